@@ -1,0 +1,176 @@
+"""Configuration as data: strict TOML files, frozen models, errors that name file, key and remedy.
+
+Every number of a model carries its unit in its name and is SI. A file is found by its path or by the name of a shipped
+one: ``load("stages", "reconstructed", StageConfig)``.
+"""
+
+import difflib
+import hashlib
+import json
+import math
+import tomllib
+from pathlib import Path
+from typing import Any, TypeVar
+
+import tomlkit
+from pydantic import BaseModel, ConfigDict, ValidationError
+
+_PACKAGED = Path(__file__).parent / "configs"
+CONFIG_DIR = _PACKAGED if _PACKAGED.is_dir() else Path(__file__).parent.parent / "configs"
+"""Where the shipped configuration files live: inside an installed wheel, or beside the packages in a checkout."""
+
+
+class ConfigError(ValueError):
+    """A configuration that cannot be used. The message names the file, the key and what to do."""
+
+
+class FrozenModel(BaseModel):
+    """Base of every configuration model: immutable, no unknown keys, no NaN, no silent conversion."""
+
+    model_config = ConfigDict(frozen=True, extra="forbid", allow_inf_nan=False, strict=True, use_attribute_docstrings=True)
+
+
+Model = TypeVar("Model", bound=BaseModel)
+
+
+def find(kind: str, name_or_path: str | Path) -> Path:
+    """Path of the file meant by a path (anything with a suffix or a separator) or the name of a shipped one.
+
+    ``kind`` is a folder of ``configs/``: stages, controllers, buses, plants or scenarios.
+    """
+    text = str(name_or_path)
+    if text.endswith(".toml") or "/" in text or "\\" in text:
+        path = Path(text)
+        if not path.is_file():
+            raise ConfigError(f"{path}: no such file; give the path of a TOML file or one of: {_known(kind)}")
+        return path
+    path = CONFIG_DIR / kind / f"{text}.toml"
+    if not path.is_file():
+        near = difflib.get_close_matches(text, names(kind), n=1)
+        hint = f"did you mean {near[0]!r}? " if near else ""
+        raise ConfigError(f"{kind}: no configuration named {text!r}; {hint}known: {_known(kind)}; or give the path of a TOML file")
+    return path
+
+
+def names(kind: str) -> list[str]:
+    """Names of the shipped configurations of one kind, sorted."""
+    return sorted(path.stem for path in (CONFIG_DIR / kind).glob("*.toml"))
+
+
+def _known(kind: str) -> str:
+    return ", ".join(names(kind)) or "none"
+
+
+def read_toml(path: str | Path) -> dict[str, Any]:
+    """Parsed content of a TOML file; a ``ConfigError`` that names the file and the line if it can't be read."""
+    try:
+        return tomllib.loads(Path(path).read_text(encoding="utf-8"))
+    except FileNotFoundError:
+        raise ConfigError(f"{path}: no such file") from None
+    except (OSError, UnicodeDecodeError) as error:
+        raise ConfigError(f"{path}: cannot be read: {error}") from None
+    except tomllib.TOMLDecodeError as error:
+        raise ConfigError(f"{path}: not valid TOML: {error}") from None
+
+
+def load(kind: str, name_or_path: str | Path, model: type[Model]) -> Model:
+    """The validated model of one file. Raises ``ConfigError`` with one line for each thing that is wrong."""
+    path = find(kind, name_or_path)
+    return parse(read_toml(path), model, str(path))
+
+
+def parse(data: dict[str, Any], model: type[Model], source: str) -> Model:
+    """Validate plain data against a model; ``source`` is the file that errors name."""
+    try:
+        return model.model_validate(_listed_as_tuples(data))
+    except ValidationError as error:
+        lines = [_explain(source, dict(item), model) for item in error.errors(include_url=False)]
+        raise ConfigError("\n".join(dict.fromkeys(lines))) from None
+
+
+def _listed_as_tuples(value: Any) -> Any:
+    """TOML knows arrays only, the frozen models hold tuples."""
+    if isinstance(value, dict):
+        return {key: _listed_as_tuples(item) for key, item in value.items()}
+    if isinstance(value, list):
+        return tuple(_listed_as_tuples(item) for item in value)
+    return value
+
+
+def _explain(source: str, item: dict[str, Any], model: type[BaseModel]) -> str:
+    location = [str(part) for part in item["loc"]]
+    key = ".".join(location)
+    if item["type"] == "extra_forbidden":
+        return f"{source}: {key}: unknown key; {_remedy_for_unknown(location[-1], _fields_at(item['loc'][:-1], model))}"
+    if item["type"] == "missing":
+        return f"{source}: {key}: missing; add this key{_unit_hint(location[-1])}"
+    message = str(item["msg"]).removeprefix("Value error, ")
+    shown = item.get("input")
+    got = "" if isinstance(shown, dict | BaseModel) else f" (got {shown!r})"
+    return f"{source}: {key or 'file'}: {message[:1].lower() + message[1:]}{got}{_unit_hint(location[-1]) if location else ''}"
+
+
+_UNITS = {
+    "m": "metres", "s": "seconds", "us": "integer microseconds", "v": "volts", "n": "newtons", "f": "farads", "hz": "hertz", "kg": "kilograms",
+    "pa": "pascals", "rad": "radians", "a": "amperes",
+}  # fmt: skip
+
+
+def _unit_hint(key: str) -> str:
+    unit = _UNITS.get(key.rsplit("_", 1)[-1])
+    return f", in {unit}" if unit and "_per_" not in key else ""
+
+
+def _remedy_for_unknown(key: str, fields: list[str]) -> str:
+    stem = key.rsplit("_", 1)[0]
+    for field in fields:
+        if stem and field.rsplit("_", 1)[0] == stem:
+            return f"this quantity is given as {field!r}{_unit_hint(field)}"
+    near = difflib.get_close_matches(key, fields, n=1)
+    return f"did you mean {near[0]!r}?" if near else f"known here: {', '.join(fields)}"
+
+
+def _fields_at(location: tuple[int | str, ...], model: Any) -> list[str]:
+    """Names of the fields at a place of a nested model, as far as the place can be followed."""
+    for part in location:
+        if isinstance(part, int) or not (isinstance(model, type) and issubclass(model, BaseModel)):
+            continue
+        field = model.model_fields.get(str(part))
+        if field is None:
+            break
+        candidates = [field.annotation, *_arguments(field.annotation)]
+        nested = [c for c in candidates if isinstance(c, type) and issubclass(c, BaseModel)]
+        model = nested[0] if nested else model
+    return list(model.model_fields) if isinstance(model, type) and issubclass(model, BaseModel) else []
+
+
+def _arguments(annotation: Any) -> list[Any]:
+    found: list[Any] = []
+    for argument in getattr(annotation, "__args__", ()):
+        found += [argument, *_arguments(argument)]
+    return found
+
+
+def plain(model: BaseModel) -> dict[str, Any]:
+    """The model as plain data (dictionaries, lists, numbers, strings) without unset optional keys."""
+    data: dict[str, Any] = model.model_dump(mode="json", exclude_none=True)
+    return data
+
+
+def digest(data: dict[str, Any]) -> str:
+    """16 hexadecimal digits that name a resolved configuration: equal data, equal digest."""
+    text = json.dumps(data, sort_keys=True, separators=(",", ":"), allow_nan=False)
+    return hashlib.sha256(text.encode()).hexdigest()[:16]
+
+
+def write_toml(data: dict[str, Any], path: str | Path) -> None:
+    """Write plain data as a TOML file that ``load`` reads back to the same model."""
+    Path(path).write_text(tomlkit.dumps(data), encoding="utf-8")
+
+
+def require_finite(value: float, what: str) -> float:
+    """``value`` as a float, or a ``ConfigError`` that says what was not a finite number."""
+    number = float(value)
+    if not math.isfinite(number):
+        raise ConfigError(f"{what} must be a finite number, got {value!r}")
+    return number
