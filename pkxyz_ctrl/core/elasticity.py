@@ -42,17 +42,11 @@ def energy(geometry, elasticity, position_m: Array) -> float:
 
 @njit(cache=True)
 def _elevation_change(geometry, dz: float) -> float:
-    """alpha - alpha_0 in rad, precise for small dz: sin(alpha - alpha_0) expanded over both angles."""
+    """alpha - alpha_0 in rad from its sine, z delta_0 - delta z_0 over L2^2, with the small difference written as a quotient."""
     link, z0, d0 = geometry["link_m"], geometry["height_rest_m"], geometry["projection_rest_m"]
     z = z0 + dz
     d = math.sqrt((link - z) * (link + z))
-    return math.asin((z * d0 - d * z0) / (link * link)) if abs(dz) > 1e-6 else _small_elevation_change(link, z0, d0, z, d, dz)
-
-
-@njit(cache=True)
-def _small_elevation_change(link: float, z0: float, d0: float, z: float, d: float, dz: float) -> float:
-    # z d0 - d z0 = dz d0 + z0 (d0 - d), the second difference written as a quotient
-    return math.asin((dz * d0 + z0 * dz * (z + z0) / (d + d0)) / (link * link))
+    return math.asin(dz * (d0 + z0 * (z + z0) / (d + d0)) / (link * link))
 
 
 @njit(cache=True)

@@ -1,0 +1,58 @@
+"""The record of one tick: what the controller saw, thought and did, with room for the truth beside it.
+
+One row a tick, in blocks of a structured array. The names carry the units; ``columns`` spreads a field of three over x, y, z
+or over combs 1, 2, 3: ``reference_m`` becomes ``reference_x_m`` ..., ``voltage_v`` becomes ``voltage_1_v`` ...
+"""
+
+import numpy as np
+
+_VECTOR = ("f8", (3,))
+
+CONTROLLER_FIELDS = [
+    ("t_us", "i8"),  # start of the tick since tick 0, us
+    ("tick", "i8"),
+    ("reference_tick", "i8"),  # index into the trajectory, -1 before tracking
+    ("mode", "i4"),  # safety.modes.Mode after this tick
+    ("event", "i4"),  # safety.modes.Event that this tick handled
+    ("trips", "i8"),  # safety.monitors.Trip bits raised in this tick
+    ("sense_status", "i4"),  # bits of the driver about the sense frame of this tick
+    ("node_events", "i4"),
+    ("overrun", "i4"),  # ticks skipped before this one
+    ("saturated", "i4"),  # 1 where a comb force met a bound
+    ("active_set_steps", "i4"),
+    ("sense_count", "i4", (3,)),
+    ("drive_count", "i4", (3,)),  # goes to the combs at the next SYNC
+    ("reference_m", *_VECTOR),  # set-point at the sample of this tick
+    ("measurement_m", *_VECTOR),  # position from this tick's sense frame alone
+    ("estimate_m", *_VECTOR),  # filtered position at the sample of this tick
+    ("estimate_m_per_s", *_VECTOR),
+    ("disturbance_n", *_VECTOR),  # estimated disturbance force at the platform
+    ("innovation_m", *_VECTOR),  # measurement less its prediction
+    ("demand_n", *_VECTOR),  # force at the platform that the law asks for
+    ("slack_n", *_VECTOR),  # demand less what the combs will give
+    ("force_n", *_VECTOR),  # comb forces commanded
+    ("voltage_v", *_VECTOR),  # comb voltages commanded, as quantised
+    ("sense_f", *_VECTOR),  # sense capacitance, offset removed
+]
+
+TRUTH_FIELDS = [
+    ("position_m", *_VECTOR),  # true position at the sample of this tick
+    ("stroke_m", *_VECTOR),
+    ("comb_voltage_v", *_VECTOR),  # true voltage at the combs at the sample, before the new drive acts
+]
+
+ROW = np.dtype(CONTROLLER_FIELDS + TRUTH_FIELDS, align=True)
+
+COMB_FIELDS = frozenset({"sense_count", "drive_count", "force_n", "voltage_v", "sense_f", "stroke_m", "comb_voltage_v"})
+"""Fields of three that belong to combs 1, 2, 3; the others belong to axes x, y, z."""
+
+_UNIT_SUFFIXES = ("_m_per_s", "_count", "_m", "_n", "_v", "_f")
+
+
+def columns(field: str) -> tuple[str, ...]:
+    """Names of the scalar columns of one field of ``ROW``: the field itself, or three names with the axis before the unit."""
+    if ROW[field].shape != (3,):
+        return (field,)
+    suffix = next(s for s in _UNIT_SUFFIXES if field.endswith(s))
+    stem = field.removesuffix(suffix)
+    return tuple(f"{stem}_{axis}{suffix}" for axis in ("123" if field in COMB_FIELDS else "xyz"))
