@@ -1,0 +1,179 @@
+"""The modes of the controller: one table, and nothing but the table decides.
+
+Whoever runs the cycle turns what happened (the node answered, a person asked, a monitor tripped) into an :class:`Event`
+and asks :func:`next_mode`. A pair that the table does not name is refused: the mode stays.
+"""
+
+from enum import IntEnum
+from typing import Final, NamedTuple
+
+import numpy as np
+from numba import njit
+from numpy.typing import NDArray
+
+
+class Mode(IntEnum):
+    BOOT = 0
+    PRE_OPERATIONAL = 1
+    IDLE = 2
+    HOMING = 3
+    ENABLED = 4
+    TRACKING = 5
+    FAULT = 6
+
+
+class Event(IntEnum):
+    NONE = 0
+    NODE_FOUND = 1
+    NODE_READY = 2
+    NODE_LOST = 3
+    HOME = 4
+    HOMED = 5
+    ENABLE = 6
+    ENABLE_UNHOMED = 7
+    TRACK = 8
+    HOLD = 9
+    DISABLE = 10
+    TRIP = 11
+    CLEAR = 12
+
+
+EVENT_MEANING: Final[dict[Event, str]] = {
+    Event.NONE: "nothing happened",
+    Event.NODE_FOUND: "the amplifier node answered its reset with a boot-up message",
+    Event.NODE_READY: "the driver has checked and configured the node, and its heartbeat says operational",
+    Event.NODE_LOST: "the driver has given the node up, or begins its start-up again",
+    Event.HOME: "asked for: measure the sense offsets",
+    Event.HOMED: "the sense offsets are averaged and in force",
+    Event.ENABLE: "asked for: close the loop, with sense offsets known",
+    Event.ENABLE_UNHOMED: "asked for: close the loop, with sense offsets unknown; refused in every mode",
+    Event.TRACK: "asked for: follow the reference",
+    Event.HOLD: "asked for: stop following, hold the set-point",
+    Event.DISABLE: "asked for: open the loop, 0 V",
+    Event.TRIP: "a monitor, the transmit gate or the operator has tripped",
+    Event.CLEAR: "asked for: forget the fault and begin again",
+}
+
+
+class ModeFacts(NamedTuple):
+    """What holds while in a mode.
+
+    ``may_energise``: a voltage other than 0 V may go out. ``loop_closed``: the law's result is what goes out.
+    ``node_expected``: the node is operational, so every tick owes us a sense frame and a heartbeat is due.
+    """
+
+    may_energise: bool
+    loop_closed: bool
+    node_expected: bool
+    meaning: str
+
+
+MODE_FACTS: Final[dict[Mode, ModeFacts]] = {
+    Mode.BOOT: ModeFacts(False, False, False, "nothing is known of the node"),
+    Mode.PRE_OPERATIONAL: ModeFacts(False, False, False, "the node was found and is being checked and configured"),
+    Mode.IDLE: ModeFacts(False, False, True, "frames flow, 0 V, loop open"),
+    Mode.HOMING: ModeFacts(False, False, True, "0 V, the sense offsets are being averaged"),
+    Mode.ENABLED: ModeFacts(True, True, True, "loop closed, holding the set-point"),
+    Mode.TRACKING: ModeFacts(True, True, True, "loop closed, following the reference"),
+    Mode.FAULT: ModeFacts(False, False, False, "0 V, latched with its reason until cleared"),
+}
+
+# Losing the node at 0 V is an inconvenience: begin again. Losing it under voltage is a fault that a person has to read.
+# CLEAR leads to BOOT, not to where it came from: after a fault nothing about the node is taken as known.
+TRANSITIONS: Final[dict[tuple[Mode, Event], Mode]] = {
+    (Mode.BOOT, Event.NODE_FOUND): Mode.PRE_OPERATIONAL,
+    (Mode.BOOT, Event.TRIP): Mode.FAULT,
+    (Mode.PRE_OPERATIONAL, Event.NODE_READY): Mode.IDLE,
+    (Mode.PRE_OPERATIONAL, Event.NODE_LOST): Mode.BOOT,
+    (Mode.PRE_OPERATIONAL, Event.TRIP): Mode.FAULT,
+    (Mode.IDLE, Event.HOME): Mode.HOMING,
+    (Mode.IDLE, Event.ENABLE): Mode.ENABLED,
+    (Mode.IDLE, Event.NODE_LOST): Mode.BOOT,
+    (Mode.IDLE, Event.TRIP): Mode.FAULT,
+    (Mode.HOMING, Event.HOMED): Mode.IDLE,
+    (Mode.HOMING, Event.DISABLE): Mode.IDLE,
+    (Mode.HOMING, Event.NODE_LOST): Mode.BOOT,
+    (Mode.HOMING, Event.TRIP): Mode.FAULT,
+    (Mode.ENABLED, Event.TRACK): Mode.TRACKING,
+    (Mode.ENABLED, Event.DISABLE): Mode.IDLE,
+    (Mode.ENABLED, Event.NODE_LOST): Mode.FAULT,
+    (Mode.ENABLED, Event.TRIP): Mode.FAULT,
+    (Mode.TRACKING, Event.HOLD): Mode.ENABLED,
+    (Mode.TRACKING, Event.DISABLE): Mode.IDLE,
+    (Mode.TRACKING, Event.NODE_LOST): Mode.FAULT,
+    (Mode.TRACKING, Event.TRIP): Mode.FAULT,
+    (Mode.FAULT, Event.CLEAR): Mode.BOOT,
+}
+
+REFUSED: Final = -1
+
+
+def _transition_table() -> NDArray[np.int8]:
+    table = np.full((len(Mode), len(Event)), REFUSED, dtype=np.int8)
+    for (mode, event), target in TRANSITIONS.items():
+        table[mode, event] = target
+    table.setflags(write=False)
+    return table
+
+
+def _fact_array(facts: list[bool]) -> NDArray[np.int8]:
+    array = np.array(facts, dtype=np.int8)
+    array.setflags(write=False)
+    return array
+
+
+# (7, 13) int8: the target, or REFUSED. Compiled callers freeze this and the three arrays below as constants.
+TRANSITION_TABLE: Final = _transition_table()
+# (7,) int8, 0 or 1, by mode.
+MAY_ENERGISE: Final = _fact_array([MODE_FACTS[mode].may_energise for mode in Mode])
+LOOP_CLOSED: Final = _fact_array([MODE_FACTS[mode].loop_closed for mode in Mode])
+NODE_EXPECTED: Final = _fact_array([MODE_FACTS[mode].node_expected for mode in Mode])
+
+_MODE_COUNT = len(Mode)
+_EVENT_COUNT = len(Event)
+_BOOT = int(Mode.BOOT)
+_HOMING = int(Mode.HOMING)
+_FAULT = int(Mode.FAULT)
+_HOMED = int(Event.HOMED)
+_ENABLE = int(Event.ENABLE)
+_ENABLE_UNHOMED = int(Event.ENABLE_UNHOMED)
+
+
+@njit(cache=True)
+def next_mode(mode: int, event: int) -> int:
+    """The mode after ``event``. An undefined pair, NONE or an unknown event: the same mode; an unknown mode: FAULT."""
+    if mode < 0 or mode >= _MODE_COUNT:
+        return _FAULT
+    if event < 0 or event >= _EVENT_COUNT:
+        return mode
+    target = int(TRANSITION_TABLE[mode, event])
+    return mode if target < 0 else target
+
+
+@njit(cache=True)
+def enable_event(homed: bool) -> int:
+    """The event that a wish to close the loop amounts to: ENABLE, or ENABLE_UNHOMED, which no mode accepts."""
+    return _ENABLE if homed else _ENABLE_UNHOMED
+
+
+@njit(cache=True)
+def next_homed(homed: bool, mode: int, event: int) -> bool:
+    """Whether the sense offsets are known after ``event`` in ``mode``.
+
+    They become known when homing ends well, and are forgotten in BOOT: a node that was away, or a fault, may have
+    changed what they correct. A homing broken off leaves what was known before.
+    """
+    target = next_mode(mode, event)
+    if target == _BOOT:
+        return False
+    return homed or (mode == _HOMING and event == _HOMED)
+
+
+def refusal(mode: Mode, event: Event) -> str | None:
+    """Why ``event`` is refused in ``mode``, for a person; None if the table accepts it (or nothing was asked)."""
+    if event == Event.NONE or (mode, event) in TRANSITIONS:
+        return None
+    if event == Event.ENABLE_UNHOMED:
+        return "the sense offsets are not known yet: home first (needs IDLE), then enable"
+    accepting = ", ".join(source.name for source, accepted in TRANSITIONS if accepted == event)
+    return f"{event.name} is not possible in {mode.name} ({MODE_FACTS[mode].meaning}); it is in: {accepting}"

@@ -1,0 +1,285 @@
+"""The monitors: once a tick, everything that was observed against everything that is plausible.
+
+One pure kernel, :func:`check`. It remembers only how long something has been wrong, and reports what has been wrong for
+too long as bits of :class:`Trip`; latching the first report and acting on it is its caller's.
+
+Two ways to count. A *state* (stale, at a rail, frozen, saturated) counts consecutive ticks, since one good tick proves
+that it is over. An *event* (a bad CRC, a lost frame, a missed tick) fills a leaky bucket, since a good tick between two
+of them proves nothing: each event adds one, each good tick takes away 1/leak_ticks. So a burst of N trips at the
+N-th, and so does, later, any rate that stays above one in leak_ticks + 1.
+"""
+
+from enum import IntFlag
+from typing import Final
+
+import numpy as np
+from numba import njit
+from numpy.typing import NDArray
+
+from pkxyz_ctrl.safety.modes import LOOP_CLOSED, NODE_EXPECTED, Mode
+from pkxyz_ctrl.safety.trips import Trip
+
+
+class SenseStatus(IntFlag):
+    """What was wrong with this tick's sense frame; 0 is a good frame."""
+
+    MISSING = 1
+    COUNTER = 2
+    CRC = 4
+    LENGTH = 8
+    DUPLICATE = 16
+
+
+class NodeEvent(IntFlag):
+    """What the supervision of the node saw since the last tick."""
+
+    HEARTBEAT_LOST = 1
+    NOT_OPERATIONAL = 2
+    REBOOTED = 4
+    EMERGENCY = 8
+
+
+# A count of 0 trips at once (a limit that was never filled in is a fault), a negative one switches that monitor off.
+LIMITS: Final = np.dtype(
+    [
+        ("stroke_min_m", "f8"),
+        ("stroke_max_m", "f8"),
+        ("innovation_max_m", "f8", (3,)),
+        ("voltage_step_max_v", "f8"),
+        ("sense_count_min", "i4"),  # at or below is at the rail
+        ("sense_count_max", "i4"),  # at or above is at the rail
+        ("stale_count", "i4"),
+        ("sequence_count", "i4"),
+        ("crc_count", "i4"),
+        ("length_count", "i4"),
+        ("range_count", "i4"),
+        ("frozen_count", "i4"),
+        ("innovation_count", "i4"),
+        ("saturation_count", "i4"),
+        ("slew_count", "i4"),
+        ("overrun_count", "i4"),
+        ("solver_count", "i4"),
+        ("frame_leak_ticks", "i4"),
+        ("overrun_leak_ticks", "i4"),
+    ],
+    align=True,
+)
+
+# Counts of ticks, except the *_level: events times the bucket's leak_ticks. All zero is a healthy beginning.
+MONITOR_MEMORY: Final = np.dtype(
+    [
+        ("sequence_level", "i8"),
+        ("crc_level", "i8"),
+        ("length_level", "i8"),
+        ("overrun_level", "i8"),
+        ("stale", "i4"),
+        ("range", "i4", (3,)),
+        ("frozen", "i4", (3,)),
+        ("frozen_sense_count", "i4", (3,)),
+        ("innovation", "i4", (3,)),
+        ("saturation", "i4"),
+        ("slew", "i4"),
+        ("solver", "i4"),
+    ],
+    align=True,
+)
+
+OBSERVATION: Final = np.dtype(
+    [
+        ("stroke_m", "f8", (3,)),  # measured strokes relative to rest
+        ("innovation_m", "f8", (3,)),  # measured minus predicted position, x y z
+        ("voltage_step_v", "f8", (3,)),  # commanded now minus commanded one tick ago, combs 1 2 3
+        ("mode", "i4"),  # Mode in which this tick was computed
+        ("sense_status", "i4"),  # SenseStatus
+        ("node_events", "i4"),  # NodeEvent
+        ("sense_count", "i4", (3,)),  # raw counts of this tick's frame
+        ("saturated", "i4"),  # 1: the allocation ended at a bound
+        ("overrun", "i4"),  # ticks missed since the last one
+        ("solver_ok", "i4"),  # 0: the law's solver gave up and its fall-back was used
+        ("finite", "i4"),  # 0: some output of this tick is NaN or infinite
+    ],
+    align=True,
+)
+
+
+def default_limits() -> NDArray[np.void]:
+    """(1,) of LIMITS, for a 25 um stage at 5 kHz with 2 nm rms of sense noise.
+
+    The innovation is a few nm when all is well and the shock of a snap is micrometres, hence 500 nm. Identical counts
+    for 50 ticks do not happen while noise spans several counts (0.2^50). 250 ticks at a bound are 50 ms, longer than
+    any move across the workspace takes.
+    """
+    limits = np.zeros(1, LIMITS)
+    limits["stroke_min_m"] = -2e-6
+    limits["stroke_max_m"] = 27e-6
+    limits["innovation_max_m"] = 0.5e-6
+    limits["voltage_step_max_v"] = 10.0
+    limits["sense_count_min"] = -32768
+    limits["sense_count_max"] = 32767
+    limits["stale_count"] = 5
+    limits["sequence_count"] = 10
+    limits["crc_count"] = 5
+    limits["length_count"] = 5
+    limits["range_count"] = 3
+    limits["frozen_count"] = 50
+    limits["innovation_count"] = 5
+    limits["saturation_count"] = 250
+    limits["slew_count"] = 1
+    limits["overrun_count"] = 10
+    limits["solver_count"] = 5
+    limits["frame_leak_ticks"] = 200
+    limits["overrun_leak_ticks"] = 500
+    return limits
+
+
+_UNUSABLE = int(SenseStatus.MISSING | SenseStatus.CRC | SenseStatus.LENGTH | SenseStatus.DUPLICATE)
+_OUT_OF_SEQUENCE = int(SenseStatus.MISSING | SenseStatus.COUNTER | SenseStatus.DUPLICATE)
+_CRC = int(SenseStatus.CRC)
+_LENGTH = int(SenseStatus.LENGTH)
+
+_SENSE_STALE = int(Trip.SENSE_STALE)
+_SENSE_SEQUENCE = int(Trip.SENSE_SEQUENCE)
+_SENSE_CRC = int(Trip.SENSE_CRC)
+_SENSE_LENGTH = int(Trip.SENSE_LENGTH)
+_SENSE_RANGE_1 = int(Trip.SENSE_RANGE_1)
+_SENSE_FROZEN_1 = int(Trip.SENSE_FROZEN_1)
+_INNOVATION_X = int(Trip.INNOVATION_X)
+_SATURATION = int(Trip.SATURATION)
+_SLEW = int(Trip.SLEW)
+_OVERRUN = int(Trip.OVERRUN)
+_SOLVER = int(Trip.SOLVER)
+_NOT_FINITE = int(Trip.NOT_FINITE)
+# NodeEvent's four bits are Trip's four bits from HEARTBEAT_LOST on, in the same order.
+_NODE_EVENTS = int(NodeEvent.HEARTBEAT_LOST | NodeEvent.NOT_OPERATIONAL | NodeEvent.REBOOTED | NodeEvent.EMERGENCY)
+_NODE_SHIFT = int(Trip.HEARTBEAT_LOST).bit_length() - 1
+
+_MODE_COUNT = len(Mode)
+_ENOUGH = 1 << 30  # counting further would only overflow
+
+
+@njit(cache=True)
+def _consecutive(ticks: int, bad: bool) -> int:
+    if not bad:
+        return 0
+    return ticks + 1 if ticks < _ENOUGH else ticks
+
+
+@njit(cache=True)
+def _bucket(level: int, events: int, leak_ticks: int) -> int:
+    if events > 0:
+        return level + int(events) * int(leak_ticks) if level < _ENOUGH else level
+    return level - 1 if level > 0 else 0
+
+
+@njit(cache=True)
+def _reached(ticks: int, limit: int, trip: int) -> int:
+    return trip if limit >= 0 and ticks >= limit else 0
+
+
+@njit(cache=True)
+def _filled(level: int, limit: int, leak_ticks: int, trip: int) -> int:
+    return trip if limit >= 0 and level >= int(limit) * int(leak_ticks) else 0
+
+
+@njit(cache=True)
+def clear_memory(memory: np.void) -> None:
+    """Forget all; ``memory`` is a record of MONITOR_MEMORY."""
+    memory["sequence_level"] = 0
+    memory["crc_level"] = 0
+    memory["length_level"] = 0
+    memory["overrun_level"] = 0
+    memory["stale"] = 0
+    for i in range(3):
+        memory["range"][i] = 0
+        memory["frozen"][i] = 0
+    _clear_loop(memory)
+
+
+@njit(cache=True)
+def _clear_loop(memory: np.void) -> None:
+    memory["saturation"] = 0
+    memory["slew"] = 0
+    memory["solver"] = 0
+    for i in range(3):
+        memory["innovation"][i] = 0
+
+
+@njit(cache=True)
+def _check_frames(limits: np.void, memory: np.void, obs: np.void) -> int:
+    status = obs["sense_status"]
+    leak = limits["frame_leak_ticks"]
+    memory["stale"] = _consecutive(memory["stale"], (status & _UNUSABLE) != 0)
+    memory["sequence_level"] = _bucket(memory["sequence_level"], 1 if status & _OUT_OF_SEQUENCE else 0, leak)
+    memory["crc_level"] = _bucket(memory["crc_level"], 1 if status & _CRC else 0, leak)
+    memory["length_level"] = _bucket(memory["length_level"], 1 if status & _LENGTH else 0, leak)
+    trips: int = _reached(memory["stale"], limits["stale_count"], _SENSE_STALE)
+    trips |= _filled(memory["sequence_level"], limits["sequence_count"], leak, _SENSE_SEQUENCE)
+    trips |= _filled(memory["crc_level"], limits["crc_count"], leak, _SENSE_CRC)
+    trips |= _filled(memory["length_level"], limits["length_count"], leak, _SENSE_LENGTH)
+    return trips
+
+
+@njit(cache=True)
+def _check_channels(limits: np.void, memory: np.void, obs: np.void) -> int:
+    """Range and frozen, per comb; only a usable frame is evidence, for or against."""
+    trips: int = 0
+    for i in range(3):
+        count = obs["sense_count"][i]
+        stroke_m = obs["stroke_m"][i]
+        in_range = limits["sense_count_min"] < count < limits["sense_count_max"]
+        # NaN fails both comparisons, hence is out of range.
+        in_range = in_range and stroke_m >= limits["stroke_min_m"] and stroke_m <= limits["stroke_max_m"]
+        memory["range"][i] = _consecutive(memory["range"][i], not in_range)
+        same = memory["frozen"][i] > 0 and count == memory["frozen_sense_count"][i]
+        memory["frozen"][i] = _consecutive(memory["frozen"][i], same) if same else 1
+        memory["frozen_sense_count"][i] = count
+        trips |= _reached(memory["range"][i], limits["range_count"], _SENSE_RANGE_1 << i)
+        trips |= _reached(memory["frozen"][i], limits["frozen_count"], _SENSE_FROZEN_1 << i)
+    return trips
+
+
+@njit(cache=True)
+def _check_loop(limits: np.void, memory: np.void, obs: np.void) -> int:
+    """What has a meaning only while the loop is closed."""
+    trips: int = 0
+    too_fast = False
+    for i in range(3):
+        # Written as "not within", so that NaN counts as beyond.
+        beyond = not abs(obs["innovation_m"][i]) <= limits["innovation_max_m"][i]
+        memory["innovation"][i] = _consecutive(memory["innovation"][i], beyond)
+        trips |= _reached(memory["innovation"][i], limits["innovation_count"], _INNOVATION_X << i)
+        too_fast = too_fast or not abs(obs["voltage_step_v"][i]) <= limits["voltage_step_max_v"]
+    memory["saturation"] = _consecutive(memory["saturation"], obs["saturated"] != 0)
+    memory["slew"] = _consecutive(memory["slew"], too_fast)
+    memory["solver"] = _consecutive(memory["solver"], obs["solver_ok"] == 0)
+    trips |= _reached(memory["saturation"], limits["saturation_count"], _SATURATION)
+    trips |= _reached(memory["slew"], limits["slew_count"], _SLEW)
+    trips |= _reached(memory["solver"], limits["solver_count"], _SOLVER)
+    return trips
+
+
+@njit(cache=True)
+def check(limits: np.void, memory: np.void, obs: np.void) -> int:
+    """Trip bits of this tick; 0 when all is well. Call once per tick, in every mode.
+
+    ``limits``, ``memory``, ``obs`` are records of LIMITS, MONITOR_MEMORY and OBSERVATION; ``memory`` is updated. While
+    no node is expected (BOOT, PRE_OPERATIONAL, FAULT) only a result that is not finite trips, and the memory is
+    cleared, so that a cleared fault does not trip again from old counts.
+    """
+    trips: int = _NOT_FINITE if obs["finite"] == 0 else 0
+    mode = obs["mode"]
+    if mode < 0 or mode >= _MODE_COUNT or NODE_EXPECTED[mode] == 0:
+        clear_memory(memory)
+        return trips
+    trips |= (obs["node_events"] & _NODE_EVENTS) << _NODE_SHIFT
+    leak = limits["overrun_leak_ticks"]
+    memory["overrun_level"] = _bucket(memory["overrun_level"], obs["overrun"], leak)
+    trips |= _filled(memory["overrun_level"], limits["overrun_count"], leak, _OVERRUN)
+    trips |= _check_frames(limits, memory, obs)
+    if obs["sense_status"] & _UNUSABLE == 0:
+        trips |= _check_channels(limits, memory, obs)
+    if LOOP_CLOSED[mode] != 0:
+        trips |= _check_loop(limits, memory, obs)
+    else:
+        _clear_loop(memory)
+    return trips

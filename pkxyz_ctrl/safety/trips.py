@@ -1,0 +1,147 @@
+"""Why the combs went to 0 V: the bits of a trip, and what a person reads."""
+
+from enum import IntFlag
+from typing import Final
+
+
+class Trip(IntFlag):
+    """Reasons to go to FAULT. Those with a number or an axis are three neighbouring bits: ``FIRST << i`` is the i-th."""
+
+    SENSE_STALE = 1 << 0
+    SENSE_SEQUENCE = 1 << 1
+    SENSE_CRC = 1 << 2
+    SENSE_LENGTH = 1 << 3
+    SENSE_RANGE_1 = 1 << 4
+    SENSE_RANGE_2 = 1 << 5
+    SENSE_RANGE_3 = 1 << 6
+    SENSE_FROZEN_1 = 1 << 7
+    SENSE_FROZEN_2 = 1 << 8
+    SENSE_FROZEN_3 = 1 << 9
+    INNOVATION_X = 1 << 10
+    INNOVATION_Y = 1 << 11
+    INNOVATION_Z = 1 << 12
+    SATURATION = 1 << 13
+    SLEW = 1 << 14
+    OVERRUN = 1 << 15
+    SOLVER = 1 << 16
+    NOT_FINITE = 1 << 17
+    HEARTBEAT_LOST = 1 << 18
+    NODE_NOT_OPERATIONAL = 1 << 19
+    NODE_REBOOTED = 1 << 20
+    NODE_EMERGENCY = 1 << 21
+    # Raised by the caller, here so that one mask and one explanation serve all.
+    GATE_BLOCKED = 1 << 22
+    OPERATOR = 1 << 23
+
+
+# What happened, in terms of the instrument; then what to look at, most likely first.
+EXPLANATIONS: Final[dict[Trip, tuple[str, str]]] = {
+    Trip.SENSE_STALE: (
+        "no usable position measurement arrived for several periods",
+        "check the node's supply and the bus plug and termination, then whether something else fills the bus",
+    ),
+    Trip.SENSE_SEQUENCE: (
+        "too many position measurements were lost, repeated or out of order",
+        "check the bus load and wiring, and that only one device uses this node id",
+    ),
+    Trip.SENSE_CRC: (
+        "position measurements arrived damaged, although the bus itself saw no error",
+        "check that controller and node agree on protection (CRC and counter), then suspect the sense electronics",
+    ),
+    Trip.SENSE_LENGTH: (
+        "position measurements arrived with the wrong length",
+        "check the node's mapping (0x1A01), and that no other device sends with its identifier",
+    ),
+    Trip.SENSE_RANGE_1: (
+        "sense comb 1 reads a stroke that the stage cannot have",
+        "check its cable and preamplifier, and the scale and offset of the bus file; the stage may be against a stop",
+    ),
+    Trip.SENSE_RANGE_2: (
+        "sense comb 2 reads a stroke that the stage cannot have",
+        "check its cable and preamplifier, and the scale and offset of the bus file; the stage may be against a stop",
+    ),
+    Trip.SENSE_RANGE_3: (
+        "sense comb 3 reads a stroke that the stage cannot have",
+        "check its cable and preamplifier, and the scale and offset of the bus file; the stage may be against a stop",
+    ),
+    Trip.SENSE_FROZEN_1: (
+        "sense comb 1 repeats one value to the last digit, without noise",
+        "its converter has stopped or its input is disconnected; restart the node, then check the cable",
+    ),
+    Trip.SENSE_FROZEN_2: (
+        "sense comb 2 repeats one value to the last digit, without noise",
+        "its converter has stopped or its input is disconnected; restart the node, then check the cable",
+    ),
+    Trip.SENSE_FROZEN_3: (
+        "sense comb 3 repeats one value to the last digit, without noise",
+        "its converter has stopped or its input is disconnected; restart the node, then check the cable",
+    ),
+    Trip.INNOVATION_X: (
+        "the stage moved along x in a way that the voltages do not explain",
+        "look for a shock, a touched sample or a comb that snapped; then compare the stage file with the device",
+    ),
+    Trip.INNOVATION_Y: (
+        "the stage moved along y in a way that the voltages do not explain",
+        "look for a shock, a touched sample or a comb that snapped; then compare the stage file with the device",
+    ),
+    Trip.INNOVATION_Z: (
+        "the stage moved along z in a way that the voltages do not explain",
+        "look for a shock, a touched sample or a comb that snapped; then compare the stage file with the device",
+    ),
+    Trip.SATURATION: (
+        "the combs were at their voltage or slew limit for too long",
+        "the reference asks for more than the stage reaches: make the scan smaller, slower or closer to the centre",
+    ),
+    Trip.SLEW: (
+        "the control law asked for a voltage step beyond the limit",
+        "this is a defect of the law or its file, not of the stage: keep the recording and report it",
+    ),
+    Trip.OVERRUN: (
+        "the computer missed too many control periods",
+        "close other programs, allow real-time priority, or choose a bus with a longer period",
+    ),
+    Trip.SOLVER: (
+        "the control law's optimiser gave no answer for several periods",
+        "check the limits and weights of the controller file; choose another law until it is understood",
+    ),
+    Trip.NOT_FINITE: (
+        "the control law computed something that is not a number",
+        "this is a defect of the law or its file, not of the stage: keep the recording and report it",
+    ),
+    Trip.HEARTBEAT_LOST: (
+        "the amplifier no longer says that it is alive",
+        "check its supply and the bus plug; after it came back, clear the fault",
+    ),
+    Trip.NODE_NOT_OPERATIONAL: (
+        "the amplifier left its operational state",
+        "another master may have stopped it, or it has lost the controller's heartbeat; look at its error history",
+    ),
+    Trip.NODE_REBOOTED: (
+        "the amplifier restarted by itself",
+        "suspect its supply (brown-out, loose plug) before clearing the fault",
+    ),
+    Trip.NODE_EMERGENCY: (
+        "the amplifier reported a fault of its own",
+        "read the emergency code in the log: over-current means a short or dust in a comb, so do not just try again",
+    ),
+    Trip.GATE_BLOCKED: (
+        "a frame that must not be sent was held back at the last moment",
+        "the gate's reason names frame and rule; this is a defect of the program: keep the recording and report it",
+    ),
+    Trip.OPERATOR: (
+        "stopped by hand",
+        "clear the fault when ready",
+    ),
+}
+
+
+def explain(trips: int) -> str:
+    """One line per bit of ``trips``: what happened, and what to check. Empty for 0; unknown bits are named as such."""
+    lines = []
+    for trip, (happened, remedy) in EXPLANATIONS.items():
+        if trips & trip:
+            lines.append(f"{happened[0].upper()}{happened[1:]} ({trip.name}): {remedy}.")
+    unknown = trips & ~int(sum(EXPLANATIONS))
+    if unknown:
+        lines.append(f"Unknown trip bits {unknown:#x}: the recording is from another version of this program.")
+    return "\n".join(lines)
