@@ -137,7 +137,7 @@ class ProcessCodec:
 
 @dataclass(frozen=True, slots=True)
 class AnalogScale:
-    """``physical = offset + scale * counts``: volts of a drive comb (CiA 401: 0x6411), farads of a sense comb (0x6401)."""
+    """``physical = offset + scale * counts``: volts of a drive comb (0x6411), farads of a sense comb (0x6401)."""
 
     scale: float
     offset: float = 0.0

@@ -1,0 +1,327 @@
+"""The controller's side of the connection to the amplifier: frames in, frames out, time passed in.
+
+No clock, no socket, no thread. The start-up dialogue is driven by ``start``, ``receive`` and ``poll``; once
+``state`` is OPERATIONAL the loop calls ``sync``, ``receive``, ``take_sense``, ``drive`` and ``heartbeat_due``.
+"""
+
+from collections import deque
+from enum import Enum, auto
+
+from . import cob_id
+from .cob_id import NmtCommand, NmtState
+from .codec import Counts, ProcessCodec
+from .driver_config import DriverConfig
+from .emergency import Emergency, decode_emergency
+from .frame import Frame
+from .sdo import SdoDialogue
+from .sense_input import SenseInput
+from .startup import configuration_steps, identity_steps
+
+NODE_HEARTBEAT_LOST = 1
+NODE_NOT_OPERATIONAL = 2
+NODE_REBOOTED = 4
+NODE_EMERGENCY = 8
+
+Frames = tuple[Frame, ...]
+
+_NOTHING: Frames = ()
+_NEVER_US = 1 << 62
+_EMERGENCIES_KEPT = 64
+
+
+class DriverState(Enum):
+    """Where the connection to the amplifier is."""
+
+    OFF = auto()
+    RESETTING = auto()
+    IDENTIFYING = auto()
+    CONFIGURING = auto()
+    STARTING = auto()
+    OPERATIONAL = auto()
+    FAILED = auto()
+
+
+class AmplifierDriver:
+    """Starts, feeds and watches one amplifier node (CiA 301 master services that it needs, CiA 401 PDOs).
+
+    ``state`` and ``failure`` (a sentence: what was expected, what came, what to do) tell how the connection fares.
+    ``node_events`` (NODE_... bits) are latched: EMERGENCY until ``acknowledge``, the others until ``start``, because a
+    node that was silent, left the operational state or restarted has to be configured again. ``emergencies`` holds
+    the last 64. All times are integer microseconds of the caller's one clock and never run backwards.
+    """
+
+    def __init__(self, config: DriverConfig) -> None:
+        self.config = config
+        self.state = DriverState.OFF
+        self.failure = ""
+        self.node_events = 0
+        self.node_state: int | None = None  # as its last heartbeat said
+        self.emergencies: deque[Emergency] = deque(maxlen=_EMERGENCIES_KEPT)
+        self._sense_id = cob_id.SENSE_BASE + config.node_id
+        self._drive_id = cob_id.DRIVE_BASE + config.node_id
+        self._sdo_request_id = cob_id.SDO_REQUEST_BASE + config.node_id
+        self._sdo_response_id = cob_id.SDO_RESPONSE_BASE + config.node_id
+        self._emergency_id = cob_id.EMCY_BASE + config.node_id
+        self._node_heartbeat_id = cob_id.HEARTBEAT_BASE + config.node_id
+        self._sense = SenseInput(ProcessCodec(self._sense_id, config.protection))
+        self._receive_sense = self._sense.receive
+        self._encode_drive = ProcessCodec(self._drive_id, config.protection).encode
+        self._fd = config.fd
+        self._sync_frames = tuple(
+            self._frame(cob_id.SYNC, bytes((count,))) for count in range(1, cob_id.SYNC_COUNTER_OVERFLOW + 1)
+        )
+        self._heartbeat_frame = self._frame(
+            cob_id.HEARTBEAT_BASE + config.controller_node_id, bytes((NmtState.OPERATIONAL,))
+        )
+        self._heartbeat_period_us = 1000 * config.controller_heartbeat_period_ms
+        self._node_timeout_us = 1000 * config.node_heartbeat_timeout_ms
+        self._node_deadline_us = _NEVER_US
+        self._heartbeat_next_us = _NEVER_US
+        self._sync_index = 0
+        self._drive_counter = 0
+        self._dialogue = SdoDialogue((), 0, 0)
+        self._deadline_us = _NEVER_US
+        self._repeats_left = 0
+
+    # -- start and stop ---------------------------------------------------------------------------------------------
+
+    def start(self, t_us: int) -> Frames:
+        """Resets the node and begins the start-up dialogue, from any state; counters, events and failure start anew."""
+        self.failure = ""
+        self.node_events = 0
+        self.node_state = None
+        self.emergencies.clear()
+        self._sense.reset()
+        self._sync_index = 0
+        self._drive_counter = 0
+        self._node_deadline_us = _NEVER_US
+        self._heartbeat_next_us = _NEVER_US
+        self._repeats_left = self.config.retries
+        return self._reset_node(t_us)
+
+    def poll(self, t_us: int) -> Frames:
+        """Time-outs and repetitions of the start-up dialogue; our heartbeat while no loop sends it.
+
+        To be called at least every few milliseconds until OPERATIONAL. The loop needs it no longer: ``sync``
+        supervises the node, and ``heartbeat_due`` lets the loop choose the place of the heartbeat.
+        """
+        frames = _NOTHING
+        if self.state is DriverState.RESETTING and t_us >= self._deadline_us:
+            frames = self._boot_timed_out(t_us)
+        elif self.state in (DriverState.IDENTIFYING, DriverState.CONFIGURING):
+            frames = self._advance(self._dialogue.poll(t_us), t_us)
+        elif self.state is DriverState.STARTING and t_us >= self._deadline_us:
+            frames = self._start_timed_out(t_us)
+        if t_us > self._node_deadline_us:
+            self._node_lost(t_us)
+        heartbeat = self.heartbeat_due(t_us)
+        if heartbeat is not None:
+            self.heartbeat_sent(t_us)
+            frames = (*frames, heartbeat)
+        return frames
+
+    def stop(self, t_us: int) -> Frames:
+        """0 V, then NMT pre-operational, where the node's outputs take their error value (0 V). State OFF."""
+        self._fall_silent()
+        self.state = DriverState.OFF
+        return self.drive((0, 0, 0), t_us), self._nmt(NmtCommand.PRE_OPERATIONAL)
+
+    def acknowledge(self) -> None:
+        """Takes note of the emergencies: clears NODE_EMERGENCY, keeps the list."""
+        self.node_events &= ~NODE_EMERGENCY
+
+    # -- the loop ---------------------------------------------------------------------------------------------------
+
+    def sync(self, t_us: int) -> Frame:
+        """The SYNC that begins a tick; its counter runs 1..240. What was received before is old from now on."""
+        if t_us > self._node_deadline_us:
+            self._node_lost(t_us)
+        self._sense.on_sync()
+        index = self._sync_index
+        self._sync_index = index + 1 if index < cob_id.SYNC_COUNTER_OVERFLOW - 1 else 0
+        return self._sync_frames[index]
+
+    def receive(self, frame: Frame, t_us: int) -> Frames:
+        """Takes any frame from the bus and returns what is to be sent at once (SDO requests during the start)."""
+        received_id, data, _, _, is_remote, is_extended, is_error = frame
+        if is_remote or is_extended or is_error:
+            return _NOTHING
+        if received_id == self._sense_id:
+            self._receive_sense(data)
+        elif received_id == self._node_heartbeat_id:
+            return self._on_heartbeat(data, t_us)
+        elif received_id == self._sdo_response_id:
+            if self.state in (DriverState.IDENTIFYING, DriverState.CONFIGURING):
+                return self._advance(self._dialogue.receive(data, t_us), t_us)
+        elif received_id == self._emergency_id:
+            self._on_emergency(data, t_us)
+        return _NOTHING
+
+    def take_sense(self) -> tuple[int, int, int, int]:
+        """``(counts 1, counts 2, counts 3, status)``, once a tick; SENSE_... bits, 0 if all is well.
+
+        With SENSE_MISSING the counts are the last valid ones (0 before the first).
+        """
+        return self._sense.take()
+
+    @property
+    def sense_fresh(self) -> bool:
+        """Whether a valid sense PDO has come since the last SYNC."""
+        return self._sense.fresh
+
+    def drive(self, counts: Counts, t_us: int) -> Frame:
+        """The drive PDO, 0..32767 counts for 0..200 V. It is applied at the end of the next SYNC.
+
+        Raises CountsOutOfRangeError beyond INTEGER16; the alive counter then stays.
+        """
+        counter = self._drive_counter
+        data = self._encode_drive(counts, counter)
+        self._drive_counter = (counter + 1) & 0xFF
+        return Frame(self._drive_id, data, self._fd, self._fd)
+
+    def heartbeat_due(self, t_us: int) -> Frame | None:
+        """Our heartbeat if its time has come; whoever sends it says so with ``heartbeat_sent``."""
+        return self._heartbeat_frame if t_us >= self._heartbeat_next_us else None
+
+    def heartbeat_sent(self, t_us: int) -> None:
+        """The next one is due a period after this one was due; periods that were missed are skipped whole."""
+        if t_us >= self._heartbeat_next_us:
+            missed = (t_us - self._heartbeat_next_us) // self._heartbeat_period_us
+            self._heartbeat_next_us += (missed + 1) * self._heartbeat_period_us
+
+    # -- what the node says -----------------------------------------------------------------------------------------
+
+    def _on_heartbeat(self, data: bytes, t_us: int) -> Frames:
+        if len(data) != 1:
+            return _NOTHING
+        node_state = data[0] & 0x7F  # bit 7 is the toggle bit of node guarding
+        self.node_state = node_state
+        if node_state == NmtState.BOOT_UP:
+            return self._on_boot_up(t_us)
+        if self.state is DriverState.STARTING and node_state == NmtState.OPERATIONAL:
+            self.state = DriverState.OPERATIONAL
+            self._deadline_us = _NEVER_US
+        if self.state is DriverState.OPERATIONAL:
+            self._node_deadline_us = t_us + self._node_timeout_us
+            if node_state != NmtState.OPERATIONAL:
+                self.node_events |= NODE_NOT_OPERATIONAL
+                self._fail(
+                    f"amplifier (node {self.config.node_id}) left the operational state: its heartbeat says "
+                    f"{_state_name(node_state)}; look at its emergencies, then start it again"
+                )
+        return _NOTHING
+
+    def _on_boot_up(self, t_us: int) -> Frames:
+        if self.state is DriverState.RESETTING:
+            return self._begin(DriverState.IDENTIFYING, t_us)
+        if self.state in (DriverState.IDENTIFYING, DriverState.CONFIGURING, DriverState.STARTING):
+            if self._repeats_left > 0:  # late answer to a repeated reset: what was written is lost
+                self._repeats_left -= 1
+                self._fall_silent()
+                return self._begin(DriverState.IDENTIFYING, t_us)
+            self._fail(
+                f"amplifier (node {self.config.node_id}) restarts again and again while it is configured; "
+                "check its power supply"
+            )
+        elif self.state in (DriverState.OPERATIONAL, DriverState.FAILED):
+            self.node_events |= NODE_REBOOTED | NODE_NOT_OPERATIONAL
+            self._fail(
+                f"amplifier (node {self.config.node_id}) restarted by itself (boot-up message while operational); "
+                "check its power supply, then start it again"
+            )
+        return _NOTHING
+
+    def _on_emergency(self, data: bytes, t_us: int) -> None:
+        emergency = decode_emergency(data, t_us)
+        if emergency is not None:
+            self.emergencies.append(emergency)
+            if not emergency.is_reset:
+                self.node_events |= NODE_EMERGENCY
+
+    def _node_lost(self, t_us: int) -> None:
+        silent_ms = (t_us - self._node_deadline_us + self._node_timeout_us) / 1000
+        self.node_events |= NODE_HEARTBEAT_LOST
+        self._fail(
+            f"amplifier (node {self.config.node_id}) sent no heartbeat for {silent_ms:g} ms, expected one every "
+            f"{self.config.node_heartbeat_period_ms} ms; check cable and power, then start it again"
+        )
+
+    # -- start-up dialogue ------------------------------------------------------------------------------------------
+
+    def _reset_node(self, t_us: int) -> Frames:
+        self.state = DriverState.RESETTING
+        self._deadline_us = t_us + self.config.boot_timeout_us
+        return (self._nmt(NmtCommand.RESET_NODE),)
+
+    def _boot_timed_out(self, t_us: int) -> Frames:
+        if self._repeats_left > 0:
+            self._repeats_left -= 1
+            return self._reset_node(t_us)
+        self._fail(
+            f"amplifier (node {self.config.node_id}) sent no boot-up message 0x{self._node_heartbeat_id:03X} within "
+            f"{self.config.boot_timeout_us / 1000:g} ms of NMT reset, {self.config.retries + 1} times; "
+            "check node id, power, wiring and bit rates"
+        )
+        return _NOTHING
+
+    def _begin(self, state: DriverState, t_us: int) -> Frames:
+        self.state = state
+        steps = identity_steps if state is DriverState.IDENTIFYING else configuration_steps
+        self._dialogue = SdoDialogue(steps(self.config), self.config.sdo_timeout_us, self.config.retries)
+        return self._sdo(self._dialogue.begin(t_us))
+
+    def _advance(self, requests: tuple[bytes, ...], t_us: int) -> Frames:
+        if self._dialogue.failure:
+            self._fail(f"amplifier (node {self.config.node_id}): {self._dialogue.failure}")
+        elif self._dialogue.done:
+            if self.state is DriverState.IDENTIFYING:
+                return self._begin(DriverState.CONFIGURING, t_us)
+            self._repeats_left = self.config.retries
+            self._heartbeat_next_us = t_us + self._heartbeat_period_us
+            return (self._heartbeat_frame, *self._start_node(t_us))
+        return self._sdo(requests)
+
+    def _start_node(self, t_us: int) -> Frames:
+        self.state = DriverState.STARTING
+        self._deadline_us = t_us + self.config.start_timeout_us
+        return (self._nmt(NmtCommand.START),)
+
+    def _start_timed_out(self, t_us: int) -> Frames:
+        if self._repeats_left > 0:
+            self._repeats_left -= 1
+            return self._start_node(t_us)
+        heard = "no heartbeat came" if self.node_state is None else f"its heartbeat says {_state_name(self.node_state)}"
+        self._fail(
+            f"amplifier (node {self.config.node_id}) did not become operational within "
+            f"{self.config.start_timeout_us / 1000:g} ms of NMT start, {self.config.retries + 1} times: {heard}; "
+            "look at its emergencies"
+        )
+        return (self._nmt(NmtCommand.PRE_OPERATIONAL),)
+
+    # -- small things -----------------------------------------------------------------------------------------------
+
+    def _fail(self, failure: str) -> None:
+        self.failure = self.failure or failure  # the first cause counts
+        self._fall_silent()
+        self.state = DriverState.FAILED
+
+    def _fall_silent(self) -> None:
+        self._node_deadline_us = _NEVER_US
+        self._deadline_us = _NEVER_US
+        self._heartbeat_next_us = _NEVER_US
+
+    def _frame(self, frame_id: int, data: bytes) -> Frame:
+        return Frame(frame_id, data, self._fd, self._fd)
+
+    def _nmt(self, command: NmtCommand) -> Frame:
+        return self._frame(cob_id.NMT, bytes((command, self.config.node_id)))
+
+    def _sdo(self, requests: tuple[bytes, ...]) -> Frames:
+        return tuple(self._frame(self._sdo_request_id, data) for data in requests)
+
+
+def _state_name(node_state: int) -> str:
+    try:
+        return NmtState(node_state).name.lower().replace("_", "-")
+    except ValueError:
+        return f"unknown state 0x{node_state:02X}"

@@ -1,0 +1,86 @@
+"""Emergency messages as text (CiA 301, 7.2.7 and table of emergency error codes; CiA 401 adds none that we need)."""
+
+import struct
+from typing import NamedTuple
+
+PROTECTION_CRC = 0xFF10  # ours: a drive PDO with a wrong CRC was not applied
+PROTECTION_COUNTER = 0xFF11  # ours: a drive PDO with a wrong alive counter was not applied
+
+_EXACT = {
+    0x8110: "CAN overrun, objects lost",
+    0x8120: "CAN in error passive mode",
+    0x8130: "heartbeat of the controller missed",
+    0x8140: "recovered from bus off",
+    0x8150: "identifier collision",
+    0x8210: "PDO not processed, too short",
+    0x8220: "PDO longer than its mapping",
+    0x8230: "DAM MPDO not processed, destination not available",
+    0x8240: "SYNC with unexpected length or counter",
+    0x8250: "RPDO time-out",
+    PROTECTION_CRC: "drive PDO with a wrong CRC",
+    PROTECTION_COUNTER: "drive PDO with a wrong alive counter",
+}
+_CLASS = {
+    0x00: "error reset or no error",
+    0x10: "generic error",
+    0x20: "current",
+    0x21: "current, input side",
+    0x22: "current inside the device",
+    0x23: "current, output side",
+    0x30: "voltage",
+    0x31: "mains voltage",
+    0x32: "voltage inside the device",
+    0x33: "output voltage",
+    0x40: "temperature",
+    0x41: "ambient temperature",
+    0x42: "device temperature",
+    0x50: "device hardware",
+    0x60: "device software",
+    0x61: "internal software",
+    0x62: "user software",
+    0x63: "data set",
+    0x70: "additional modules",
+    0x80: "monitoring",
+    0x81: "monitoring, communication",
+    0x82: "monitoring, protocol",
+    0x90: "external error",
+    0xF0: "additional functions",
+    0xFF: "device specific",
+}
+_FRAME = struct.Struct("<HB5s")
+
+
+class Emergency(NamedTuple):
+    """One emergency message: when it came, the code, error register (0x1001), five manufacturer bytes."""
+
+    t_us: int
+    code: int
+    register: int
+    manufacturer: bytes
+
+    @property
+    def is_reset(self) -> bool:
+        """Whether it says that an error is over (codes 0x00xx)."""
+        return self.code < 0x0100
+
+    @property
+    def text(self) -> str:
+        """For a person, e.g. ``EMCY 0x2310: current, output side (error register 0x03)``."""
+        suffix = f", data {self.manufacturer.hex(' ')}" if any(self.manufacturer) else ""
+        return f"EMCY 0x{self.code:04X}: {code_text(self.code)} (error register 0x{self.register:02X}{suffix})"
+
+
+def code_text(code: int) -> str:
+    """The meaning of an emergency error code; an unknown one falls back to its class, 0xXX00 and 0xX000."""
+    exact = _EXACT.get(code)
+    if exact is not None:
+        return exact
+    high = code >> 8
+    return _CLASS.get(high) or _CLASS.get(high & 0xF0) or "unknown error code"
+
+
+def decode_emergency(data: bytes, t_us: int) -> Emergency | None:
+    """The emergency in an EMCY frame's eight bytes; None if the length is not eight."""
+    if len(data) != _FRAME.size:
+        return None
+    return Emergency(t_us, *_FRAME.unpack(data))
