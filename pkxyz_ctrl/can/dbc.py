@@ -1,0 +1,180 @@
+"""The DBC of the bus, generated from the EDS, for cantools, python-can's viewer and everything else that reads DBCs.
+
+``python -m pkxyz_ctrl.can.dbc comb_amplifier.eds comb_amplifier.dbc`` writes it anew.
+"""
+
+import re
+import sys
+from collections import OrderedDict
+from pathlib import Path
+
+import canopen
+from cantools.database.can import Database, Message, Node, Signal
+from cantools.database.conversion import BaseConversion
+
+from . import cob_id
+from .cob_id import NmtCommand, NmtState
+from .codec import DRIVE_SCALE, AnalogScale
+
+CONTROLLER = "Controller"
+AMPLIFIER = "Amplifier"
+
+# The sense combs have 1.275e-7 F/m and 20 um of overlap at rest, so strokes of -2..27 um are 2.30..5.99 pF;
+# 16 bits over 2.15..6.15 pF are 2^-14 pF, about half a nanometre, a count.
+DEFAULT_SENSE_SCALE = AnalogScale(scale=2**-14 * 1e-12, offset=4.15e-12)
+
+_DRIVE_INDEX = 0x6411
+_SENSE_INDEX = 0x6401
+_SIGNED_TYPES = canopen.objectdictionary.datatypes.SIGNED_TYPES
+_FEMTO = 1e15
+
+
+def database_from_eds(
+    eds_path: Path,
+    node_id: int = 10,
+    controller_node_id: int = 127,
+    drive_scale: AnalogScale = DRIVE_SCALE,
+    sense_scale: AnalogScale = DEFAULT_SENSE_SCALE,
+) -> Database:
+    """Every frame between controller and amplifier as the EDS's default values describe it.
+
+    PDO signals follow the mapping entries; drive combs are scaled to V with ``drive_scale`` (V per count), sense combs
+    to fF with ``sense_scale`` (F per count, F). Raw values are the counts.
+    """
+    dictionary = canopen.import_od(str(eds_path), node_id)
+    conversions = {
+        _DRIVE_INDEX: ("V", _conversion(drive_scale, 1.0)),
+        _SENSE_INDEX: ("fF", _conversion(sense_scale, _FEMTO)),
+    }
+    messages = [
+        _message(
+            cob_id.NMT, "NMT", CONTROLLER, [_enumerated("NMT_command", 0, NmtCommand), _unsigned("NMT_node", 8, 8)]
+        ),
+        _message(dictionary[0x1005].default, "SYNC", CONTROLLER, [_sync_counter(dictionary)]),
+        _message(dictionary[0x1014].default, "EMCY", AMPLIFIER, _emergency_signals()),
+        _message(dictionary[0x1200][1].default, "SDO_request", CONTROLLER, _sdo_signals("SDO_request")),
+        _message(dictionary[0x1200][2].default, "SDO_response", AMPLIFIER, _sdo_signals("SDO_response")),
+        _heartbeat(AMPLIFIER, node_id),
+        _heartbeat(CONTROLLER, controller_node_id),
+    ]
+    for index in dictionary:
+        if 0x1400 <= index < 0x1600:
+            messages.append(_pdo(dictionary, index, CONTROLLER, conversions))
+        elif 0x1800 <= index < 0x1A00:
+            messages.append(_pdo(dictionary, index, AMPLIFIER, conversions))
+    return Database(
+        messages=sorted(messages, key=lambda message: message.frame_id),
+        nodes=[Node(CONTROLLER, "pkxyz_ctrl, the CANopen master"), Node(AMPLIFIER, f"comb amplifier, node {node_id}")],
+        version=f"generated from {eds_path.name}, node {node_id}",
+    )
+
+
+def dbc_text(database: Database) -> str:
+    """The DBC file's content, with line feeds only."""
+    return str(database.as_dbc_string()).replace("\r\n", "\n")
+
+
+def _pdo(
+    dictionary: canopen.ObjectDictionary,
+    index: int,
+    sender: str,
+    conversions: dict[int, tuple[str, BaseConversion]],
+) -> Message:
+    communication, entries = dictionary[index], dictionary[index + 0x200]
+    signals = []
+    bit = 0
+    for place in range(1, entries[0].default + 1):
+        entry = entries[place].default
+        mapped_index, subindex, length = entry >> 16, entry >> 8 & 0xFF, entry & 0xFF
+        variable = dictionary.get_variable(mapped_index, subindex)
+        unit, conversion = conversions.get(mapped_index, (None, BaseConversion.factory()))
+        is_signed = variable.data_type in _SIGNED_TYPES
+        lowest, highest = (-(1 << length - 1), (1 << length - 1) - 1) if is_signed else (0, (1 << length) - 1)
+        limits = (
+            _twelve_digits(float(conversion.raw_to_scaled(lowest if variable.min is None else variable.min))),
+            _twelve_digits(float(conversion.raw_to_scaled(highest if variable.max is None else variable.max))),
+        )
+        signals.append(
+            Signal(
+                _identifier(variable.name),
+                bit,
+                length,
+                is_signed=is_signed,
+                conversion=conversion,
+                minimum=limits[0],
+                maximum=limits[1],
+                unit=unit,
+                receivers=[_other(sender)],
+                comment=f"object 0x{mapped_index:04X}:{subindex:02X}",
+            )
+        )
+        bit += length
+    named = re.fullmatch(r"([RT]PDO) (\d+) communication parameter \((\w+)\)", communication.name)
+    if named is None:
+        raise ValueError(
+            f"object 0x{index:04X}: '{communication.name}' is not '[RT]PDO n communication parameter (role)'"
+        )
+    return _message(communication[1].default & 0x7FF, f"{named[1]}{named[2]}_{named[3]}", sender, signals)
+
+
+def _message(frame_id: int, name: str, sender: str, signals: list[Signal]) -> Message:
+    length = (max(signal.start + signal.length for signal in signals) + 7) // 8
+    for signal in signals:
+        signal.receivers = [_other(sender)]
+    return Message(frame_id, name, length, signals, senders=[sender], strict=True)
+
+
+def _heartbeat(sender: str, node_id: int) -> Message:
+    state = _enumerated(f"{sender}_state", 0, NmtState)
+    return _message(cob_id.HEARTBEAT_BASE + node_id, f"Heartbeat_{sender}", sender, [state])
+
+
+def _sync_counter(dictionary: canopen.ObjectDictionary) -> Signal:
+    return Signal("SYNC_counter", 0, 8, minimum=1, maximum=dictionary[0x1019].default)
+
+
+def _emergency_signals() -> list[Signal]:
+    manufacturer = [_unsigned(f"EMCY_manufacturer_{place}", 8 * place + 16, 8) for place in range(1, 6)]
+    return [_unsigned("EMCY_code", 0, 16), _unsigned("EMCY_register", 16, 8), *manufacturer]
+
+
+def _sdo_signals(prefix: str) -> list[Signal]:
+    return [
+        _unsigned(f"{prefix}_command", 0, 8),
+        _unsigned(f"{prefix}_index", 8, 16),
+        _unsigned(f"{prefix}_subindex", 24, 8),
+        _unsigned(f"{prefix}_data", 32, 32),
+    ]
+
+
+def _unsigned(name: str, start: int, length: int) -> Signal:
+    return Signal(name, start, length, minimum=0, maximum=(1 << length) - 1)
+
+
+def _enumerated(name: str, start: int, numbers: type[NmtCommand] | type[NmtState]) -> Signal:
+    choices = OrderedDict((int(number), number.name) for number in numbers)
+    return Signal(name, start, 8, conversion=BaseConversion.factory(choices=choices), minimum=0, maximum=255)
+
+
+def _conversion(scale: AnalogScale, unit_factor: float) -> BaseConversion:
+    return BaseConversion.factory(
+        scale=_twelve_digits(scale.scale * unit_factor), offset=_twelve_digits(scale.offset * unit_factor)
+    )
+
+
+def _twelve_digits(value: float) -> float:
+    # What a DBC reader needs, without the last digits of binary fractions.
+    return float(f"{value:.12g}")
+
+
+def _other(sender: str) -> str:
+    return AMPLIFIER if sender == CONTROLLER else CONTROLLER
+
+
+def _identifier(name: str) -> str:
+    return re.sub(r"\W+", "_", name)
+
+
+if __name__ == "__main__":
+    source, target = Path(sys.argv[1]), Path(sys.argv[2])
+    target.write_text(dbc_text(database_from_eds(source)), encoding="utf-8", newline="\n")
