@@ -94,7 +94,7 @@ def _bit_counts(can_id: int, data: bytes, flags: int) -> int:
             state, crc = _stuff(state, byte, 8), _crc15(crc, byte, 8)
         state = _stuff(state, crc, 15)
         stuffed = (state >> 8) + (1 if (state >> 1) & 0x7F == 5 else 0)
-        return n_header + 8 * length + 15 + stuffed + 1 + ACK_TO_END_BITS + INTERFRAME_BITS
+        return int(n_header + 8 * length + 15 + stuffed + 1 + ACK_TO_END_BITS + INTERFRAME_BITS)
     code = _fd_code(length)
     if code < 0 or flags & IS_REMOTE:
         return -1
@@ -108,18 +108,19 @@ def _bit_counts(can_id: int, data: bytes, flags: int) -> int:
         state = _stuff(state, np.int64(data[i]), 8)
     crc_field = FIXED_STUFFED_CRC21_BITS if length > 16 else FIXED_STUFFED_CRC17_BITS
     fast = 5 + 8 * length + (state >> 8) + crc_field + 1
-    return nominal | fast << 16 if switch else nominal + fast
+    return int(nominal | fast << 16 if switch else nominal + fast)
 
 
 @njit(cache=True)
 def duration_ns_kernel(can_id: int, data: bytes, flags: int, nominal_bitrate: int, data_bitrate: int) -> int:
+    """``frame_duration_ns`` for the hot path: -1 if there is no such frame."""
     counts = _bit_counts(can_id, data, flags)
     if counts < 0:
         return -1
     nominal_ns = ((counts & 0xFFFF) * 1_000_000_000 + nominal_bitrate // 2) // nominal_bitrate
     if counts >> 16 == 0:
-        return nominal_ns
-    return nominal_ns + ((counts >> 16) * 1_000_000_000 + data_bitrate // 2) // data_bitrate
+        return int(nominal_ns)
+    return int(nominal_ns + ((counts >> 16) * 1_000_000_000 + data_bitrate // 2) // data_bitrate)
 
 
 def _flags(frame: Frame, error_passive: bool) -> int:
@@ -165,3 +166,70 @@ def _what_is_wrong(frame: Frame) -> str:
     return f"{len(frame.data)} data bytes, but {'an FD' if frame.is_fd else 'a classic'} frame has " + (
         f"one of {FD_LENGTHS}" if frame.is_fd else "at most 8"
     )
+
+
+def worst_case_frame_us(
+    length: int,
+    nominal_bitrate: int,
+    data_bitrate: int = 0,
+    *,
+    is_fd: bool = False,
+    bitrate_switch: bool = False,
+    is_extended: bool = False,
+) -> float:
+    """The customary upper bound in us over all identifiers and data of ``length`` bytes (Davis et al. 2007).
+
+    A stuff bit after the first five bits and then after every fourth. Fixed bits make the bound unreachable for some
+    identifiers: ``frame_range_us`` is exact. Raises FrameFormatError.
+    """
+    frame = Frame(0, bytes(length), is_fd, bitrate_switch, is_extended=is_extended)
+    frame_bit_counts(frame)
+    n_header = 31 if is_extended else 12
+    if not is_fd:
+        stuffable = n_header + 7 + 8 * length + 15
+        bits = stuffable + (stuffable - 1) // 4 + 1 + ACK_TO_END_BITS + INTERFRAME_BITS
+        return bits * 1e6 / nominal_bitrate
+    n_header += 4 if is_extended else 5
+    stuffed_nominal, stuffed = (n_header - 2) // 4, (n_header + 5 + 8 * length - 2) // 4
+    crc_field = FIXED_STUFFED_CRC21_BITS if length > 16 else FIXED_STUFFED_CRC17_BITS
+    nominal = n_header + stuffed_nominal + ACK_TO_END_BITS + INTERFRAME_BITS
+    fast = 5 + 8 * length + stuffed - stuffed_nominal + crc_field + 1
+    return nominal * 1e6 / nominal_bitrate + fast * 1e6 / (data_bitrate if bitrate_switch else nominal_bitrate)
+
+
+def frame_range_us(
+    can_id: int, length: int, nominal_bitrate: int, data_bitrate: int = 0, *, is_fd: bool = False
+) -> tuple[float, float]:
+    """Shortest and longest duration in us of a data frame with this 11-bit identifier, over all its data.
+
+    FD frames are taken with bit-rate switch, ``data_bitrate`` then matters. Exact for FD; for classic frames the CRC
+    is taken as free, so the range may be a few bits wider than any data attain. Raises FrameFormatError.
+    """
+    frame_bit_counts(Frame(can_id, bytes(length), is_fd))
+    if not is_fd:
+        stuffable = f"{can_id:012b}000{length:04b}" + "x" * (8 * length + 15)
+        fixed = len(stuffable) + 1 + ACK_TO_END_BITS + INTERFRAME_BITS
+        fewest, most = _stuff_bit_range(stuffable + "x")  # one more bit: a stuff bit may follow the CRC's last
+        return (fixed + fewest) * 1e6 / nominal_bitrate, (fixed + most) * 1e6 / nominal_bitrate
+    header = f"{can_id:012b}00101"  # RRS, IDE, FDF, res, BRS
+    stuffable = f"{header}0{_fd_code(length):04b}" + "x" * (8 * length)
+    stuffed, (fewest, most) = _stuff_bit_range(header)[0], _stuff_bit_range(stuffable)
+    crc_field = FIXED_STUFFED_CRC21_BITS if length > 16 else FIXED_STUFFED_CRC17_BITS
+    nominal = len(header) + stuffed + ACK_TO_END_BITS + INTERFRAME_BITS
+    fast = len(stuffable) - len(header) - stuffed + crc_field + 1
+    slow_us = nominal * 1e6 / nominal_bitrate
+    return slow_us + (fast + fewest) * 1e6 / data_bitrate, slow_us + (fast + most) * 1e6 / data_bitrate
+
+
+def _stuff_bit_range(bits: str) -> tuple[int, int]:
+    """Fewest and most stuff bits ahead of the last of ``bits``, where "x" may be either."""
+    reached = {1: (0, 0)}
+    for place in bits:
+        following: dict[int, tuple[int, int]] = {}
+        for state, (fewest, most) in reached.items():
+            for bit in (0, 1) if place == "x" else (int(place),):
+                after = _stuff(state, bit, 1)
+                low, high = following.get(after & 0xFF, (len(bits), 0))
+                following[after & 0xFF] = min(low, fewest + (after >> 8)), max(high, most + (after >> 8))
+        reached = following
+    return min(low for low, _ in reached.values()), max(high for _, high in reached.values())

@@ -6,27 +6,16 @@ EOF; its interframe space then still keeps the wire. Frames compete if they are 
 in which the start of frame lies.
 """
 
-import random
-from collections import deque
 from collections.abc import Callable
-from enum import IntEnum
 from functools import partial
-from heapq import heapify, heappop, heappush
+from heapq import heapify, heappop
 from typing import NamedTuple
 from weakref import WeakValueDictionary
 
 from hil.clock import Lockstep
-from hil.frame_time import (
-    BIT_RATE_SWITCH,
-    ERROR_PASSIVE,
-    INTERFRAME_BITS,
-    IS_EXTENDED,
-    IS_FD,
-    IS_REMOTE,
-    FrameFormatError,
-    duration_ns_kernel,
-    frame_bit_counts,
-)
+from hil.disturbance import Disturbance
+from hil.endpoint import Endpoint, Entry, dominance
+from hil.frame_time import INTERFRAME_BITS, FrameFormatError, frame_bit_counts
 from pkxyz_ctrl.can.frame import Frame
 
 ERROR_DELIMITER_BITS = 8  # the error flags themselves, 6 + 1 bits, lie where the frame's EOF would have been
@@ -38,146 +27,6 @@ RECESSIVE_RUN_BITS = 11  # also what ends every frame and error frame: delimiter
 ERROR_ACK, ERROR_PROTOCOL, ERROR_BUS_OFF, ERROR_BUS, ERROR_RESTARTED = 0x020, 0x008, 0x040, 0x080, 0x100
 
 _channels: "WeakValueDictionary[str, Wire]" = WeakValueDictionary()
-
-
-class ErrorState(IntEnum):
-    ACTIVE = 0
-    PASSIVE = 1  # a counter at 128 or more
-    BUS_OFF = 2  # transmit counter at 256 or more
-
-
-class Outcome(NamedTuple):
-    """What a fault makes of a frame: an error frame, or deliveries as (delay_us, frame) in the receivers."""
-
-    corrupt: bool = False
-    deliveries: tuple[tuple[int, Frame], ...] = ()
-
-
-CORRUPTED = Outcome(corrupt=True)
-DROPPED = Outcome()
-
-FaultTap = Callable[[Frame, str, int], Outcome | None]
-"""Called with frame, sender's name and t_us as each frame ends; None leaves it alone."""
-
-_Entry = tuple[int, int, Frame, int]  # arbitration key, order of queueing, frame, duration_ns
-
-
-class Endpoint:
-    """One CAN controller on a wire, made by ``Wire.attach``."""
-
-    __slots__ = (
-        "_earliest_ns",
-        "_received",
-        "_recovery_runs",
-        "_to_send",
-        "_wire",
-        "auto_recover",
-        "bus_off",
-        "error_frames",
-        "listen_only",
-        "name",
-        "on_frame",
-        "on_sent",
-        "overruns",
-        "queue_limit",
-        "receive_errors",
-        "send_drops",
-        "transmit_errors",
-    )
-
-    def __init__(
-        self,
-        wire: "Wire",
-        name: str,
-        on_frame: Callable[[Frame, int], object] | None,
-        queue_limit: int,
-        on_sent: Callable[[Frame, int], object] | None,
-        listen_only: bool,
-        error_frames: bool,
-        auto_recover: bool,
-    ) -> None:
-        self._wire: Wire | None = wire
-        self.name = name
-        self.on_frame = on_frame
-        self.on_sent = on_sent
-        self.queue_limit = queue_limit
-        self.listen_only = listen_only
-        self.error_frames = error_frames
-        self.auto_recover = auto_recover
-        self.transmit_errors = 0  # TEC of ISO 11898-1
-        self.receive_errors = 0  # REC
-        self.bus_off = False
-        self.overruns = 0  # frames lost because the receive queue was full
-        self.send_drops = 0  # frames refused or discarded unsent
-        self._to_send: list[_Entry] = []
-        self._received: deque[tuple[Frame, int]] = deque()
-        self._earliest_ns = 0
-        self._recovery_runs = 0
-
-    @property
-    def state(self) -> ErrorState:
-        if self.bus_off:
-            return ErrorState.BUS_OFF
-        return ErrorState.PASSIVE if self._is_passive() else ErrorState.ACTIVE
-
-    def _is_passive(self) -> bool:
-        return self.transmit_errors >= 128 or self.receive_errors >= 128
-
-    def send(self, frame: Frame) -> bool:
-        """Queue ``frame``; False if it was refused because the queue is full or the endpoint is bus-off.
-
-        Raises FrameFormatError for a frame that cannot exist on this wire, RuntimeError if detached or listen-only.
-        """
-        wire = self._wire
-        if wire is None or self.listen_only:
-            raise RuntimeError(f"endpoint {self.name!r} is {'listen-only' if wire else 'detached'}")
-        can_id, data, is_fd, bitrate_switch, is_remote, is_extended, is_error = frame
-        flags = (IS_FD if is_fd else 0) | (BIT_RATE_SWITCH if bitrate_switch else 0)
-        key = can_id << 21
-        if is_remote or is_extended or is_error:
-            flags |= (IS_REMOTE if is_remote else 0) | (IS_EXTENDED if is_extended else 0)
-            key = _arbitration_key(frame)
-        if self.transmit_errors >= 128 or self.receive_errors >= 128:
-            flags |= ERROR_PASSIVE
-        duration_ns = duration_ns_kernel(can_id, data, flags, wire.nominal_bitrate, wire._fast_bitrate)
-        if duration_ns < 0 or (is_fd and wire.data_bitrate is None):
-            wire._refuse(frame)
-        to_send = self._to_send
-        if self.bus_off or len(to_send) >= self.queue_limit:
-            self.send_drops += 1
-            return False
-        wire._order = order = wire._order + 1
-        heappush(to_send, (key, order, frame, duration_ns))
-        if not wire._delivering and (wire._end_us < 0 or wire.clock.now_us * 1000 <= wire._start_ns):
-            wire._arbitrate()
-        return True
-
-    def receive_nowait(self) -> tuple[Frame, int] | None:
-        """The oldest received frame and its time in us, None if there is none. For endpoints without ``on_frame``."""
-        return self._received.popleft() if self._received else None
-
-    def pending(self) -> int:
-        """Number of frames queued and not yet sent, the one on the wire included."""
-        return len(self._to_send)
-
-    def flush(self) -> None:
-        """Discard all queued frames but the one on the wire."""
-        wire = self._wire
-        kept = [e for e in self._to_send if wire is not None and e is wire._entry and wire._has_started()]
-        self.send_drops += len(self._to_send) - len(kept)
-        self._to_send[:] = kept
-        if wire is not None and not kept and wire._sender is self:
-            wire._arbitrate()
-
-    def recover(self) -> None:
-        """Leave bus-off after 128 runs of 11 recessive bits. For endpoints without ``auto_recover``."""
-        if self.bus_off and self._wire is not None:
-            self._wire._begin_recovery(self)
-
-    def detach(self) -> None:
-        """Unplug. A frame on its way is cut off; received frames stay readable."""
-        if self._wire is not None:
-            self._wire._detach(self)
 
 
 class WireStatistics(NamedTuple):
@@ -192,7 +41,7 @@ class WireStatistics(NamedTuple):
 class Wire:
     """A bus with the given bit rates in bit/s; ``data_bitrate`` None makes it a classic one.
 
-    ``seed`` feeds the only randomness, ``bit_error_rate``: the probability that a bit of a frame is disturbed.
+    ``seed`` feeds the only randomness, the bit errors that ``disturbance`` can be told to make.
     """
 
     def __init__(
@@ -203,22 +52,20 @@ class Wire:
         self.clock = clock
         self.nominal_bitrate = nominal_bitrate
         self.data_bitrate = data_bitrate
-        self.fault_tap: FaultTap | None = None
-        self.bit_error_rate = 0.0
+        self.disturbance = Disturbance(seed)
         self._fast_bitrate = data_bitrate or nominal_bitrate
-        self._random = random.Random(seed)
         self._interframe_ns = self._bits_ns(INTERFRAME_BITS)
         self._endpoints: tuple[Endpoint, ...] = ()
         self._nodes = 0  # endpoints that acknowledge
-        self._doomed: list[tuple[Callable[[Frame], bool], int]] = []  # predicate, how many more
         self._order = 0
         self._frames = 0
         self._error_frames = 0
         self._busy_ns = 0
+        self._first = WireStatistics(clock.now_us, 0, 0, 0)
         # the transmission under way or, until its start is past, the one that would win the arbitration
         self._sender: Endpoint | None = None
-        self._entry: _Entry | None = None
-        self._rivals: list[Endpoint] = []  # others that sent the same identifier at the same time
+        self._entry: Entry | None = None
+        self._rivals: list[tuple[Endpoint, Entry]] = []  # others that send the same identifier at the same time
         self._start_ns = 0
         self._end_ns = 0  # end of EOF
         self._end_us = -1  # -1: idle
@@ -259,6 +106,7 @@ class Wire:
         if endpoint in self._recovering:
             self._recovering.remove(endpoint)
         endpoint._wire = None
+        endpoint.bus_off = True  # if this happens during a delivery, it gets no more of it
         endpoint.on_frame = endpoint.on_sent = None
         endpoint.send_drops += len(endpoint._to_send)
         endpoint._to_send.clear()
@@ -280,10 +128,10 @@ class Wire:
             busy_ns += max(0, now_ns - self._start_ns)
         return WireStatistics(self.clock.now_us, busy_ns, self._frames, self._error_frames)
 
-    def bus_load(self, since: WireStatistics = WireStatistics(0, 0, 0, 0)) -> float:
-        """Fraction of the time since ``since`` in which the wire was taken, 0..1."""
-        now = self.statistics()
-        return (now.busy_ns - since.busy_ns) / max(1, (now.t_us - since.t_us) * 1000)
+    def bus_load(self, since: WireStatistics | None = None) -> float:
+        """Fraction of the time since ``since`` (None: since the wire was made) in which the wire was taken, 0..1."""
+        now, then = self.statistics(), since or self._first
+        return (now.busy_ns - then.busy_ns) / max(1, (now.t_us - then.t_us) * 1000)
 
     # -- transmission ------------------------------------------------------------------------------------------------
 
@@ -292,14 +140,18 @@ class Wire:
         ready_ns = self.clock.now_us * 1000
         if ready_ns < self._free_ns:
             ready_ns = self._free_ns
-        sender, entry, tie = self._lowest(ready_ns)
-        if entry is None:  # nothing to send, or only by endpoints that must wait first
-            ready_ns = min((e._earliest_ns for e in self._endpoints if e._to_send), default=ready_ns)
-            sender, entry, tie = self._lowest(ready_ns)
-        if tie and entry is not None:
-            sender, entry, self._rivals = self._most_dominant(entry[0], ready_ns)
-        elif self._rivals:
-            self._rivals = []
+        sender, entry, tie, suspended = None, None, False, 0
+        for endpoint in self._endpoints:
+            if endpoint._to_send:
+                head = endpoint._to_send[0]
+                if endpoint._earliest_ns > ready_ns:
+                    suspended += 1
+                elif entry is None or head[0] < entry[0]:
+                    sender, entry, tie = endpoint, head, False
+                elif head[0] == entry[0]:
+                    tie = True
+        if tie or (suspended and entry is None) or self._rivals:
+            ready_ns, sender, entry = self._arbitrate_slowly(ready_ns)
         if entry is None:
             self._sender, self._entry, self._end_us = None, None, -1
             return
@@ -311,23 +163,14 @@ class Wire:
         self._end_us = end_us = -(-end_ns // 1000)
         self.clock.call_at(end_us, self._complete)
 
-    def _lowest(self, ready_ns: int) -> tuple[Endpoint | None, _Entry | None, bool]:
-        """The endpoint and its entry that win an arbitration at ``ready_ns``; True if another sends the same key."""
-        sender, entry, tie = None, None, False
-        for endpoint in self._endpoints:
-            if endpoint._to_send and endpoint._earliest_ns <= ready_ns:
-                head = endpoint._to_send[0]
-                if entry is None or head[0] < entry[0]:
-                    sender, entry, tie = endpoint, head, False
-                elif head[0] == entry[0]:
-                    tie = True
-        return sender, entry, tie
-
-    def _most_dominant(self, key: int, ready_ns: int) -> tuple[Endpoint, _Entry, list[Endpoint]]:
-        """Of several that send the same identifier at once: the one whose bits prevail, and the others."""
-        tied = [e for e in self._endpoints if e._to_send and e._to_send[0][0] == key and e._earliest_ns <= ready_ns]
-        tied.sort(key=lambda e: _dominance(e._to_send[0][2]))
-        return tied[0], tied[0]._to_send[0], tied[1:]
+    def _arbitrate_slowly(self, ready_ns: int) -> tuple[int, Endpoint | None, Entry | None]:
+        """The cases that are rare: senders that must wait after their own frame, and equal identifiers."""
+        ready = [e for e in self._endpoints if e._to_send]
+        ready_ns = max(ready_ns, min((e._earliest_ns for e in ready), default=ready_ns))
+        ready = [e for e in ready if e._earliest_ns <= ready_ns]
+        ready.sort(key=lambda e: (e._to_send[0][0], dominance(e._to_send[0][2])))
+        self._rivals = [(e, e._to_send[0]) for e in ready[1:] if e._to_send[0][0] == ready[0]._to_send[0][0]]
+        return (ready_ns, ready[0], ready[0]._to_send[0]) if ready else (ready_ns, None, None)
 
     def _complete(self) -> None:
         """The frame on the wire has reached the end of its EOF."""
@@ -344,9 +187,9 @@ class Wire:
             self._runs += 1 + (self._start_ns - previous_free_ns) // self._bits_ns(RECESSIVE_RUN_BITS)
         self._delivering = True
         try:
-            if self._nodes < 2 or self._rivals or self.fault_tap is not None or self._doomed or self.bit_error_rate:
+            if self.disturbance.armed or self._nodes < 2 or self._rivals or sender._wire is None:
                 self._complete_under_faults(sender, entry, t_us)
-            elif sender._wire is not None:
+            else:
                 self._confirm(sender, entry, t_us)
                 self._deliver(entry[2], t_us, sender)
         finally:
@@ -356,7 +199,7 @@ class Wire:
                     self._arbitrate()
                     break
 
-    def _confirm(self, sender: Endpoint, entry: _Entry, t_us: int) -> None:
+    def _confirm(self, sender: Endpoint, entry: Entry, t_us: int) -> None:
         to_send = sender._to_send
         if to_send[0] is entry:
             heappop(to_send)
@@ -387,51 +230,35 @@ class Wire:
 
     # -- faults ------------------------------------------------------------------------------------------------------
 
-    def corrupt_next(self, predicate: Callable[[Frame], bool] = lambda frame: True, count: int = 1) -> None:
-        """Destroy the next ``count`` frames for which ``predicate`` holds, retransmissions included."""
-        self._doomed.append((predicate, count))
-
-    def _complete_under_faults(self, sender: Endpoint, entry: _Entry, t_us: int) -> None:
-        rivals, self._rivals = self._rivals, []
+    def _complete_under_faults(self, sender: Endpoint, entry: Entry, t_us: int) -> None:
         frame = entry[2]
-        twins = [e for e in rivals if e._to_send[0][2] == frame]  # bit for bit the same: nobody notices
-        losers = [e for e in rivals if e not in twins]
-        if sender._wire is None:
-            self._count_error([], ERROR_PROTOCOL)
-            return
+        rivals = [(e, its) for e, its in self._rivals if e._wire is not None]
+        self._rivals = []
+        involved = [sender, *(e for e, _ in rivals)]
+        twins = [(sender, entry), *((e, its) for e, its in rivals if its[2] == frame)]  # the same bits: nobody notices
+        losers = [e for e, its in rivals if its[2] != frame]
+        if sender._wire is None:  # unplugged in the middle
+            return self._count_error([], ERROR_PROTOCOL)
         if any(not e._is_passive() for e in losers):
-            self._count_error([sender, *rivals], ERROR_PROTOCOL)
-            return
+            return self._count_error(involved, ERROR_PROTOCOL)
         if self._nodes < 2:
-            self._count_error([sender], ERROR_ACK)
-            return
-        outcome = self._outcome(frame, sender.name, t_us)
+            return self._count_error([sender], ERROR_ACK)
+        outcome = self.disturbance.judge(frame, sender.name, t_us) if self.disturbance.armed else None
         if outcome is not None and outcome.corrupt:
-            self._count_error([sender, *rivals], ERROR_PROTOCOL)
-            return
+            return self._count_error(involved, ERROR_PROTOCOL)
         for loser in losers:  # their passive error flags disturb nobody
             self._count_transmit_error(loser, ERROR_PROTOCOL)
-        for twin in (sender, *twins):
-            self._confirm(twin, twin._to_send[0] if twin is not sender else entry, t_us)
+        for twin, its in twins:
+            self._confirm(twin, its, t_us)
+        senders = [e for e, _ in twins]
         for delay_us, delivered in ((0, frame),) if outcome is None else outcome.deliveries:
             if delay_us <= 0:
-                self._deliver(delivered, t_us, sender, *twins)
+                self._deliver(delivered, t_us, *senders)
             else:
-                self.clock.call_at(t_us + delay_us, partial(self._deliver_late, delivered, sender, *twins))
+                self.clock.call_at(t_us + delay_us, partial(self._deliver_late, delivered, *senders))
 
     def _deliver_late(self, frame: Frame, *senders: Endpoint) -> None:
         self._deliver(frame, self.clock.now_us, *senders)
-
-    def _outcome(self, frame: Frame, sender: str, t_us: int) -> Outcome | None:
-        for i, (predicate, count) in enumerate(self._doomed):
-            if predicate(frame):
-                self._doomed[i : i + 1] = [(predicate, count - 1)] if count > 1 else []
-                return CORRUPTED
-        if self.bit_error_rate:
-            bits = sum(frame_bit_counts(frame))
-            if self._random.random() < 1.0 - (1.0 - self.bit_error_rate) ** bits:
-                return CORRUPTED
-        return None if self.fault_tap is None else self.fault_tap(frame, sender, t_us)
 
     # -- fault confinement (ISO 11898-1, 12.1.4) ---------------------------------------------------------------------
 
@@ -446,8 +273,7 @@ class Wire:
         for endpoint in self._endpoints:
             if endpoint not in senders and not endpoint.listen_only and not endpoint.bus_off:
                 endpoint.receive_errors = min(endpoint.receive_errors + 1, 128)
-        worst = senders[0] if senders else None
-        self._announce(kind | ERROR_BUS, worst)
+        self._announce(kind | ERROR_BUS, senders[0] if senders else None)
 
     def _count_transmit_error(self, endpoint: Endpoint, kind: int) -> None:
         if endpoint._is_passive():
@@ -495,7 +321,7 @@ class Wire:
         self._announce(ERROR_RESTARTED, endpoint)
 
     def _announce(self, kind: int, endpoint: Endpoint | None) -> None:
-        """Tell those who asked for error frames, with the counters of the endpoint concerned as in linux/can/error.h."""
+        """Tell those who asked for error frames; bytes 6 and 7 are the endpoint's counters, as in linux/can/error.h."""
         counters = (min(endpoint.transmit_errors, 255), endpoint.receive_errors) if endpoint is not None else (0, 0)
         frame = Frame(kind, bytes((0, 0, 0, 0, 0, 0, *counters)), is_error=True)
         for listener in self._endpoints:
@@ -521,15 +347,3 @@ class Wire:
 def find_wire(channel: str) -> Wire | None:
     """The living wire published as ``channel``."""
     return _channels.get(channel)
-
-
-def _arbitration_key(frame: Frame) -> int:
-    """The bits that arbitrate, as one number: the smaller wins. Base identifier, RTR or SRR, IDE, extension, RTR."""
-    if not frame.is_extended:
-        return frame.can_id << 21 | frame.is_remote << 20
-    return (frame.can_id >> 18) << 21 | 3 << 19 | (frame.can_id & 0x3FFFF) << 1 | frame.is_remote
-
-
-def _dominance(frame: Frame) -> tuple[bool, int, bytes]:
-    """Order of frames with equal arbitration bits: the first dominant bit where they differ prevails (FDF, DLC, data)."""
-    return frame.is_fd, len(frame.data), frame.data

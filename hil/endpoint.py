@@ -1,0 +1,152 @@
+"""A CAN controller on the simulated wire: its queues, its error counters and its error state."""
+
+from collections import deque
+from collections.abc import Callable
+from enum import IntEnum
+from heapq import heappush
+from typing import TYPE_CHECKING
+
+from hil.frame_time import BIT_RATE_SWITCH, ERROR_PASSIVE, IS_EXTENDED, IS_FD, IS_REMOTE, duration_ns_kernel
+from pkxyz_ctrl.can.frame import Frame
+
+if TYPE_CHECKING:
+    from hil.wire import Wire
+
+
+class ErrorState(IntEnum):
+    ACTIVE = 0
+    PASSIVE = 1  # a counter at 128 or more
+    BUS_OFF = 2  # transmit counter at 256 or more
+
+
+Entry = tuple[int, int, Frame, int]  # arbitration key, order of queueing, frame, duration_ns
+
+
+class Endpoint:
+    """One CAN controller on a wire, made by ``Wire.attach``."""
+
+    __slots__ = (
+        "_earliest_ns",
+        "_received",
+        "_recovery_runs",
+        "_to_send",
+        "_wire",
+        "auto_recover",
+        "bus_off",
+        "error_frames",
+        "listen_only",
+        "name",
+        "on_frame",
+        "on_sent",
+        "overruns",
+        "queue_limit",
+        "receive_errors",
+        "send_drops",
+        "transmit_errors",
+    )
+
+    def __init__(
+        self,
+        wire: "Wire",
+        name: str,
+        on_frame: Callable[[Frame, int], object] | None,
+        queue_limit: int,
+        on_sent: Callable[[Frame, int], object] | None,
+        listen_only: bool,
+        error_frames: bool,
+        auto_recover: bool,
+    ) -> None:
+        self._wire: Wire | None = wire
+        self.name = name
+        self.on_frame = on_frame
+        self.on_sent = on_sent
+        self.queue_limit = queue_limit
+        self.listen_only = listen_only
+        self.error_frames = error_frames
+        self.auto_recover = auto_recover
+        self.transmit_errors = 0  # TEC of ISO 11898-1
+        self.receive_errors = 0  # REC
+        self.bus_off = False
+        self.overruns = 0  # frames lost because the receive queue was full
+        self.send_drops = 0  # frames refused or discarded unsent
+        self._to_send: list[Entry] = []
+        self._received: deque[tuple[Frame, int]] = deque()
+        self._earliest_ns = 0
+        self._recovery_runs = 0
+
+    @property
+    def state(self) -> ErrorState:
+        if self.bus_off:
+            return ErrorState.BUS_OFF
+        return ErrorState.PASSIVE if self._is_passive() else ErrorState.ACTIVE
+
+    def _is_passive(self) -> bool:
+        return self.transmit_errors >= 128 or self.receive_errors >= 128
+
+    def send(self, frame: Frame) -> bool:
+        """Queue ``frame``; False if it was refused because the queue is full or the endpoint is bus-off.
+
+        Raises FrameFormatError for a frame that cannot exist on this wire, RuntimeError if detached or listen-only.
+        """
+        wire = self._wire
+        if wire is None or self.listen_only:
+            raise RuntimeError(f"endpoint {self.name!r} is {'listen-only' if wire else 'detached'}")
+        can_id, data, is_fd, bitrate_switch, is_remote, is_extended, is_error = frame
+        flags = (IS_FD if is_fd else 0) | (BIT_RATE_SWITCH if bitrate_switch else 0)
+        key = can_id << 21
+        if is_remote or is_extended or is_error:
+            flags |= (IS_REMOTE if is_remote else 0) | (IS_EXTENDED if is_extended else 0)
+            key = arbitration_key(frame)
+        if self.transmit_errors >= 128 or self.receive_errors >= 128:
+            flags |= ERROR_PASSIVE
+        duration_ns = duration_ns_kernel(can_id, data, flags, wire.nominal_bitrate, wire._fast_bitrate)
+        if duration_ns < 0 or (is_fd and wire.data_bitrate is None):
+            wire._refuse(frame)
+        to_send = self._to_send
+        if self.bus_off or len(to_send) >= self.queue_limit:
+            self.send_drops += 1
+            return False
+        wire._order = order = wire._order + 1
+        heappush(to_send, (key, order, frame, duration_ns))
+        if not wire._delivering and (wire._end_us < 0 or wire.clock.now_us * 1000 <= wire._start_ns):
+            wire._arbitrate()
+        return True
+
+    def receive_nowait(self) -> tuple[Frame, int] | None:
+        """The oldest received frame and its time in us, None if there is none. For endpoints without ``on_frame``."""
+        return self._received.popleft() if self._received else None
+
+    def pending(self) -> int:
+        """Number of frames queued and not yet sent, the one on the wire included."""
+        return len(self._to_send)
+
+    def flush(self) -> None:
+        """Discard all queued frames but the one on the wire."""
+        wire = self._wire
+        kept = [e for e in self._to_send if wire is not None and e is wire._entry and wire._has_started()]
+        self.send_drops += len(self._to_send) - len(kept)
+        self._to_send[:] = kept
+        if wire is not None and not kept and wire._sender is self:
+            wire._arbitrate()
+
+    def recover(self) -> None:
+        """Leave bus-off after 128 runs of 11 recessive bits. For endpoints without ``auto_recover``."""
+        if self.bus_off and self._wire is not None:
+            self._wire._begin_recovery(self)
+
+    def detach(self) -> None:
+        """Unplug. A frame on its way is cut off; received frames stay readable."""
+        if self._wire is not None:
+            self._wire._detach(self)
+
+
+def arbitration_key(frame: Frame) -> int:
+    """The bits that arbitrate, as one number: the smaller wins. Base identifier, RTR or SRR, IDE, extension, RTR."""
+    if not frame.is_extended:
+        return frame.can_id << 21 | frame.is_remote << 20
+    return (frame.can_id >> 18) << 21 | 3 << 19 | (frame.can_id & 0x3FFFF) << 1 | frame.is_remote
+
+
+def dominance(frame: Frame) -> tuple[bool, int, bytes]:
+    """Order of frames with equal arbitration bits: the first bit where they differ decides (FDF, DLC, data)."""
+    return frame.is_fd, len(frame.data), frame.data
