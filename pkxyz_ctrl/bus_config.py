@@ -1,0 +1,59 @@
+"""How the controller talks to the amplifier: rate, bus, scales."""
+
+from typing import Annotated, Self
+
+from pydantic import Field, model_validator
+
+from pkxyz_ctrl.can.driver_config import DriverConfig
+from pkxyz_ctrl.config import FrozenModel
+
+Positive = Annotated[float, Field(gt=0)]
+
+
+class CanConfig(FrozenModel):
+    """The CAN segment and the node on it."""
+
+    interface: str = "pkxyz-sim"
+    """python-can interface: "pkxyz-sim" for the simulated bus, else socketcan, slcan, gs_usb, virtual ..."""
+    channel: str = "pkxyz"
+    nominal_bitrate_bit_per_s: Annotated[int, Field(gt=0, le=1_000_000)]
+    data_bitrate_bit_per_s: Annotated[int, Field(gt=0, le=8_000_000)] | None = None
+    """Bit rate of the data phase of FD frames; absent on a classic bus."""
+    turnaround_us: Annotated[int, Field(ge=0, le=1000)]
+    """From the end of the SYNC frame until the node's sense frame is ready to be sent."""
+    compute_us: Annotated[int, Field(ge=0, le=1000)]
+    """From the end of the sense frame until the controller's drive frame is ready to be sent; lockstep charges it."""
+    driver: DriverConfig
+
+    @model_validator(mode="after")
+    def _rates_match(self) -> Self:
+        if self.driver.fd != (self.data_bitrate_bit_per_s is not None):
+            raise ValueError("driver.fd and data_bitrate_bit_per_s belong together: give both for CAN FD, neither for classic CAN")
+        return self
+
+
+class AnalogConfig(FrozenModel):
+    """Counts of the process image and what they mean."""
+
+    drive_volt_per_count: Positive
+    """Output count to comb voltage; count 0 is 0 V, so that a cleared buffer discharges the combs."""
+    sense_farad_per_count: Positive
+    sense_offset_f: Positive
+    """Capacitance of input count 0."""
+
+
+class BusConfig(FrozenModel):
+    """One way to reach a stage: the period of the loop and what lies between a sample and its consequence."""
+
+    name: Annotated[str, Field(min_length=1)]
+    period_us: Annotated[int, Field(ge=20, le=100_000)]
+    delay_periods: Annotated[int, Field(ge=1, le=2)] = 1
+    """Periods from a sample to the start of the action that it causes; 2 for adapters that cannot answer within one."""
+    analog: AnalogConfig
+    can: CanConfig | None = None
+    """Absent: no bus at all, fast lane only."""
+
+    @property
+    def period_s(self) -> float:
+        """Period of the loop in s."""
+        return self.period_us * 1e-6

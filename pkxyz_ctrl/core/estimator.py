@@ -1,0 +1,87 @@
+"""Kalman filter of the platform: position, velocity and disturbance force, nine states, constant gain, compiled.
+
+State s = [x - x_0, v, d] in platform coordinates about the operating point x_0. Over one period, with the comb forces held
+and approached through the amplifier's pole::
+
+    s+ = Phi s + Gamma w + Gamma_lag (w_old - w),   w = J(x)^T F - grad V(x) + K_0 (x - x_0)
+
+so the linear part carries the resonance and the input w the exact energy gradient and Jacobian at the estimate: the filter
+follows the stage over the whole workspace with one gain. The commanded forces of the last tick act from the sample of this
+one, hence the loop's period of delay is in the bookkeeping of w, not in extra states. A sample shows x - tau v, tau being
+the sense chain's delay.
+"""
+
+import numpy as np
+from numba import njit
+from numpy.typing import NDArray
+
+from pkxyz_ctrl.core.elasticity import energy_gradient
+from pkxyz_ctrl.core.kinematics import jacobian
+from pkxyz_ctrl.core.linear3 import multiply3_transposed
+
+Array = NDArray[np.float64]
+
+ESTIMATOR = np.dtype(
+    [
+        ("transition", "f8", (6, 9)),  # first six rows of Phi; the disturbance keeps its value
+        ("input", "f8", (6, 3)),  # Gamma
+        ("input_lag", "f8", (6, 3)),  # Gamma_lag
+        ("gain", "f8", (9, 3)),  # steady-state Kalman gain of the measurement update
+        ("stiffness_n_per_m", "f8", (3, 3)),  # K_0
+        ("operating_point_m", "f8", (3,)),  # x_0
+        ("sense_delay_s", "f8"),  # tau
+    ],
+    align=True,
+)
+
+ESTIMATE = np.dtype(
+    [
+        ("predicted", "f8", (9,)),  # s at the next sample, before it is seen
+        ("filtered", "f8", (9,)),  # s at the last sample, after it was seen
+        ("ahead", "f8", (9,)),  # s at the instant from which the force of this tick acts
+        ("innovation_m", "f8", (3,)),
+    ],
+    align=True,
+)
+
+
+@njit(cache=True)
+def update(estimator, estimate, measured_m: Array, has_measurement: bool) -> None:
+    """Measurement update at a sample: filtered = predicted + gain (y - h(predicted)). Without a measurement the prediction stands."""
+    predicted, filtered, innovation = estimate["predicted"], estimate["filtered"], estimate["innovation_m"]
+    gain, origin, tau = estimator["gain"], estimator["operating_point_m"], estimator["sense_delay_s"]
+    for i in range(3):
+        innovation[i] = measured_m[i] - origin[i] - (predicted[i] - tau * predicted[3 + i]) if has_measurement else 0.0
+    for i in range(9):
+        filtered[i] = predicted[i] + gain[i, 0] * innovation[0] + gain[i, 1] * innovation[1] + gain[i, 2] * innovation[2]
+
+
+@njit(cache=True)
+def net_input(geometry, elasticity, estimator, position_m: Array, force_n: Array, force_old_n: Array, w: Array, w_change: Array) -> None:
+    """w (3,) and w_old - w (3,) in N at an estimated position, for the comb forces that act now and those that acted before."""
+    j, gradient, difference = np.empty((3, 3)), np.empty(3), np.empty(3)
+    jacobian(geometry, position_m, j)
+    energy_gradient(geometry, elasticity, position_m, gradient)
+    stiffness, origin = estimator["stiffness_n_per_m"], estimator["operating_point_m"]
+    multiply3_transposed(j, force_n, w)
+    for i in range(3):
+        difference[i] = force_old_n[i] - force_n[i]
+        for k in range(3):
+            w[i] += stiffness[i, k] * (position_m[k] - origin[k])
+        w[i] -= gradient[i]
+    multiply3_transposed(j, difference, w_change)
+
+
+@njit(cache=True)
+def predict(estimator, s: Array, w: Array, w_change: Array, out: Array) -> None:
+    """Time update over one period: write the state (9,) that follows from ``s`` and the input of ``net_input`` to ``out``, another array."""
+    transition, gamma, gamma_lag = estimator["transition"], estimator["input"], estimator["input_lag"]
+    for i in range(6):
+        total = 0.0
+        for k in range(9):
+            total += transition[i, k] * s[k]
+        for k in range(3):
+            total += gamma[i, k] * w[k] + gamma_lag[i, k] * w_change[k]
+        out[i] = total
+    for i in range(6, 9):
+        out[i] = s[i]

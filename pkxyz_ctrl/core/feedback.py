@@ -1,0 +1,78 @@
+"""The force that the law asks for: feed-forward along the reference plus state feedback about it, compiled.
+
+    w = grad V(r_f) + C v_f + m a_f  -  g [ K_x (x - r) + K_v (v - r') + d ]
+
+r, r' are the reference at the instant the force begins to act (one period after the sample), x, v, d the estimate predicted
+for it; r_f, v_f, a_f are the reference at the middle of the interval in which it acts, as the amplifier lets it act. Combs
+only pull, so at rest there is no force to take away: the feedback's authority g rises from 0 to 1 with the least of the
+forces that hold r.
+"""
+
+import numpy as np
+from numba import njit
+from numpy.typing import NDArray
+
+from pkxyz_ctrl.core.elasticity import energy_gradient
+
+Array = NDArray[np.float64]
+
+FEEDBACK = np.dtype(
+    [
+        ("position_gain_n_per_m", "f8", (3, 3)),  # K_x
+        ("velocity_gain_n_s_per_m", "f8", (3, 3)),  # K_v
+        ("damping_n_s_per_m", "f8", (3, 3)),  # C
+        ("mass_kg", "f8"),
+        ("period_s", "f8"),
+        ("lead_s", "f8"),  # from the start of the interval to its effective middle: T/2 + amplifier time constant
+        ("authority_force_n", "f8"),  # least holding force from which the feedback has its full gain
+    ],
+    align=True,
+)
+
+
+@njit(cache=True)
+def ahead(feedback, now: Array, after: Array, position_m: Array, velocity: Array, acceleration: Array) -> None:
+    """Reference (three times (3,)) at ``lead_s`` past the row ``now``: constant jerk towards the row ``after``, one period later.
+
+    A row is (9,): position m, velocity m/s, acceleration m/s^2.
+    """
+    h = feedback["lead_s"]
+    per_period = 1.0 / feedback["period_s"]
+    for i in range(3):
+        jerk = (after[6 + i] - now[6 + i]) * per_period
+        position_m[i] = now[i] + h * (now[3 + i] + h * (0.5 * now[6 + i] + h * jerk / 6.0))
+        velocity[i] = now[3 + i] + h * (now[6 + i] + 0.5 * h * jerk)
+        acceleration[i] = now[6 + i] + h * jerk
+
+
+@njit(cache=True)
+def feedforward(geometry, elasticity, feedback, now: Array, after: Array, out: Array) -> None:
+    """Platform force (3,) in N that drives the stage along the reference in the interval after the row ``now``."""
+    position, velocity, acceleration = np.empty(3), np.empty(3), np.empty(3)
+    ahead(feedback, now, after, position, velocity, acceleration)
+    energy_gradient(geometry, elasticity, position, out)
+    damping, mass = feedback["damping_n_s_per_m"], feedback["mass_kg"]
+    for i in range(3):
+        out[i] += mass * acceleration[i]
+        for k in range(3):
+            out[i] += damping[i, k] * velocity[k]
+
+
+@njit(cache=True)
+def authority(feedback, inverse: Array, holding_n: Array) -> float:
+    """g in 0..1 from the least comb force of J^-T ``holding_n``; ``inverse`` is J^-1 at the set-point."""
+    least = np.inf
+    for i in range(3):
+        least = min(least, inverse[0, i] * holding_n[0] + inverse[1, i] * holding_n[1] + inverse[2, i] * holding_n[2])
+    return min(max(least / feedback["authority_force_n"], 0.0), 1.0)
+
+
+@njit(cache=True)
+def add_feedback(feedback, origin_m: Array, predicted: Array, reference: Array, share: float, out: Array) -> None:
+    """Subtract share times the feedback force from ``out`` (3,); ``predicted`` (9,) is about ``origin_m``, ``reference`` a row (9,)."""
+    kx, kv = feedback["position_gain_n_per_m"], feedback["velocity_gain_n_s_per_m"]
+    for i in range(3):
+        total = predicted[6 + i]
+        for k in range(3):
+            total += kx[i, k] * (origin_m[k] + predicted[k] - reference[k]) + kv[i, k] * (predicted[3 + k] - reference[3 + k])
+        out[i] -= share * total

@@ -1,0 +1,178 @@
+"""The tick: sense counts in, drive counts out. Composes kinematics, filter, law, allocation and voltage; PURE and compiled.
+
+Three steps, so that whoever composes them can look between: ``measure`` (counts -> position), ``estimate`` (filter and its
+prediction to the instant of action), ``act`` (law -> comb forces -> counts). ``rest`` stands in for ``act`` while the loop is
+open. Everything works on two records: ``law`` (numbers that were designed, never written) and ``memory`` (what lives from
+tick to tick).
+"""
+
+import math
+
+import numpy as np
+from numba import njit
+from numpy.typing import NDArray
+
+from pkxyz_ctrl.core import allocation, feedback, kinematics, voltage
+from pkxyz_ctrl.core import estimator as filtering
+from pkxyz_ctrl.core.elasticity import ELASTICITY, energy_gradient
+from pkxyz_ctrl.core.linear3 import inverse3, multiply3_transposed
+
+Array = NDArray[np.float64]
+
+SENSE = np.dtype(
+    [
+        ("farad_per_count", "f8"),
+        ("offset_f", "f8"),  # capacitance of count 0
+        ("rest_f", "f8"),  # nominal capacitance at rest
+        ("metre_per_farad", "f8"),
+    ],
+    align=True,
+)
+
+LAW = np.dtype(
+    [
+        ("geometry", kinematics.GEOMETRY),
+        ("elasticity", ELASTICITY),
+        ("sense", SENSE),
+        ("estimator", filtering.ESTIMATOR),
+        ("feedback", feedback.FEEDBACK),
+        ("drive", voltage.DRIVE),
+        ("delay_periods", "i4"),  # periods from a sample to the start of the action that it causes: 1 or 2
+    ],
+    align=True,
+)
+
+DELAY_MAX = 2
+
+MEMORY = np.dtype(
+    [
+        ("estimate", filtering.ESTIMATE),
+        ("sense_zero_f", "f8", (3,)),  # found by homing: capacitance at rest less its nominal value
+        ("sense_f", "f8", (3,)),
+        ("stroke_m", "f8", (3,)),
+        ("measurement_m", "f8", (3,)),
+        ("count", "i4", (DELAY_MAX + 1, 3)),  # counts commanded, newest first
+        ("carry_v", "f8", (3,)),
+        ("demand_n", "f8", (3,)),
+        ("slack_n", "f8", (3,)),
+        ("force_n", "f8", (3,)),
+        ("active_set_steps", "i4"),
+    ],
+    align=True,
+)
+
+
+@njit(cache=True)
+def measure(law, memory, sense_count: NDArray[np.int32]) -> None:
+    """Sense counts (3,) -> capacitances -> strokes -> ``measurement_m``, by one Newton step from the predicted position."""
+    sense = law["sense"]
+    capacitance, stroke, position = memory["sense_f"], memory["stroke_m"], memory["measurement_m"]
+    predicted, origin = memory["estimate"]["predicted"], law["estimator"]["operating_point_m"]
+    for i in range(3):
+        capacitance[i] = sense["offset_f"] + sense["farad_per_count"] * sense_count[i] - memory["sense_zero_f"][i]
+        stroke[i] = (capacitance[i] - sense["rest_f"]) * sense["metre_per_farad"]
+        position[i] = origin[i] + predicted[i]
+    kinematics.newton_step(law["geometry"], stroke, position)
+
+
+@njit(cache=True)
+def estimate(law, memory, has_measurement: bool) -> None:
+    """Filter the measurement, then predict to the next sample and on to the instant from which this tick's force acts."""
+    estimator, state, drive = law["estimator"], memory["estimate"], law["drive"]
+    filtering.update(estimator, state, memory["measurement_m"], has_measurement)
+    position, w, w_change = np.empty(3), np.empty(3), np.empty(3)
+    force, force_old = np.empty(3), np.empty(3)
+    origin, ahead = estimator["operating_point_m"], state["ahead"]
+    start = np.empty(9)
+    start[:] = state["filtered"]
+    delay = law["delay_periods"]
+    for step in range(delay):
+        acting = delay - 1 - step
+        voltage.forces_of_counts(drive, memory["count"][acting], force)
+        voltage.forces_of_counts(drive, memory["count"][acting + 1], force_old)
+        for i in range(3):
+            position[i] = origin[i] + start[i]
+        filtering.net_input(law["geometry"], law["elasticity"], estimator, position, force, force_old, w, w_change)
+        filtering.predict(estimator, start, w, w_change, ahead)
+        if step == 0:
+            state["predicted"][:] = ahead
+        start[:] = ahead
+
+
+@njit(cache=True)
+def act(law, memory, now: Array, after: Array) -> bool:
+    """Law, allocation and voltages for the reference rows (9,) at the start and the end of the interval of action.
+
+    Writes demand, comb forces, slack and the new counts. Returns whether a comb force met a limit.
+    """
+    geometry, gains, drive = law["geometry"], law["feedback"], law["drive"]
+    demand, force = memory["demand_n"], memory["force_n"]
+    j, inverse = np.empty((3, 3)), np.empty((3, 3))
+    holding, lower, upper, given = np.empty(3), np.empty(3), np.empty(3), np.empty(3)
+    target = now[0:3]
+    kinematics.jacobian(geometry, target, j)
+    inverse3(j, inverse)
+    energy_gradient(geometry, law["elasticity"], target, holding)
+    share = feedback.authority(gains, inverse, holding)
+    feedback.feedforward(geometry, law["elasticity"], gains, now, after, demand)
+    feedback.add_feedback(gains, law["estimator"]["operating_point_m"], memory["estimate"]["ahead"], now, share, demand)
+    _push(memory)
+    count = memory["count"]
+    voltage.force_limits(drive, count[1], lower, upper)
+    memory["active_set_steps"] = allocation.allocate(j, inverse, demand, lower, upper, force)
+    voltage.counts_for_forces(drive, force, count[1], memory["carry_v"], count[0])
+    multiply3_transposed(j, force, given)
+    for i in range(3):
+        memory["slack_n"][i] = demand[i] - given[i]
+    return memory["active_set_steps"] > 1
+
+
+@njit(cache=True)
+def rest(memory) -> None:
+    """The open loop: 0 V on every comb at once, no demand. A release to 0 V is never delayed by the slew limit."""
+    _push(memory)
+    release(memory)
+
+
+@njit(cache=True)
+def release(memory) -> None:
+    """Take back what this tick decided: 0 V goes out instead."""
+    for i in range(3):
+        memory["count"][0, i] = 0
+        memory["carry_v"][i] = 0.0
+        memory["demand_n"][i] = 0.0
+        memory["slack_n"][i] = 0.0
+        memory["force_n"][i] = 0.0
+    memory["active_set_steps"] = 0
+
+
+@njit(cache=True)
+def _push(memory) -> None:
+    """Make room for this tick's counts: the history moves on by one."""
+    count = memory["count"]
+    for age in range(DELAY_MAX, 0, -1):
+        for i in range(3):
+            count[age, i] = count[age - 1, i]
+
+
+@njit(cache=True)
+def set_position(law, memory, position_m: Array) -> None:
+    """Start the filter at a position (3,) at rest, without disturbance: after homing, and wherever a state is known."""
+    for i in range(9):
+        known = position_m[i] - law["estimator"]["operating_point_m"][i] if i < 3 else 0.0
+        memory["estimate"]["predicted"][i] = known
+        memory["estimate"]["filtered"][i] = known
+        memory["estimate"]["ahead"][i] = known
+    for i in range(3):
+        memory["estimate"]["innovation_m"][i] = 0.0
+
+
+@njit(cache=True)
+def is_finite(memory) -> bool:
+    """Whether the estimate and the forces of this tick are numbers."""
+    total = 0.0
+    for i in range(9):
+        total += memory["estimate"]["ahead"][i]
+    for i in range(3):
+        total += memory["force_n"][i] + memory["demand_n"][i]
+    return math.isfinite(total)

@@ -1,0 +1,61 @@
+"""Comb forces to amplifier counts: limits, the square-root law and first-order noise shaping, compiled.
+
+F = G V^2 (Eq. 33), V = scale x count. What a count cannot express is carried into the next tick, so the quantisation error
+of the voltage is pushed to high frequency, where the stage does not follow: its spectrum gains the factor |1 - z^-1|.
+"""
+
+import math
+
+import numpy as np
+from numba import njit
+from numpy.typing import NDArray
+
+Array = NDArray[np.float64]
+Counts = NDArray[np.int32]
+
+DRIVE = np.dtype(
+    [
+        ("force_gain_n_per_v2", "f8"),  # G
+        ("volt_per_count", "f8"),
+        ("count_max", "i4"),
+        ("count_slew_max", "i4"),  # most that a count may change in one tick
+        ("noise_shaping", "i4"),  # 1: carry the quantisation error
+    ],
+    align=True,
+)
+
+
+@njit(cache=True)
+def force_limits(drive, count_last: Counts, lower_n: Array, upper_n: Array) -> None:
+    """Comb forces (3,) reachable in one tick from the last counts (3,): slew limit, no push, voltage limit."""
+    slew, most, scale, gain = drive["count_slew_max"], drive["count_max"], drive["volt_per_count"], drive["force_gain_n_per_v2"]
+    for i in range(3):
+        low = scale * max(0, count_last[i] - slew)
+        high = scale * min(most, count_last[i] + slew)
+        lower_n[i] = gain * low * low
+        upper_n[i] = gain * high * high
+
+
+@njit(cache=True)
+def counts_for_forces(drive, force_n: Array, count_last: Counts, carry_v: Array, count: Counts) -> None:
+    """Counts (3,) for forces (3,) >= 0; ``carry_v`` (3,) holds the error from tick to tick, at most one count of it.
+
+    Whatever the forces are (NaN and infinity too), every count stays within 0..count_max and within the slew limit of the last one.
+    """
+    slew, most, scale = drive["count_slew_max"], drive["count_max"], drive["volt_per_count"]
+    for i in range(3):
+        wanted = math.sqrt(force_n[i] / drive["force_gain_n_per_v2"]) if force_n[i] > 0.0 else 0.0  # NaN counts as no force
+        if drive["noise_shaping"] != 0 and wanted > 0.0:
+            wanted += carry_v[i]
+        low, high = max(0, count_last[i] - slew), min(most, count_last[i] + slew)
+        nearest = math.floor(wanted / scale + 0.5) if wanted < scale * (high + 1) else high
+        count[i] = min(max(nearest, low), high)
+        carry_v[i] = min(max(wanted - scale * count[i], -scale), scale)
+
+
+@njit(cache=True)
+def forces_of_counts(drive, count: Counts, force_n: Array) -> None:
+    """Comb forces (3,) in N that counts (3,) give by the nominal law."""
+    for i in range(3):
+        voltage = drive["volt_per_count"] * count[i]
+        force_n[i] = drive["force_gain_n_per_v2"] * voltage * voltage

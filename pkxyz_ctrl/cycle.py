@@ -1,0 +1,213 @@
+"""One period of the controller, compiled: events and modes, the tick, the monitors, the record.
+
+This is where core and safety meet: neither knows the other. ``cycle`` is called once a period, by the loop that waits for a
+clock and by the lane that does not; it reads ``memory["input"]`` and leaves counts, mode and record in ``memory["row"]``.
+"""
+
+import numpy as np
+from numba import njit
+from numpy.typing import NDArray
+
+from pkxyz_ctrl.core import tick
+from pkxyz_ctrl.row import ROW
+from pkxyz_ctrl.safety.modes import LOOP_CLOSED, Event, Mode, enable_event, next_homed, next_mode
+from pkxyz_ctrl.safety.monitors import LIMITS, MONITOR_MEMORY, OBSERVATION, SenseStatus, check
+
+INPUT = np.dtype(
+    [
+        ("event", "i4"),  # what happened or was asked for since the last tick
+        ("sense_status", "i4"),
+        ("node_events", "i4"),
+        ("overrun", "i4"),
+        ("sense_count", "i4", (3,)),
+        ("reference_base", "i8"),  # trajectory tick of row 0 of the reference handed in
+    ],
+    align=True,
+)
+
+LAW = np.dtype(
+    [
+        ("tick", tick.LAW),
+        ("limits", LIMITS),
+        ("period_us", "i8"),
+        ("homing_ticks", "i4"),
+        ("autostart", "i4"),  # 1: home, enable and track by itself, as a scenario wants it
+    ],
+    align=True,
+)
+
+MEMORY = np.dtype(
+    [
+        ("input", INPUT),
+        ("tick", tick.MEMORY),
+        ("monitors", MONITOR_MEMORY),
+        ("observation", OBSERVATION),
+        ("row", ROW),
+        ("setpoint", "f8", (9,)),  # what is held while enabled and not tracking
+        ("tick_index", "i8"),
+        ("reference_tick", "i8"),
+        ("mode", "i4"),
+        ("homed", "i4"),
+        ("homing_count", "i4"),
+        ("homing_sum", "i8", (3,)),
+    ],
+    align=True,
+)
+
+_UNUSABLE = int(SenseStatus.MISSING | SenseStatus.CRC | SenseStatus.LENGTH | SenseStatus.DUPLICATE)
+_NONE, _HOME, _HOMED, _TRACK, _TRIP = (int(e) for e in (Event.NONE, Event.HOME, Event.HOMED, Event.TRACK, Event.TRIP))
+_IDLE, _HOMING, _ENABLED, _TRACKING, _FAULT = (
+    int(m) for m in (Mode.IDLE, Mode.HOMING, Mode.ENABLED, Mode.TRACKING, Mode.FAULT)
+)
+
+
+def new_memory(mode: Mode = Mode.BOOT) -> NDArray[np.void]:
+    """Memory of a controller that has just been switched on, in a mode: nothing known, 0 V, no reference."""
+    memory = np.zeros(1, MEMORY)
+    memory["mode"] = mode
+    return memory
+
+
+@njit(cache=True)
+def cycle(law_array, memory_array, reference) -> None:
+    """One period. ``law_array`` (1,) of ``LAW``, ``memory_array`` (1,) of ``MEMORY``, ``reference`` (n, 9) rows of the trajectory.
+
+    Row ``reference_tick - reference_base`` is the set-point at this sample; the law looks up to three rows further. Rows
+    before the first and past the last are taken as the first and the last.
+    """
+    law, memory = law_array[0], memory_array[0]
+    _handle(law, memory, _asked(law, memory))
+    seen = memory["input"]
+    usable = (seen["sense_status"] & _UNUSABLE) == 0
+    if usable:
+        tick.measure(law["tick"], memory["tick"], seen["sense_count"])
+        if memory["mode"] == _HOMING:
+            _average(law, memory)
+    tick.estimate(law["tick"], memory["tick"], usable)
+    saturated = 0
+    if LOOP_CLOSED[memory["mode"]] != 0:
+        delay = law["tick"]["delay_periods"]
+        now, after = np.empty(9), np.empty(9)
+        _reference_row(memory, reference, delay, now)
+        _reference_row(memory, reference, delay + 1, after)
+        saturated = 1 if tick.act(law["tick"], memory["tick"], now, after) else 0
+    else:
+        tick.rest(memory["tick"])
+    trips = _monitor(law, memory, saturated)
+    _write_row(law, memory, reference, trips, saturated)
+    if memory["mode"] == _TRACKING:
+        memory["reference_tick"] += 1
+    memory["tick_index"] += 1
+    seen["event"] = _NONE
+
+
+@njit(cache=True)
+def _asked(law, memory) -> int:
+    """The event of this tick: what came in, else the next step of the automatic start."""
+    event = memory["input"]["event"]
+    if event == _NONE and law["autostart"] != 0:
+        mode = memory["mode"]
+        if mode == _IDLE:
+            return enable_event(True) if memory["homed"] != 0 else _HOME
+        if mode == _ENABLED:
+            return _TRACK
+    return event
+
+
+@njit(cache=True)
+def _handle(law, memory, event: int) -> None:
+    """Let an event act on the mode, and prepare what the mode that is entered needs."""
+    mode = memory["mode"]
+    memory["row"]["event"] = event
+    target = next_mode(mode, event)
+    memory["homed"] = 1 if next_homed(memory["homed"] != 0, mode, event) else 0
+    if target == mode:
+        return
+    memory["mode"] = target
+    rest = np.zeros(3)
+    if target == _HOMING:
+        memory["homing_count"] = 0
+        memory["homing_sum"][:] = 0
+        memory["tick"]["sense_zero_f"][:] = 0.0
+        tick.set_position(law["tick"], memory["tick"], rest)
+    elif target == _ENABLED and mode == _IDLE:
+        memory["setpoint"][:] = 0.0
+        memory["reference_tick"] = 0
+    elif target == _ENABLED and mode == _TRACKING:
+        memory["setpoint"][0:3] = memory["row"]["reference_m"]
+        memory["setpoint"][3:9] = 0.0
+
+
+@njit(cache=True)
+def _average(law, memory) -> None:
+    """Add this sample to the average at rest; once there are enough, that is where zero is."""
+    for i in range(3):
+        memory["homing_sum"][i] += memory["input"]["sense_count"][i]
+    memory["homing_count"] += 1
+    if memory["homing_count"] < law["homing_ticks"]:
+        return
+    sense = law["tick"]["sense"]
+    for i in range(3):
+        mean = memory["homing_sum"][i] / memory["homing_count"]
+        memory["tick"]["sense_zero_f"][i] = sense["offset_f"] + sense["farad_per_count"] * mean - sense["rest_f"]
+    tick.set_position(law["tick"], memory["tick"], np.zeros(3))
+    tick.measure(law["tick"], memory["tick"], memory["input"]["sense_count"])
+    _handle(law, memory, _HOMED)
+
+
+@njit(cache=True)
+def _reference_row(memory, reference, ahead: int, out) -> None:
+    """Write the row (9,) of the set-point ``ahead`` ticks from this one to ``out``."""
+    if memory["mode"] == _TRACKING:
+        index = memory["reference_tick"] - memory["input"]["reference_base"] + ahead
+        out[:] = reference[min(max(index, 0), len(reference) - 1)]
+    else:
+        out[:] = memory["setpoint"]
+
+
+@njit(cache=True)
+def _monitor(law, memory, saturated: int) -> int:
+    """Let the monitors look at this tick; a trip takes the voltages of this very tick to 0."""
+    seen, state, obs = memory["input"], memory["tick"], memory["observation"]
+    obs["mode"], obs["sense_status"] = memory["mode"], seen["sense_status"]
+    obs["node_events"], obs["overrun"] = seen["node_events"], seen["overrun"]
+    obs["saturated"], obs["solver_ok"] = saturated, 1
+    obs["finite"] = 1 if tick.is_finite(state) else 0
+    for i in range(3):
+        obs["sense_count"][i] = seen["sense_count"][i]
+        obs["stroke_m"][i] = state["stroke_m"][i]
+        obs["innovation_m"][i] = state["estimate"]["innovation_m"][i]
+        obs["voltage_step_v"][i] = law["tick"]["drive"]["volt_per_count"] * (state["count"][0, i] - state["count"][1, i])
+    trips = check(law["limits"], memory["monitors"], obs)
+    if trips != 0 and memory["mode"] != _FAULT:
+        _handle(law, memory, _TRIP)
+        tick.release(state)
+    return trips
+
+
+@njit(cache=True)
+def _write_row(law, memory, reference, trips: int, saturated: int) -> None:
+    row, seen, state = memory["row"], memory["input"], memory["tick"]
+    estimate, drive, origin = state["estimate"], law["tick"]["drive"], law["tick"]["estimator"]["operating_point_m"]
+    setpoint = np.empty(9)
+    _reference_row(memory, reference, 0, setpoint)
+    row["t_us"] = memory["tick_index"] * law["period_us"]
+    row["tick"] = memory["tick_index"]
+    row["reference_tick"] = memory["reference_tick"] if memory["mode"] == _TRACKING else -1
+    row["mode"], row["trips"], row["sense_status"] = memory["mode"], trips, seen["sense_status"]
+    row["node_events"], row["overrun"], row["saturated"] = seen["node_events"], seen["overrun"], saturated
+    row["active_set_steps"] = state["active_set_steps"]
+    for i in range(3):
+        row["sense_count"][i] = seen["sense_count"][i]
+        row["drive_count"][i] = state["count"][0, i]
+        row["reference_m"][i] = setpoint[i]
+        row["measurement_m"][i] = state["measurement_m"][i]
+        row["estimate_m"][i] = origin[i] + estimate["filtered"][i]
+        row["estimate_m_per_s"][i] = estimate["filtered"][3 + i]
+        row["disturbance_n"][i] = estimate["filtered"][6 + i]
+        row["innovation_m"][i] = estimate["innovation_m"][i]
+        row["demand_n"][i] = state["demand_n"][i]
+        row["slack_n"][i] = state["slack_n"][i]
+        row["force_n"][i] = state["force_n"][i]
+        row["voltage_v"][i] = drive["volt_per_count"] * state["count"][0, i]
+        row["sense_f"][i] = state["sense_f"][i]

@@ -1,0 +1,86 @@
+"""The Kalman filter's constant gain: filterpy discretises the noise and runs the filter, scipy solves the Riccati equation.
+
+The two must agree, or there is no controller: a gain that only one of them believes in is an error in the model.
+"""
+
+import math
+
+import numpy as np
+import scipy.linalg
+from filterpy.common import van_loan_discretization
+from filterpy.kalman import KalmanFilter
+from numpy.typing import NDArray
+
+from pkxyz_ctrl.bus_config import BusConfig
+from pkxyz_ctrl.controller_config import EstimatorConfig
+from pkxyz_ctrl.design.plant_model import LinearStage, SampledStage
+from pkxyz_ctrl.stage import Stage
+
+Array = NDArray[np.float64]
+
+
+class DesignError(RuntimeError):
+    """A design that does not hold what it promised; the message says which check failed and by how much."""
+
+
+def process_noise(model: LinearStage, config: EstimatorConfig, period_s: float) -> tuple[Array, Array]:
+    """Phi (9,9) and Q (9,9) by van Loan's method for white force noise on v and a random walk of d."""
+    shaping = np.zeros((9, 6))
+    shaping[3:6, 0:3] = np.eye(3) * config.force_noise_n_per_rthz / (math.sqrt(2.0) * model.mass_kg)  # one-sided to two-sided
+    shaping[6:9, 3:6] = np.eye(3) * config.disturbance_drift_n_per_rts
+    return van_loan_discretization(model.a, shaping, period_s)
+
+
+def sense_noise(stage: Stage, bus: BusConfig) -> float:
+    """Standard deviation in m of one stroke sample: white noise up to half the sampling rate, and quantisation."""
+    sigma_f = stage.config.sense.noise_density_f_per_rthz * math.sqrt(0.5 / bus.period_s)
+    step_f = bus.analog.sense_farad_per_count
+    return math.sqrt(sigma_f**2 + step_f**2 / 12) / stage.sense_gradient_f_per_m
+
+
+def measurement_noise(stage: Stage, model: LinearStage, bus: BusConfig) -> Array:
+    """R (3,3) in m^2 in platform coordinates: J^-1 R_q J^-T."""
+    inverse = np.linalg.inv(model.jacobian)
+    return sense_noise(stage, bus) ** 2 * inverse @ inverse.T
+
+
+def measurement_matrix(stage: Stage) -> Array:
+    """H (3,9): a sample shows the position a sense delay ago, x - tau v."""
+    h = np.zeros((3, 9))
+    h[:, 0:3] = np.eye(3)
+    h[:, 3:6] = -stage.config.sense.delay_s * np.eye(3)
+    return h
+
+
+# The Riccati equation is solved in nm, um/s and uN, where its numbers are within some decades of 1.
+_UNITS = np.repeat([1e-9, 1e-6, 1e-6], 3)
+
+
+def kalman_gain(sampled: SampledStage, q: Array, h: Array, r: Array) -> Array:
+    """Steady-state gain (9,3) of the measurement update, by scipy's discrete Riccati solver; raises ``DesignError`` unless filterpy agrees."""
+    scale = _UNITS
+    phi = sampled.phi * scale[None, :] / scale[:, None]
+    q_scaled = q / np.outer(scale, scale)
+    h_scaled = h * scale[None, :] / 1e-9
+    r_scaled = r / 1e-18
+    predicted = scipy.linalg.solve_discrete_are(phi.T, h_scaled.T, q_scaled, r_scaled)
+    innovation = h_scaled @ predicted @ h_scaled.T + r_scaled
+    gain = np.linalg.solve(innovation, h_scaled @ predicted).T
+    _agree_with_filterpy(phi, q_scaled, h_scaled, r_scaled, predicted, gain)
+    return gain * scale[:, None] / 1e-9
+
+
+def _agree_with_filterpy(phi: Array, q: Array, h: Array, r: Array, predicted: Array, gain: Array) -> None:
+    """Run filterpy's filter from well off the steady state, and ask it for the gain it settles at."""
+    reference = KalmanFilter(dim_x=9, dim_z=3)
+    reference.F, reference.Q, reference.H, reference.R = phi, q, h, r
+    reference.P = 4.0 * predicted
+    for _ in range(2000):
+        last = reference.K
+        reference.predict()
+        reference.update(np.zeros(3))
+        if np.abs(reference.K - last).max() <= 1e-10 * np.abs(reference.K).max():
+            break
+    error = float(np.abs(reference.K - gain).max() / np.abs(gain).max())
+    if not error < 1e-6:
+        raise DesignError(f"Kalman gain: scipy and filterpy differ by {error:.1e} of its largest entry; check the noise levels of the controller file")

@@ -1,0 +1,111 @@
+"""From configuration to the numbers that the cycle runs on: everything that can be computed before the first tick."""
+
+import math
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from pkxyz_ctrl import cycle
+from pkxyz_ctrl.bus_config import BusConfig
+from pkxyz_ctrl.config import ConfigError
+from pkxyz_ctrl.controller_config import ControllerConfig
+from pkxyz_ctrl.design.estimator_gain import kalman_gain, measurement_matrix, measurement_noise, process_noise
+from pkxyz_ctrl.design.plant_model import LinearStage, SampledStage, linearise, sample
+from pkxyz_ctrl.design.regulator import regulator_gain
+from pkxyz_ctrl.stage import Stage
+
+
+def design_law(stage: Stage, controller: ControllerConfig, bus: BusConfig, *, autostart: bool) -> NDArray[np.void]:
+    """One-element array of ``cycle.LAW``, read-only. Raises ``ConfigError`` for limits that contradict each other and
+    ``DesignError`` where a cross-check of the gains fails."""
+    _check_limits(stage, controller, bus)
+    model = linearise(stage, np.array(controller.operating_strokes_m))
+    sampled = sample(model, bus.period_s, amplifier_time_constant_s(stage))
+    law = np.zeros(1, cycle.LAW)
+    _fill_stage(law["tick"], stage, bus)
+    _fill_estimator(law["tick"]["estimator"], stage, controller, bus, model, sampled)
+    _fill_feedback(law["tick"]["feedback"], stage, controller, bus, model, sampled)
+    _fill_drive(law["tick"]["drive"], stage, controller, bus)
+    _fill_monitors(law["limits"], controller, bus)
+    law["tick"]["delay_periods"] = bus.delay_periods
+    law["period_us"] = bus.period_us
+    law["homing_ticks"] = max(1, round(controller.homing_s / bus.period_s))
+    law["autostart"] = autostart
+    law.flags.writeable = False
+    return law
+
+
+def amplifier_time_constant_s(stage: Stage) -> float:
+    """Time constant of the amplifier's first-order approach to a new voltage."""
+    return 1.0 / (2.0 * math.pi * stage.config.amplifier.bandwidth_hz)
+
+
+def slew_counts(controller: ControllerConfig, bus: BusConfig) -> int:
+    """Most that a drive count may change in one tick."""
+    return math.floor(controller.limits.slew_max_v_per_s * bus.period_s / bus.analog.drive_volt_per_count + 1e-9)
+
+
+def count_max(stage: Stage, controller: ControllerConfig, bus: BusConfig) -> int:
+    """Largest drive count that stays within the controller's and the device's voltage limit."""
+    limit_v = min(controller.limits.voltage_max_v, stage.voltage_max_v)
+    return min(32767, math.floor(limit_v / bus.analog.drive_volt_per_count + 1e-9))
+
+
+def _check_limits(stage: Stage, controller: ControllerConfig, bus: BusConfig) -> None:
+    if controller.limits.voltage_max_v > stage.voltage_max_v:
+        raise ConfigError(
+            f"controller {controller.name!r}: limits.voltage_max_v = {controller.limits.voltage_max_v:g} V is beyond the "
+            f"{stage.voltage_max_v:g} V of stage {stage.config.name!r}; lower it"
+        )
+    if slew_counts(controller, bus) < 1:
+        raise ConfigError(f"controller {controller.name!r}: limits.slew_max_v_per_s allows less than one count a tick; raise it")
+
+
+def _fill_stage(law: Any, stage: Stage, bus: BusConfig) -> None:
+    law["geometry"] = stage.geometry
+    law["elasticity"] = stage.elasticity
+    law["sense"]["farad_per_count"] = bus.analog.sense_farad_per_count
+    law["sense"]["offset_f"] = bus.analog.sense_offset_f
+    law["sense"]["rest_f"] = stage.sense_rest_f
+    law["sense"]["metre_per_farad"] = 1.0 / stage.sense_gradient_f_per_m
+
+
+def _fill_estimator(
+    law: Any, stage: Stage, controller: ControllerConfig, bus: BusConfig, model: LinearStage, sampled: SampledStage
+) -> None:
+    _, q = process_noise(model, controller.estimator, bus.period_s)
+    r = measurement_noise(stage, model, bus)
+    law["transition"] = sampled.phi[:6]
+    law["input"] = sampled.gamma[:6]
+    law["input_lag"] = sampled.gamma_lag[:6]
+    law["gain"] = kalman_gain(sampled, q, measurement_matrix(stage), r)
+    law["stiffness_n_per_m"] = model.stiffness_n_per_m
+    law["operating_point_m"] = model.position_m
+    law["sense_delay_s"] = stage.config.sense.delay_s
+
+
+def _fill_feedback(
+    law: Any, stage: Stage, controller: ControllerConfig, bus: BusConfig, model: LinearStage, sampled: SampledStage
+) -> None:
+    law["position_gain_n_per_m"], law["velocity_gain_n_s_per_m"] = regulator_gain(sampled, controller.regulator)
+    law["damping_n_s_per_m"] = model.damping_n_s_per_m
+    law["mass_kg"] = model.mass_kg
+    law["period_s"] = bus.period_s
+    law["lead_s"] = 0.5 * bus.period_s + amplifier_time_constant_s(stage)
+    law["authority_force_n"] = controller.regulator.authority_force_n
+
+
+def _fill_drive(law: Any, stage: Stage, controller: ControllerConfig, bus: BusConfig) -> None:
+    law["force_gain_n_per_v2"] = stage.force_gain_n_per_v2
+    law["volt_per_count"] = bus.analog.drive_volt_per_count
+    law["count_max"] = count_max(stage, controller, bus)
+    law["count_slew_max"] = slew_counts(controller, bus)
+    law["noise_shaping"] = controller.limits.noise_shaping
+
+
+def _fill_monitors(limits: Any, controller: ControllerConfig, bus: BusConfig) -> None:
+    for name, value in controller.monitors.model_dump().items():
+        limits[name] = value
+    limits["sense_count_min"], limits["sense_count_max"] = -32768, 32767
+    limits["voltage_step_max_v"] = (slew_counts(controller, bus) + 0.5) * bus.analog.drive_volt_per_count
