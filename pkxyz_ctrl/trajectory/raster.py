@@ -1,0 +1,149 @@
+"""Raster scan in three dimensions: lines along x, steps along y during the turn-around, layers along z, back and forth."""
+
+import math
+from typing import Annotated, Literal
+
+import numpy as np
+from pydantic import Field
+
+from pkxyz_ctrl.config import FrozenModel
+from pkxyz_ctrl.trajectory.pieces import Array, Phases, Pieces, TrajectoryError, at_rest, from_phases, joined
+from pkxyz_ctrl.trajectory.segments import Limits, NotNegative, Plan, Position, Positive, travel
+
+Count = Annotated[int, Field(ge=1)]
+
+
+class Raster(FrozenModel):
+    """Lines along x at constant velocity, serpentine in x, y and z, around a centre at which it ends.
+
+    Each turn-around reverses x and steps y (or z, between layers) inside the limits; it takes as long as they ask for,
+    and the lines get the rest of the period.
+    """
+
+    kind: Literal["raster"]
+    centre_m: Position | None = None
+    """centre of the scanned block; unset: where the stage stands"""
+    line_length_m: Positive
+    """the constant-velocity part; turn-arounds reach beyond it"""
+    lines: Count
+    """lines in a layer"""
+    line_pitch_m: NotNegative
+    layers: Count = 1
+    layer_pitch_m: NotNegative = 0.0
+    line_rate_hz: Positive
+    """lines a second; a line's period holds one pass and one turn-around"""
+    velocity_max_m_per_s: Positive
+    acceleration_max_m_per_s2: Positive
+    jerk_max_m_per_s3: Positive
+
+    def plan(self, start_m: Array) -> Plan:
+        """Lead-in, lines and turn-arounds, lead-out to the centre."""
+        centre = start_m if self.centre_m is None else np.array(self.centre_m)
+        limits = Limits(self.velocity_max_m_per_s, self.acceleration_max_m_per_s2, self.jerk_max_m_per_s3)
+        speed = self.line_speed_m_per_s()
+        line_s = self.line_length_m / speed
+        turn_s = 1 / self.line_rate_hz - line_s
+        starts = self._line_starts(centre, speed)
+        lead_in = travel(at_rest(start_m), starts[0], limits)
+        parts: list[Pieces] = [lead_in]
+        for n, start in enumerate(starts):
+            line = from_phases(start, [Phases([line_s], [0.0])] * 3, line_s)
+            parts.append(line)
+            if n + 1 < len(starts):
+                parts.append(self._turn(line.end(), starts[n + 1], turn_s))
+        parts.append(travel(parts[-1].end(), at_rest(centre), limits))
+        begin = lead_in.total_s
+        lines = tuple(
+            (begin + n / self.line_rate_hz, begin + n / self.line_rate_hz + line_s) for n in range(len(starts))
+        )
+        return Plan(joined(parts), centre, scan_s=(begin, lines[-1][1]), lines_s=lines)
+
+    def line_speed_m_per_s(self) -> float:
+        """Speed on the lines: the least at which pass and turn-around fit the line's period. ``TrajectoryError`` if none does."""
+        a, j = self.acceleration_max_m_per_s2, self.jerk_max_m_per_s3
+        step_s = step_time_s(max(self.line_pitch_m, self.layer_pitch_m if self.layers > 1 else 0.0), a, j)
+
+        def period_s(v: float) -> float:
+            return self.line_length_m / v + max(reversal_time_s(v, a, j), step_s)
+
+        # the period falls with v until the turn-around grows faster than the line shrinks
+        jerk_bound = (self.line_length_m * math.sqrt(j / 2)) ** (2 / 3)
+        fastest = jerk_bound if jerk_bound <= a * a / (2 * j) else math.sqrt(self.line_length_m * a / 2)
+        fastest = min(max(fastest, _reversible_speed(step_s, a, j)), self.velocity_max_m_per_s)
+        if period_s(fastest) * self.line_rate_hz > 1:
+            raise TrajectoryError(
+                f"raster: {self.line_rate_hz:g} lines/s is beyond the {1 / period_s(fastest):.4g} lines/s that its velocity, "
+                "acceleration and jerk limits allow; lower line_rate_hz or line_length_m, or raise the limits"
+            )
+        low, high = self.line_length_m * self.line_rate_hz, fastest
+        while (middle := low + (high - low) / 2) not in (low, high):
+            low, high = (low, middle) if period_s(middle) * self.line_rate_hz <= 1 else (middle, high)
+        return high
+
+    def _line_starts(self, centre: Array, speed: float) -> list[Array]:
+        """State (3, 3) at the start of each line."""
+        states = []
+        for n in range(self.lines * self.layers):
+            layer, row = divmod(n, self.lines)
+            row = row if layer % 2 == 0 else self.lines - 1 - row
+            way = 1.0 if n % 2 == 0 else -1.0
+            offset = [
+                -way * self.line_length_m / 2,
+                (row - (self.lines - 1) / 2) * self.line_pitch_m,
+                (layer - (self.layers - 1) / 2) * self.layer_pitch_m,
+            ]
+            states.append(np.array([centre + offset, (way * speed, 0.0, 0.0), (0.0, 0.0, 0.0)]))
+        return states
+
+    def _turn(self, start: Array, end: Array, turn_s: float) -> Pieces:
+        a, j = self.acceleration_max_m_per_s2, self.jerk_max_m_per_s3
+        x = reversal(float(end[1, 0]), a, j, turn_s)
+        y, z = (step(float(d), a, j, turn_s) for d in (end[0] - start[0])[1:])
+        return from_phases(start, [x, y, z], turn_s)
+
+
+def reversal_time_s(speed_m_per_s: float, a: float, j: float) -> float:
+    """Shortest time to turn ``speed`` into its opposite, acceleration zero at both ends, within acceleration a and jerk j."""
+    change = 2 * speed_m_per_s
+    return 2 * math.sqrt(change / j) if change * j <= a * a else change / a + a / j
+
+
+def _reversible_speed(time_s: float, a: float, j: float) -> float:
+    """Speed whose shortest reversal takes ``time_s``: the inverse of ``reversal_time_s``."""
+    return j * time_s**2 / 8 if time_s <= 2 * a / j else (time_s - a / j) * a / 2
+
+
+def reversal(velocity_after_m_per_s: float, a: float, j: float, duration_s: float) -> Phases:
+    """Phases from -velocity to +velocity: the shortest ones, stretched evenly to ``duration_s``, so no limit is passed."""
+    speed = abs(velocity_after_m_per_s)
+    total = reversal_time_s(speed, a, j)
+    ramp = min(math.sqrt(2 * speed / j), a / j)
+    stretch = duration_s / total
+    jerk = math.copysign(2 * speed / (ramp * (total - ramp)), velocity_after_m_per_s) / stretch**2
+    return Phases([ramp * stretch, (total - 2 * ramp) * stretch, ramp * stretch], [jerk, 0.0, -jerk])
+
+
+def step_time_s(distance_m: float, a: float, j: float) -> float:
+    """Shortest time from rest to rest over ``distance`` within acceleration a and jerk j."""
+    ramp, flat = _step_ramps(distance_m, a, j)
+    return 4 * ramp + 2 * flat
+
+
+def _step_ramps(distance_m: float, a: float, j: float) -> tuple[float, float]:
+    """Time of each of the four jerk ramps and of the two stretches of constant acceleration between them."""
+    ramp = (distance_m / (2 * j)) ** (1 / 3)
+    if ramp * j <= a:
+        return ramp, 0.0
+    ramp = a / j
+    return ramp, (-3 * ramp + math.sqrt(ramp * ramp + 4 * distance_m / a)) / 2  # a (ramp + flat)(2 ramp + flat) = distance
+
+
+def step(displacement_m: float, a: float, j: float, duration_s: float) -> Phases:
+    """Phases from rest to rest over a signed ``displacement``: the shortest ones, stretched evenly to ``duration_s``."""
+    ramp, flat = _step_ramps(abs(displacement_m), a, j)
+    if ramp == 0:
+        return Phases([duration_s], [0.0])
+    stretch = duration_s / (4 * ramp + 2 * flat)
+    ramp, flat = ramp * stretch, flat * stretch
+    jerk = displacement_m / (ramp * (ramp + flat) * (2 * ramp + flat))
+    return Phases([ramp, flat, ramp, ramp, flat, ramp], [jerk, 0.0, -jerk, -jerk, 0.0, jerk])
