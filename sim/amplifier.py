@@ -1,0 +1,82 @@
+"""From counts to volts at the combs.
+
+    target = counts * volt_per_count + offset;   dV/dt = clip((target - V) / tau, +-limit),   limit = min(slew, I / (C(q) + stray))
+
+Solved piecewise: while |target - V| > limit * tau a straight ramp, then an exponential. So over a segment without a switch
+every channel is  V(t) = base + slope t + error exp(-t / tau),  with slope or error zero."""
+
+import math
+
+from numba import njit
+
+from sim.geometry import strokes
+
+
+@njit(cache=True)
+def drive(params, state, counts):
+    """Put ``counts`` (3,) integers on the converters now."""
+    p = params[0]
+    s = state[0]
+    step = p["dac_step"]
+    for i in range(3):
+        coarse = (int(counts[i]) + step // 2) // step * step
+        s["target_v"][i] = coarse * p["volt_per_count"][i] + p["amplifier_offset_v"][i]
+
+
+@njit(cache=True, error_model="numpy")
+def plan(p, s, remaining_s):
+    """Set base, slope and error of all channels from now on; returns how long they hold, s, at most ``remaining_s``."""
+    tau = p["amplifier_s"]
+    duration = remaining_s
+    strokes(p, s["motion"], s["strokes_m"])
+    for i in range(3):
+        gap = s["target_v"][i] - s["voltage_v"][i]
+        limit = p["slew_v_per_s"]
+        if p["current_a"] > 0.0:
+            comb_f = 2.0 * p["force_gain_n_per_v2"][i] * (p["overlap_rest_m"] + s["strokes_m"][i])
+            limit = min(limit, p["current_a"] / (comb_f + p["stray_f"]))
+        ramp_s = (abs(gap) - limit * tau) / limit
+        if s["held"][i] != 0:  # shorted by snapped fingers
+            s["base_v"][i], s["slope_v_per_s"][i], s["error_v"][i] = 0.0, 0.0, 0.0
+        elif ramp_s > 1e-12:
+            s["base_v"][i], s["error_v"][i] = s["voltage_v"][i], 0.0
+            s["slope_v_per_s"][i] = math.copysign(limit, gap)
+            duration = min(duration, ramp_s)
+        else:
+            s["base_v"][i], s["slope_v_per_s"][i] = s["target_v"][i], 0.0
+            s["error_v"][i] = -gap if tau > 0.0 and abs(gap) > 1e-12 else 0.0
+    return duration
+
+
+@njit(cache=True, error_model="numpy")
+def pass_time(s, h_s, decay):
+    """Move the channels on by h_s, over which the exponential falls by the factor ``decay``."""
+    for i in range(3):
+        s["base_v"][i] += s["slope_v_per_s"][i] * h_s
+        s["error_v"][i] *= decay
+        s["voltage_v"][i] = s["base_v"][i] + s["error_v"][i]
+
+
+@njit(cache=True, error_model="numpy")
+def charge(p, s, dt_s):
+    """Dielectric charging over dt_s: the opposing voltage relaxes towards its share of the comb's voltage at the end of the step."""
+    kept = math.exp(-dt_s / p["charging_s"])
+    for i in range(3):
+        goal = p["charging_fraction"] * s["voltage_v"][i]
+        s["charge_v"][i] = goal + (s["charge_v"][i] - goal) * kept
+
+
+@njit(cache=True, error_model="numpy")
+def snapped(p, s):
+    """Look for lateral pull-in; snapped fingers short their comb and hold the slider. Returns the chain or -1."""
+    strokes(p, s["motion"], s["strokes_m"])
+    for i in range(3):
+        if s["held"][i] == 0:
+            volt = s["voltage_v"][i] - s["charge_v"][i]
+            if (p["overlap_rest_m"] + s["strokes_m"][i]) * volt * volt > p["lateral_limit_v2m"][i]:
+                s["held"][i] = 1
+                s["held_m"][i] = s["strokes_m"][i]
+                s["voltage_v"][i] = 0.0
+                s["charge_v"][i] = 0.0
+                return i
+    return -1

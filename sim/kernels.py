@@ -1,0 +1,129 @@
+"""The plant in compiled form: ``advance``, ``drive`` and ``sample`` on one record of parameters and one of state.
+
+The same arithmetic whether called from Python (``sim.plant.Plant``) or from another compiled loop."""
+
+import math
+
+from numba import njit
+
+from sim.amplifier import charge, drive, plan, snapped
+from sim.integrator import LONGEST_S, step
+from sim.layout import BROKEN, BROWNIAN_STREAM, DRIFT_STREAM, EVENTS, PULLED_IN, STOP
+from sim.noise import normal
+from sim.parasitic import parasitic_step
+from sim.sense import follow, sample, seen, walk
+
+__all__ = ["advance", "drive", "sample"]
+
+REACH_M = 300e-6
+"""Further than this from rest, on any axis, no flexure is whole: the stage is broken and stays where it was."""
+
+
+@njit(cache=True)
+def note(s, kind, chain):
+    """Add an event at the present time."""
+    n = s["event_count"]
+    if n < EVENTS:
+        s["event_t_us"][n] = s["t_us"]
+        s["event_kind"][n] = kind
+        s["event_chain"][n] = chain
+    s["event_count"] = n + 1
+
+
+@njit(cache=True, error_model="numpy")
+def _constant_forces(p, s, dt_s):
+    """External, weight, drift and thermal force of the coming step, held over it."""
+    for j in range(3):
+        s["force_n"][j] = s["external_n"][j] + p["weight_n"][j]
+    if p["drift_on"] != 0:
+        grown = 1.0 - math.exp(-1e-6 * s["t_us"] / p["drift_s"])
+        size = p["drift_walk_n_per_rt_s"] * math.sqrt(dt_s)
+        for j in range(3):
+            s["drift_walk_n"][j] += size * normal(s["random"][DRIFT_STREAM], s["spare"][DRIFT_STREAM])
+            s["force_n"][j] += p["drift_n"][j] * grown + s["drift_walk_n"][j]
+    if p["brownian_n_rt_s"][0] > 0.0:
+        for j in range(3):
+            size = p["brownian_n_rt_s"][j] / math.sqrt(dt_s)
+            s["force_n"][j] += size * normal(s["random"][BROWNIAN_STREAM], s["spare"][BROWNIAN_STREAM])
+
+
+@njit(cache=True)
+def _whole(motion):
+    """False if the table is out of reach or not a number."""
+    for j in range(3):
+        if not abs(motion[j]) < REACH_M:
+            return False
+    return True
+
+
+@njit(cache=True)
+def _note_contacts(s):
+    """An event where a slider that did not touch its stop in the last step does now."""
+    for i in range(3):
+        if s["touched"][i] != s["touching"][i]:
+            s["touching"][i] = s["touched"][i]
+            if s["touched"][i] != 0:
+                note(s, STOP, i)
+
+
+@njit(cache=True, error_model="numpy")
+def _move(p, s, total_s):
+    """Rigid motion, parasitic mode and voltages over total_s, from switch to switch of the amplifier."""
+    remaining = total_s
+    while remaining > 0.0:
+        duration = plan(p, s, remaining)
+        n = int(math.ceil(duration / LONGEST_S))
+        h = duration / n
+        for _ in range(n):
+            if p["parasitic_on"] != 0:
+                parasitic_step(p, s, h)
+            if s["broken"] == 0:
+                step(p, s, h)
+            if s["broken"] != 0 or not _whole(s["motion"]):
+                _break(s)
+            chain = snapped(p, s)
+            if chain >= 0:
+                note(s, PULLED_IN, chain)
+                s["base_v"][chain], s["error_v"][chain], s["slope_v_per_s"][chain] = 0.0, 0.0, 0.0
+        remaining -= duration
+        if remaining < 1e-15:
+            remaining = 0.0
+
+
+@njit(cache=True)
+def _break(s):
+    """The stage stays where this step began; its combs are dead."""
+    if s["broken"] == 0:
+        s["broken"] = 1
+        note(s, BROKEN, -1)
+        for j in range(3):
+            s["motion"][j] = s["start"][j]
+            s["motion"][3 + j] = 0.0
+    for i in range(3):
+        s["voltage_v"][i] = 0.0
+        s["base_v"][i], s["slope_v_per_s"][i], s["error_v"][i] = 0.0, 0.0, 0.0
+
+
+@njit(cache=True, error_model="numpy")
+def advance(params, state, dt_us):
+    """Integrate over dt_us microseconds with what the converters hold now; nothing for dt_us <= 0."""
+    if dt_us <= 0:
+        return
+    p = params[0]
+    s = state[0]
+    dt_s = dt_us * 1e-6
+    remembers = p["sense_filter_s"] > 0.0 or p["sense_delay_us"] > 0.0
+    if remembers:
+        seen(p, s, s["before_m"], s["before_m_per_s"])
+    _constant_forces(p, s, dt_s)
+    for i in range(3):
+        s["touched"][i] = 0
+    _move(p, s, dt_s)
+    s["t_us"] += dt_us
+    _note_contacts(s)
+    if p["charging_on"] != 0:
+        charge(p, s, dt_s)
+    if p["sense_walk_f_per_rt_s"] > 0.0:
+        walk(p, s, dt_s)
+    if remembers:
+        follow(p, s, dt_s)

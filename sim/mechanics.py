@@ -1,0 +1,125 @@
+"""Elastic energy, its gradient and Hessian, and the acceleration of the table.
+
+    V = sum_i (2 K1_i q_i^2 + 2 K2_i theta_i^2) + 2 c K3 (alpha - alpha_0)^2,     sin(theta_i) = w_i / L1,  sin(alpha) = z / L2
+    m x'' = -grad V + J^T F + F_levitation + F_stops + F_external - m D x',        F_i = k_i (1 + phi q_i) (V_i - V_charge,i)^2
+
+The record keeps leaf = 4 K1, crank_hinge = 4 K2 and link_hinge = 4 c K3, so each energy is half of that times the square."""
+
+import math
+
+from numba import njit
+
+from sim.geometry import E_X, E_Y, N_X, N_Y, leg, lift
+
+
+@njit(cache=True)
+def arcsine(y):
+    """asin(y); near zero by its series, which is exact to rounding below 0.1 and cheaper than the library."""
+    if abs(y) > 0.1:
+        return math.asin(max(-1.0, min(1.0, y)))
+    s = y * y
+    tail = 105.0 / 3456.0 + s * (945.0 / 42240.0 + s * (10395.0 / 599040.0))
+    return y * (1.0 + s * (1.0 / 6.0 + s * (3.0 / 40.0 + s * (15.0 / 336.0 + s * tail))))
+
+
+@njit(cache=True, error_model="numpy")
+def elevation_change(p, height_m, projection_m):
+    """alpha - alpha_0, rad: the sine of the difference from the two legs now and at rest."""
+    cross = height_m * p["projection_rest_m"] - projection_m * p["height_rest_m"]
+    return arcsine(cross / (p["link_m"] * p["link_m"]))
+
+
+@njit(cache=True, error_model="numpy")
+def energy(p, motion):
+    """Elastic energy of the pose motion[:3], J."""
+    height_m, projection_m, drawn_m = lift(p, motion[2])
+    total = 0.5 * p["link_hinge_nm"] * elevation_change(p, height_m, projection_m) ** 2
+    for i in range(3):
+        u = E_X[i] * motion[0] + E_Y[i] * motion[1]
+        w = N_X[i] * motion[0] + N_Y[i] * motion[1]
+        q = u + drawn_m + w * w / (p["crank_m"] + leg(p["crank_m"], w))
+        total += 0.5 * p["leaf_n_per_m"][i] * q * q + 0.5 * p["crank_hinge_nm"][i] * arcsine(w / p["crank_m"]) ** 2
+    return total
+
+
+@njit(cache=True, error_model="numpy")
+def acceleration(p, s, volt2, x, y, z, vx, vy, vz):
+    """Acceleration (ax, ay, az) in m/s^2 at a pose and velocity, with squared comb voltages ``volt2`` (3,) in V^2 and the constant
+    force s["force_n"]. Sets s["contact"] and s["touched"] where a slider meets a stop or is held by snapped fingers."""
+    height_m, projection_m, drawn_m = lift(p, z)
+    crank_m = p["crank_m"]
+    fringe = p["fringe_per_m"]
+    steep = height_m / projection_m
+    fx, fy, pulls, combs = s["force_n"][0], s["force_n"][1], 0.0, 0.0
+    for i in range(3):
+        w = N_X[i] * x + N_Y[i] * y
+        c = leg(crank_m, w)
+        inverse_c = 1.0 / c
+        q = E_X[i] * x + E_Y[i] * y + drawn_m + w * w / (crank_m + c)
+        tangent = w * inverse_c
+        comb = p["force_gain_n_per_v2"][i] * (1.0 + fringe * q) * volt2[i]
+        pull = comb - p["leaf_n_per_m"][i] * q
+        if q > p["stop_high_m"] or q < p["stop_low_m"] or s["held"][i] != 0:
+            rate = E_X[i] * vx + E_Y[i] * vy + (N_X[i] * vx + N_Y[i] * vy) * tangent + vz * steep
+            if s["held"][i] != 0:
+                pull -= comb  # shorted
+                comb = 0.0
+            pull += _stop_force(p, s, i, q, rate)
+            s["contact"] = 1
+        turn = pull * tangent - p["crank_hinge_nm"][i] * arcsine(w / crank_m) * inverse_c
+        fx += pull * E_X[i] + turn * N_X[i]
+        fy += pull * E_Y[i] + turn * N_Y[i]
+        pulls += pull
+        combs += comb
+    hinge = p["link_hinge_nm"] * elevation_change(p, height_m, projection_m) / projection_m
+    fz = s["force_n"][2] + pulls * steep - hinge + p["levitation"] * combs
+    per_kg = 1.0 / p["mass_kg"]
+    d = p["damping_per_s"]
+    ax = fx * per_kg - (d[0, 0] * vx + d[0, 1] * vy + d[0, 2] * vz)
+    ay = fy * per_kg - (d[1, 0] * vx + d[1, 1] * vy + d[1, 2] * vz)
+    az = fz * per_kg - (d[2, 0] * vx + d[2, 1] * vy + d[2, 2] * vz)
+    return ax, ay, az
+
+
+@njit(cache=True)
+def _stop_force(p, s, i, q, rate):
+    """Force of stops on slider i, N, positive inward: Hunt-Crossley k d (1 + c d'), which never pulls. Snapped fingers hold the
+    slider with the same stiffness, both ways, near critically damped."""
+    force = 0.0
+    if s["held"][i] != 0:
+        k = p["stop_n_per_m"]
+        force -= k * (q - s["held_m"][i]) + math.sqrt(k * p["mass_kg"]) * rate
+    if q > p["stop_high_m"]:
+        force -= p["stop_n_per_m"] * (q - p["stop_high_m"]) * max(0.0, 1.0 + p["stop_damping_s_per_m"] * rate)
+        s["touched"][i] = 1
+    elif q < p["stop_low_m"]:
+        force += p["stop_n_per_m"] * (p["stop_low_m"] - q) * max(0.0, 1.0 - p["stop_damping_s_per_m"] * rate)
+        s["touched"][i] = 1
+    return force
+
+
+@njit(cache=True, error_model="numpy")
+def stiffness(p, x, y, z):
+    """Hessian of the elastic energy at a pose, N/m: (k_xx, k_xy, k_xz, k_yy, k_yz, k_zz)."""
+    height_m, projection_m, drawn_m = lift(p, z)
+    crank_m = p["crank_m"]
+    steep = height_m / projection_m
+    bend = p["link_m"] * p["link_m"] / projection_m**3
+    change = elevation_change(p, height_m, projection_m)
+    k_zz = p["link_hinge_nm"] / projection_m**2 * (1.0 + change * steep)
+    k_xx, k_xy, k_xz, k_yy, k_yz = 0.0, 0.0, 0.0, 0.0, 0.0
+    for i in range(3):
+        w = N_X[i] * x + N_Y[i] * y
+        c = leg(crank_m, w)
+        q = E_X[i] * x + E_Y[i] * y + drawn_m + w * w / (crank_m + c)
+        k1, k2 = p["leaf_n_per_m"][i], p["crank_hinge_nm"][i]
+        jx = E_X[i] + N_X[i] * w / c
+        jy = E_Y[i] + N_Y[i] * w / c
+        across = k1 * q * crank_m * crank_m / c**3 + k2 / c**2 * (1.0 + arcsine(w / crank_m) * w / c)
+        k_xx += k1 * jx * jx + across * N_X[i] * N_X[i]
+        k_xy += k1 * jx * jy + across * N_X[i] * N_Y[i]
+        k_yy += k1 * jy * jy + across * N_Y[i] * N_Y[i]
+        k_xz += k1 * jx * steep
+        k_yz += k1 * jy * steep
+        k_zz += k1 * (steep * steep + q * bend)
+    return k_xx, k_xy, k_xz, k_yy, k_yz, k_zz

@@ -1,0 +1,213 @@
+"""From a device and a plant file to the record of parameters and a state at rest."""
+
+import math
+
+import numpy as np
+
+from sim import layout
+from sim.config import Device, PlantConfig
+from sim.geometry import strokes
+from sim.layout import PARAMS, STATE
+from sim.mechanics import acceleration, stiffness
+from sim.noise import stream
+from sim.parasitic import rest
+
+EPSILON_0_F_PER_M = 8.8541878128e-12  # CODATA 2018
+BOLTZMANN_J_PER_K = 1.380649e-23  # SI 2019, exact
+STROKE_SCALE_M = 25e-6  # changes "over 25 um" in the plant file
+
+
+def build_parameters(
+    config: PlantConfig,
+    device: Device,
+    *,
+    period_us: int,
+    drive_v_per_count: float,
+    sense_f_per_count: float,
+    sense_zero_f: float,
+) -> np.ndarray:
+    """Record of parameters, one element of ``layout.PARAMS``. ``period_us`` fixes the noise bandwidth of a sample."""
+    params = np.zeros(1, PARAMS)
+    p = params[0]
+    _mechanism(p, config, device)
+    _drive_combs(p, config, device)
+    _amplifier(p, config, drive_v_per_count)
+    _modes_and_forces(p, config)
+    _sense_chain(p, config, device, period_us, sense_f_per_count, sense_zero_f)
+    return params
+
+
+def _mechanism(p: np.void, config: PlantConfig, device: Device) -> None:
+    f = device.flexures
+    projection_m, height_m = device.geometry.link_rest_m
+    p["crank_m"] = device.geometry.crank_length_m
+    p["link_m"] = math.hypot(projection_m, height_m)
+    p["projection_rest_m"], p["height_rest_m"] = projection_m, height_m
+    # one folded spring is two clamped beams in series; a beam of length l gives E h t^3 / l^3 (paper Eq. 26: four of these)
+    leaf = (
+        4
+        * f.youngs_modulus_pa
+        * f.leaf_height_m
+        * f.leaf_thickness_m**3
+        / (f.leaf_inner_length_m**3 + f.leaf_outer_length_m**3)
+    )
+    crank = f.youngs_modulus_pa * f.crank_hinge_height_m * f.crank_hinge_thickness_m**3 / 12 / f.crank_hinge_length_m
+    link = f.youngs_modulus_pa * f.link_hinge_width_m * f.link_hinge_thickness_m**3 / 12 / f.link_hinge_length_m
+    mismatch = config.stiffness_mismatch
+    leaf_error, crank_error, link_error = (
+        np.array(e) if mismatch.on else np.zeros(3) for e in (mismatch.leaf, mismatch.crank_hinge, mismatch.link_hinge)
+    )
+    p["leaf_n_per_m"] = 4 * leaf * (1 + leaf_error)
+    p["crank_hinge_nm"] = 4 * crank * (1 + crank_error)
+    p["link_hinge_nm"] = 4 * f.out_of_plane_chains * link * (1 + np.mean(link_error))
+    p["mass_kg"] = device.dynamics.mass_kg * (1 + (config.mass_error.relative if config.mass_error.on else 0.0))
+    p["damping_per_s"] = _damping(p, config, device)
+    p["weight_n"] = _weight(config, float(p["mass_kg"]))
+    stops = config.stops
+    far_m = 1.0  # no stop
+    p["stop_low_m"] = device.limits.stroke_min_m - stops.clearance_m if stops.on else -far_m
+    p["stop_high_m"] = device.limits.stroke_max_m + stops.clearance_m if stops.on else far_m
+    p["stop_n_per_m"], p["stop_damping_s_per_m"] = stops.stiffness_n_per_m, stops.damping_s_per_m
+
+
+def rest_stiffness(p: np.void, position_m: np.ndarray) -> np.ndarray:
+    """Hessian of the elastic energy, (3, 3), N/m."""
+    xx, xy, xz, yy, yz, zz = stiffness(p, *position_m)
+    return np.array([[xx, xy, xz], [xy, yy, yz], [xz, yz, zz]])
+
+
+def _damping(p: np.void, config: PlantConfig, device: Device) -> np.ndarray:
+    """Modal damping D = C / m: every mode of the rest pose gets w / Q."""
+    if not config.damping.on:
+        return np.zeros((3, 3))
+    quality = config.damping.quality_factor or device.dynamics.quality_factor
+    w2, modes = np.linalg.eigh(rest_stiffness(p, np.zeros(3)) / p["mass_kg"])
+    return np.asarray((modes * np.sqrt(w2) / quality) @ modes.T)
+
+
+def _weight(config: PlantConfig, mass_kg: float) -> np.ndarray:
+    g = config.gravity
+    if not g.on:
+        return np.zeros(3)
+    # the stage turned by tilt_x about x, then tilt_y about y: 'down' as the stage sees it
+    down = np.array(
+        [
+            math.cos(g.tilt_x_rad) * math.sin(g.tilt_y_rad),
+            -math.sin(g.tilt_x_rad),
+            -math.cos(g.tilt_x_rad) * math.cos(g.tilt_y_rad),
+        ]
+    )
+    if g.level_is_rest:
+        down[2] += 1.0
+    return mass_kg * g.acceleration_m_per_s2 * down
+
+
+def _drive_combs(p: np.void, config: PlantConfig, device: Device) -> None:
+    comb, f = device.drive_comb, device.flexures
+    gain = comb.finger_count * EPSILON_0_F_PER_M * comb.finger_height_m / comb.finger_gap_m
+    error = np.array(config.comb_mismatch.relative) if config.comb_mismatch.on else np.zeros(3)
+    p["force_gain_n_per_v2"] = gain * (1 + error)
+    p["fringe_per_m"] = config.fringe.relative_per_25um / STROKE_SCALE_M if config.fringe.on else 0.0
+    p["levitation"] = config.levitation.ratio if config.levitation.on else 0.0
+    p["overlap_rest_m"] = comb.overlap_rest_m
+    # lateral stiffness of a slider: its four folded springs across the motion, each two leaves in series along their length
+    lateral = (
+        16
+        * f.youngs_modulus_pa
+        * f.leaf_height_m
+        * f.leaf_thickness_m
+        / (f.leaf_inner_length_m + f.leaf_outer_length_m)
+    )
+    per_volt2_m = 2 * gain / comb.finger_gap_m**2
+    p["lateral_limit_v2m"] = (
+        config.pull_in.lateral_stiffness_ratio * lateral / per_volt2_m if config.pull_in.on else np.inf
+    )
+    p["charging_on"] = config.charging.on
+    p["charging_fraction"], p["charging_s"] = config.charging.fraction, config.charging.time_constant_s
+
+
+def _amplifier(p: np.void, config: PlantConfig, v_per_count: float) -> None:
+    unlimited_v_per_s = 1e18
+    p["amplifier_s"] = (
+        1 / (2 * math.pi * config.amplifier_bandwidth.corner_hz) if config.amplifier_bandwidth.on else 0.0
+    )
+    p["slew_v_per_s"] = config.slew.limit_v_per_s if config.slew.on else unlimited_v_per_s
+    p["current_a"] = config.current_limit.limit_a if config.current_limit.on else 0.0
+    p["stray_f"] = config.current_limit.stray_f
+    p["volt_per_count"] = v_per_count * (1 + np.array(config.amplifier_gain.relative) * config.amplifier_gain.on)
+    p["amplifier_offset_v"] = np.array(config.amplifier_offset.offset_v) * config.amplifier_offset.on
+    p["dac_step"] = config.dac.step_counts if config.dac.on else 1
+
+
+def _modes_and_forces(p: np.void, config: PlantConfig) -> None:
+    mode = config.parasitic
+    p["parasitic_on"] = mode.on
+    w = 2 * math.pi * mode.frequency_hz
+    p["parasitic_rad_per_s"], p["parasitic_damping_per_s"] = w, w / mode.quality_factor
+    p["parasitic_per_kg"] = mode.compliance_share * w**2 / rest_stiffness(p, np.zeros(3))[0, 0]
+    p["parasitic_comb"], p["parasitic_table"] = mode.comb_shape, mode.table_shape
+    p["drift_on"] = config.drift.on
+    p["drift_n"], p["drift_s"] = config.drift.force_n, config.drift.time_constant_s
+    p["drift_walk_n_per_rt_s"] = config.drift.walk_n_per_rt_s
+    if config.brownian.on:  # two-sided density 2 k T C, held over a step dt: variance 2 k T C / dt
+        damping = np.diag(p["damping_per_s"]) * p["mass_kg"]
+        p["brownian_n_rt_s"] = np.sqrt(2 * BOLTZMANN_J_PER_K * config.brownian.temperature_k * damping)
+
+
+def _sense_chain(
+    p: np.void, config: PlantConfig, device: Device, period_us: int, f_per_count: float, zero_f: float
+) -> None:
+    comb = device.sense_comb
+    gradient = 2 * comb.finger_count * EPSILON_0_F_PER_M * comb.finger_height_m / comb.finger_gap_m
+    gain = config.sense_gain
+    p["sense_f_per_m"] = gradient * (1 + np.array(gain.relative) * gain.on)
+    p["sense_curvature_per_m"] = gain.curvature_per_25um / STROKE_SCALE_M * gain.on
+    p["sense_rest_f"] = gradient * comb.overlap_rest_m
+    p["sense_offset_f"] = np.array(config.sense_offset.offset_f) * config.sense_offset.on
+    sample_hz = 1e6 / period_us
+    p["sense_noise_f"] = config.sense_noise.density_f_per_rt_hz * math.sqrt(sample_hz / 2) * config.sense_noise.on
+    p["sense_filter_s"] = 1 / (2 * math.pi * config.sense_bandwidth.corner_hz) if config.sense_bandwidth.on else 0.0
+    p["sense_delay_us"] = config.sense_delay.delay_s * 1e6 * config.sense_delay.on
+    p["sense_walk_f_per_rt_s"] = config.sense_drift.walk_f_per_rt_s * config.sense_drift.on
+    p["feedthrough_f_per_v"] = config.feedthrough.f_per_v * config.feedthrough.on
+    p["count_f"], p["count_zero_f"] = f_per_count, zero_f
+    p["adc_step"] = config.sense_adc.step_counts if config.sense_adc.on else 1
+
+
+def state_at_rest(params: np.ndarray, config: PlantConfig, seed: int) -> np.ndarray:
+    """State, one element of ``layout.STATE``, in static equilibrium with zero counts on the converters."""
+    state = np.zeros(1, STATE)
+    p, s = params[0], state[0]
+    s["target_v"] = s["voltage_v"] = p["amplifier_offset_v"]
+    s["force_n"] = p["weight_n"]
+    volt2 = s["voltage_v"] ** 2
+    s["motion"][:3] = equilibrium(p, s, volt2)
+    if p["parasitic_on"]:
+        s["parasitic"][0] = rest(p, volt2)
+    strokes(p, s["motion"], s["filtered_m"])
+    s["filtered_m"] += p["parasitic_comb"] * s["parasitic"][0]
+    s["knot_m"][0] = s["filtered_m"]
+    s["knot_count"] = 1
+    offsets = {
+        layout.BROWNIAN_STREAM: config.brownian.seed_offset,
+        layout.DRIFT_STREAM: config.drift.seed_offset,
+        **{layout.SENSE_STREAM + i: config.sense_noise.seed_offset for i in range(3)},
+        **{layout.SENSE_DRIFT_STREAM + i: config.sense_drift.seed_offset for i in range(3)},
+    }
+    for source, offset in offsets.items():
+        s["random"][source] = stream(seed, source, offset)
+    return state
+
+
+def equilibrium(p: np.void, s: np.void, volt2: np.ndarray) -> np.ndarray:
+    """Position (3,), m, where elastic, comb and constant forces balance, by Newton's method from rest.
+
+    Raises ArithmeticError if it does not settle, which needs forces far beyond the stage's own."""
+    x = np.zeros(3)
+    for _ in range(50):
+        force = p["mass_kg"] * np.array(acceleration(p, s, volt2, *x, 0.0, 0.0, 0.0))
+        change = np.linalg.solve(rest_stiffness(p, x), force)
+        x = x + change
+        if np.abs(change).max() < 1e-18:
+            return x
+    raise ArithmeticError(f"no static equilibrium near rest: the table still moves by {np.abs(change).max():.1e} m")

@@ -1,0 +1,115 @@
+"""From strokes to sense counts.
+
+    C_i = C_rest + g_i (q_i + c q_i^2 / 2) + offset_i + walk_i + feedthrough V_i + noise;   counts = round((C_i - zero) / scale), int16
+
+q_i is the slider's stroke with the parasitic mode's part, after a first-order filter and a delay where these are on. Filter and
+delay see the strokes as a cubic through value and rate at both ends of each step."""
+
+import math
+
+from numba import njit
+
+from sim.geometry import stroke_rates, strokes
+from sim.layout import KNOTS, SENSE_DRIFT_STREAM, SENSE_STREAM
+from sim.noise import normal
+
+
+@njit(cache=True, error_model="numpy")
+def seen(p, s, out_m, out_m_per_s):
+    """Strokes and rates (3,) as the sense combs move, parasitic mode included."""
+    strokes(p, s["motion"], out_m)
+    stroke_rates(p, s["motion"], out_m_per_s)
+    if p["parasitic_on"] != 0:
+        for i in range(3):
+            out_m[i] += p["parasitic_comb"][i] * s["parasitic"][0]
+            out_m_per_s[i] += p["parasitic_comb"][i] * s["parasitic"][1]
+
+
+@njit(cache=True, error_model="numpy")
+def _filtered(tau, h, q0, v0, q1, v1, f0):
+    """End value of f' = (q - f) / tau over h s, for the cubic q(t) with these values and rates at its ends, from f0."""
+    a3 = (2.0 * (q0 - q1) / h + v0 + v1) / (h * h)
+    a2 = (3.0 * (q1 - q0) / h - 2.0 * v0 - v1) / h
+    c3 = a3
+    c2 = a2 - 3.0 * tau * c3
+    c1 = v0 - 2.0 * tau * c2
+    c0 = q0 - tau * c1
+    return c0 + h * (c1 + h * (c2 + h * c3)) + (f0 - c0) * math.exp(-h / tau)
+
+
+@njit(cache=True, error_model="numpy")
+def follow(p, s, h):
+    """Move filter and memory of the sense chain on over the step of h s that just ended at s["t_us"]. s["before_m"] and
+    s["before_m_per_s"] are the strokes and rates at its start."""
+    q, v = s["strokes_m"], s["rates_m_per_s"]
+    seen(p, s, q, v)
+    n = s["knot_count"] % KNOTS
+    s["knot_count"] += 1
+    s["knot_t_us"][n] = s["t_us"]
+    tau = p["sense_filter_s"]
+    for i in range(3):
+        if tau > 0.0:
+            f = _filtered(tau, h, s["before_m"][i], s["before_m_per_s"][i], q[i], v[i], s["filtered_m"][i])
+            s["knot_m_per_s"][n, i] = (q[i] - f) / tau
+        else:
+            f = q[i]
+            s["knot_m_per_s"][n, i] = v[i]
+        s["filtered_m"][i] = f
+        s["knot_m"][n, i] = f
+
+
+@njit(cache=True, error_model="numpy")
+def _remembered(p, s, out_m):
+    """Filtered strokes (3,) at the delay before now, by the cubic between the knots around that time; at most as old as the
+    oldest knot."""
+    wanted_us = s["t_us"] - p["sense_delay_us"]
+    newest = s["knot_count"] - 1
+    oldest = max(0, s["knot_count"] - KNOTS)
+    late = newest
+    while late > oldest and s["knot_t_us"][(late - 1) % KNOTS] >= wanted_us:
+        late -= 1
+    if late == oldest:
+        for i in range(3):
+            out_m[i] = s["knot_m"][late % KNOTS, i]
+        return
+    a, b = (late - 1) % KNOTS, late % KNOTS
+    h = (s["knot_t_us"][b] - s["knot_t_us"][a]) * 1e-6
+    u = (wanted_us - s["knot_t_us"][a]) * 1e-6 / h
+    for i in range(3):
+        rise = s["knot_m"][b, i] - s["knot_m"][a, i]
+        v0, v1 = s["knot_m_per_s"][a, i] * h, s["knot_m_per_s"][b, i] * h
+        out_m[i] = s["knot_m"][a, i] + u * (v0 + u * (3.0 * rise - 2.0 * v0 - v1 + u * (v0 + v1 - 2.0 * rise)))
+
+
+@njit(cache=True, error_model="numpy")
+def walk(p, s, dt_s):
+    """Random walk of the channels' offsets over dt_s."""
+    size = p["sense_walk_f_per_rt_s"] * math.sqrt(dt_s)
+    for i in range(3):
+        s["sense_walk_f"][i] += size * normal(s["random"][SENSE_DRIFT_STREAM + i], s["spare"][SENSE_DRIFT_STREAM + i])
+
+
+@njit(cache=True, error_model="numpy")
+def sample(params, state, counts):
+    """Sample the three channels now into ``counts`` (3,) integers; draws their noise."""
+    p = params[0]
+    s = state[0]
+    q = s["strokes_m"]
+    if p["sense_delay_us"] > 0.0:
+        _remembered(p, s, q)
+    elif p["sense_filter_s"] > 0.0:
+        for i in range(3):
+            q[i] = s["filtered_m"][i]
+    else:
+        strokes(p, s["motion"], q)
+        if p["parasitic_on"] != 0:
+            for i in range(3):
+                q[i] += p["parasitic_comb"][i] * s["parasitic"][0]
+    step = p["adc_step"]
+    for i in range(3):
+        farad = p["sense_rest_f"] + p["sense_f_per_m"][i] * q[i] * (1.0 + 0.5 * p["sense_curvature_per_m"] * q[i])
+        farad += p["sense_offset_f"][i] + s["sense_walk_f"][i] + p["feedthrough_f_per_v"] * s["voltage_v"][i]
+        if p["sense_noise_f"] > 0.0:
+            farad += p["sense_noise_f"] * normal(s["random"][SENSE_STREAM + i], s["spare"][SENSE_STREAM + i])
+        steps = (farad - p["count_zero_f"]) / (p["count_f"] * step)
+        counts[i] = int(max(-32768.0, min(32767.0, math.floor(steps + 0.5) * step)))
