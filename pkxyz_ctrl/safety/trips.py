@@ -5,7 +5,7 @@ from typing import Final
 
 
 class Trip(IntFlag):
-    """Reasons to go to FAULT. Those with a number or an axis are three neighbouring bits: ``FIRST << i`` is the i-th."""
+    """Reasons to go to FAULT. Those with a number or an axis are three neighbouring bits, FIRST << i is the i-th."""
 
     SENSE_STALE = 1 << 0
     SENSE_SEQUENCE = 1 << 1
