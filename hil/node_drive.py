@@ -1,0 +1,105 @@
+"""Reception of the drive PDO: no count reaches the amplifier that has not passed here."""
+
+import struct
+
+from hil.node_crc import crc8h2f, word_tables
+from hil.node_emergency import ErrorCode, FrameErrors
+from hil.node_pdo import Layout, PdoParameters
+from hil.object_dictionary import ObjectDictionary
+
+Counts = tuple[int, int, int]
+
+_unpack_protected = struct.Struct("<3HBB").unpack
+_OUTPUT = 0x6411
+
+
+class DriveReceiver:
+    """Checks length, CRC, alive counter and range of each drive PDO; ``pending`` holds the last one that passed.
+
+    A count is valid from 0 to the high limit that the EDS gives to object 0x6411. The alive counter must be one more
+    than that of the last frame with a correct CRC, whether that one passed or not: after a lost frame one more is
+    refused, and the sequence goes on. The first frame after `start` may carry any.
+    """
+
+    def __init__(self, od: ObjectDictionary, parameters: PdoParameters, errors: FrameErrors) -> None:
+        self._od = od
+        self._parameters = parameters
+        self._errors = errors
+        self._limit = od.entry(_OUTPUT, 1).high or 0
+        self.pending: Counts | None = None
+        self.counter: int | None = None  # of the last frame with a correct CRC
+        self.crc = 0
+        self.configure()
+
+    def configure(self) -> None:
+        """Take over COB-ID and mapping from the dictionary."""
+        self._cob_bytes = self._parameters.cob_id.to_bytes(2, "little")
+        self._layout: Layout = self._parameters.layout()
+        self.receive = self._receive_mapped
+        if self._layout.fields == self._parameters.protected_fields:
+            self._w0, self._w1, self._w2, self._w3 = word_tables(self._parameters.cob_id)
+            self.receive = self._receive_protected
+
+    def start(self) -> None:
+        """Forget what came before: nothing pending, and any alive counter may come next."""
+        self.pending = None
+        self.counter = None
+
+    def _receive_protected(self, data: bytes, t_us: int) -> None:
+        try:
+            a, b, c, counter, crc = _unpack_protected(data)
+        except struct.error:
+            self._wrong_length(data, t_us)
+            return
+        if self._w0[a] ^ self._w1[b] ^ self._w2[c] ^ self._w3[counter] != crc:
+            self._errors.bad(ErrorCode.DRIVE_CRC, t_us, data[3:8])
+            return
+        last, self.counter, self.crc = self.counter, counter, crc
+        if last is not None and (last + 1) & 0xFF != counter:
+            self._errors.bad(ErrorCode.DRIVE_COUNTER, t_us, bytes((last, counter)))
+            return
+        limit = self._limit  # the words are unsigned here, so a negative count is above any limit
+        if a > limit or b > limit or c > limit:
+            self._errors.bad(ErrorCode.DRIVE_VALUE, t_us, _channels_over((a, b, c), limit))
+            return
+        self.pending = (a, b, c)
+        if self._errors.present:
+            self._errors.good(t_us)
+
+    def _receive_mapped(self, data: bytes, t_us: int) -> None:
+        """The same for any mapping; a channel that is not mapped keeps its value."""
+        layout = self._layout
+        if len(data) != layout.codec.size:
+            self._wrong_length(data, t_us)
+            return
+        values = layout.codec.unpack(data)
+        if layout.crc is not None:
+            if crc8h2f(self._cob_bytes + data[:-1]) != data[-1]:
+                self._errors.bad(ErrorCode.DRIVE_CRC, t_us, data[-5:])
+                return
+            self.crc = data[-1]
+        if layout.counter is not None:
+            last, self.counter = self.counter, values[layout.counter]
+            if last is not None and (last + 1) & 0xFF != self.counter:
+                self._errors.bad(ErrorCode.DRIVE_COUNTER, t_us, bytes((last, values[layout.counter])))
+                return
+        words = list(self.pending or (self._od[_OUTPUT, subindex] for subindex in (1, 2, 3)))
+        for (index, subindex), value in zip(layout.fields, values, strict=True):
+            if index == _OUTPUT:
+                words[subindex - 1] = value & 0xFFFF
+        if max(words) > self._limit:
+            self._errors.bad(ErrorCode.DRIVE_VALUE, t_us, _channels_over(words, self._limit))
+            return
+        self.pending = (words[0], words[1], words[2])
+        if self._errors.present:
+            self._errors.good(t_us)
+
+    def _wrong_length(self, data: bytes, t_us: int) -> None:
+        """CiA 301 would use the front of a frame that is too long; with 200 V behind it, it is refused as well."""
+        expected = self._layout.codec.size
+        code = ErrorCode.DRIVE_SHORT if len(data) < expected else ErrorCode.DRIVE_LONG
+        self._errors.bad(code, t_us, bytes((len(data), expected)))
+
+
+def _channels_over(words: list[int] | Counts, limit: int) -> bytes:
+    return bytes((sum(1 << channel for channel, word in enumerate(words) if word > limit),))

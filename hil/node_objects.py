@@ -1,0 +1,88 @@
+"""What a master reads and writes by SDO: the dictionary's access rules, and those that depend on the node's state."""
+
+from collections.abc import Callable
+
+from hil.node_pdo import PdoParameters, check_can_id
+from hil.object_dictionary import Abort, Entry, ObjectDictionary, SdoAbortError
+
+
+class NodeObjects:
+    """Stands between the SDO server and the dictionary.
+
+    ``refresh(index)`` is called before a value is read, ``changed(index)`` after one was written; ``may_drive()`` tells
+    whether a drive count other than 0 may be set by SDO.
+    """
+
+    def __init__(
+        self,
+        od: ObjectDictionary,
+        pdos: tuple[PdoParameters, ...],
+        *,
+        refresh: Callable[[int], None],
+        changed: Callable[[int], None],
+        may_drive: Callable[[], bool],
+    ) -> None:
+        self._od = od
+        self._pdos = {index: pdo for pdo in pdos for index in (pdo.communication, pdo.mapping)}
+        self._refresh = refresh
+        self._changed = changed
+        self._may_drive = may_drive
+
+    def read(self, index: int, subindex: int) -> bytes:
+        entry = self._od.entry(index, subindex)
+        entry.check_readable()
+        self._refresh(index)
+        return entry.encode()
+
+    def check_download(self, index: int, subindex: int, length: int | None) -> None:
+        """What can be refused before the data are there. ``length`` in bytes, None if the client does not say."""
+        entry = self._od.entry(index, subindex)
+        entry.check_writable()
+        if length is not None:
+            entry.check_length(length)
+
+    def unsized_length(self, index: int, subindex: int) -> int:
+        """Bytes that count in an expedited download that does not say how many do."""
+        return self._od.entry(index, subindex).length or 4
+
+    def write(self, index: int, subindex: int, data: bytes) -> None:
+        entry = self._od.entry(index, subindex)
+        entry.check_writable()
+        value = entry.decode(data)
+        if isinstance(value, int):
+            self._check(entry, value)
+        entry.value = value
+        self._changed(index)
+
+    def _check(self, entry: Entry, value: int) -> None:
+        index, subindex = entry.index, entry.subindex
+        if index in self._pdos:
+            self._pdos[index].check(index, subindex, value)
+        elif index == 0x1003 and value != 0:
+            raise SdoAbortError(Abort.VALUE_RANGE)  # zero clears the history; nothing else can be written
+        elif index == 0x1005:
+            if value & 1 << 30:
+                raise SdoAbortError(Abort.VALUE_RANGE)  # the node does not produce SYNC
+            check_can_id(value)
+        elif index == 0x1014:
+            check_can_id(value)
+            old = self._od[0x1014, 0]
+            if not (old | value) & 1 << 31 and (old ^ value) & 0x7FF:
+                raise SdoAbortError(Abort.VALUE_RANGE)  # in use: the identifier cannot change
+        elif index == 0x1016:
+            self._check_heartbeat_consumer(subindex, value)
+        elif index == 0x1019 and value == 1:
+            raise SdoAbortError(Abort.VALUE_RANGE)  # reserved (CiA 301, 7.5.2.22)
+        elif index == 0x6411 and value != 0 and not self._may_drive():
+            raise SdoAbortError(Abort.LOCAL_CONTROL)
+        elif index == 0x6444 and not 0 <= value <= (self._od.entry(0x6411, subindex).high or 0):
+            raise SdoAbortError(Abort.VALUE_RANGE)
+
+    def _check_heartbeat_consumer(self, subindex: int, value: int) -> None:
+        node_id, time_ms = value >> 16, value & 0xFFFF
+        if node_id > 127:
+            raise SdoAbortError(Abort.VALUE_RANGE)
+        for other in range(1, self._od[0x1016, 0] + 1):
+            entry = self._od[0x1016, other]
+            if other != subindex and time_ms and entry & 0xFFFF and entry >> 16 == node_id:
+                raise SdoAbortError(Abort.INCOMPATIBLE)  # one node cannot have two times

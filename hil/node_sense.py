@@ -1,0 +1,161 @@
+"""Transmission of the sense PDO: sampled at the SYNC, sent after the turn-around time."""
+
+import struct
+from collections.abc import Callable
+from typing import Protocol
+
+from hil.alarm import Alarm, Clock
+from hil.node_crc import crc8h2f, word_tables
+from hil.node_heartbeat import HeartbeatProducer
+from hil.node_pdo import PdoParameters
+from hil.object_dictionary import ObjectDictionary
+
+_pack_protected = struct.Struct("<3hBB").pack
+_INPUT = 0x6401
+_PROTECTION = 0x2001
+
+
+class Plant(Protocol):
+    """What the amplifier is wired to: three drive combs, three sense combs."""
+
+    def advance_to(self, t_us: int, /) -> None: ...
+
+    def drive(self, counts: tuple[int, int, int], /) -> None: ...
+
+    def sample(self) -> tuple[int, int, int]: ...
+
+
+class SenseTransmitter:
+    """Samples and sends as the transmission type says (CiA 301, table 72).
+
+    0: at a SYNC, if a count has changed since the last frame. 1 to 240: at every n-th SYNC, counted from the start or
+    from the SYNC whose counter is the SYNC start value. 254, 255: by the event timer (CiA 401 would add a change of the
+    input, which its object 0x6423 switches off by default and which this device does not have).
+    """
+
+    def __init__(
+        self,
+        od: ObjectDictionary,
+        parameters: PdoParameters,
+        clock: Clock,
+        plant: Plant,
+        send: Callable[[int, bytes], None],
+        heartbeat: HeartbeatProducer,
+        turnaround_us: int,
+    ) -> None:
+        self._od = od
+        self._parameters = parameters
+        self._clock = clock
+        self._plant = plant
+        self._send = send
+        self._heartbeat = heartbeat
+        self._turnaround_us = turnaround_us
+        self._event = Alarm(clock, self._on_event)
+        self._running = False
+        self._sync_us = 0
+        self._cycle_us = 0  # between the last two SYNCs
+        self._due_us: int | None = None  # of the frame in the turn-around
+        self.counts = (0, 0, 0)  # last sample
+        self.counter = 0  # alive counter of the next frame
+        self.crc = 0
+        self.configure()
+
+    def configure(self) -> None:
+        """Take over COB-ID, mapping, transmission type and timers from the dictionary."""
+        od, parameters = self._od, self._parameters
+        self._cob_id = parameters.cob_id
+        self._cob_bytes = self._cob_id.to_bytes(2, "little")
+        self._layout = parameters.layout()
+        self._is_default = self._layout.fields == parameters.protected_fields
+        if self._is_default:
+            self._w0, self._w1, self._w2, self._w3 = word_tables(self._cob_id)
+        kind = parameters.transmission_type
+        self._on_change = kind == 0
+        self._every = max(1, kind) if parameters.in_use and kind <= 240 else 0
+        self._to_go = self._every
+        start = od[parameters.communication, 6] if od[0x1019, 0] else 0
+        self._start_data = bytes((start,)) if start else None
+        inhibit_us = 100 * od[parameters.communication, 3]
+        event_us = 1000 * od[parameters.communication, 5]
+        self._event_us = max(event_us, inhibit_us) if event_us and parameters.in_use and kind >= 254 else 0
+        self._event.cancel()
+        if self._running:
+            self.start()
+
+    def start(self) -> None:
+        """The node has become operational."""
+        self._running = True
+        self._to_go = self._every
+        self._sent: tuple[int, int, int] | None = None
+        self._waits_for = self._start_data
+        if self._event_us:
+            self._event.set(self._clock.now_us + self._event_us)
+
+    def stop(self) -> None:
+        """The node has left operational: what is in the turn-around is not sent."""
+        self._running = False
+        self._due_us = None
+        self._event.cancel()
+
+    def on_sync(self, data: bytes, t_us: int) -> None:
+        """Sample if it is time to; the plant is at ``t_us``. ``data`` of the SYNC: its counter, or nothing."""
+        self._cycle_us = t_us - self._sync_us
+        self._sync_us = t_us
+        self._to_go -= 1
+        if self._waits_for is not None:
+            if data != self._waits_for:
+                return
+            self._waits_for = None
+            self._to_go = 0
+        if self._to_go > 0 or not self._every:
+            return
+        self._to_go = self._every
+        self.counts = self._plant.sample()
+        if self._on_change and self.counts == self._sent:
+            return
+        due_us = t_us + self._turnaround_us
+        self._due_us = due_us
+        self._clock.call_at(due_us, self._on_turnaround)
+
+    def _on_turnaround(self) -> None:
+        now_us = self._clock.now_us
+        if self._due_us is None or now_us < self._due_us:
+            return  # stopped meanwhile, or overtaken by a SYNC that came too soon
+        self._due_us = None
+        self._transmit()
+        self._heartbeat.ride(now_us, self._cycle_us)
+
+    def _on_event(self, now_us: int) -> None:
+        self._plant.advance_to(now_us)
+        self.counts = self._plant.sample()
+        self._transmit()
+        self._event.set(now_us + self._event_us)
+
+    def _transmit(self) -> None:
+        counter = self.counter
+        self.counter = (counter + 1) & 0xFF
+        if self._is_default:
+            a, b, c = self._sent = self.counts
+            self.crc = crc = self._w0[a] ^ self._w1[b] ^ self._w2[c] ^ self._w3[counter]
+            self._send(self._cob_id, _pack_protected(a, b, c, counter, crc))
+        else:
+            self._send(self._cob_id, self._encode_mapped(counter))
+
+    def _encode_mapped(self, counter: int) -> bytes:
+        self._sent = self.counts
+        od, layout = self._od, self._layout
+        self.publish()
+        od[_PROTECTION, 1] = counter
+        od[_PROTECTION, 2] = 0
+        data = layout.codec.pack(*(od[field] for field in layout.fields))
+        if layout.crc is not None:
+            self.crc = od[_PROTECTION, 2] = crc8h2f(self._cob_bytes + data[:-1])
+            data = data[:-1] + bytes((self.crc,))
+        return data
+
+    def publish(self) -> None:
+        """Bring the process values to where SDO reads them."""
+        for subindex in (1, 2, 3):
+            self._od[_INPUT, subindex] = self.counts[subindex - 1]
+        self._od[_PROTECTION, 1] = (self.counter - 1) & 0xFF
+        self._od[_PROTECTION, 2] = self.crc
