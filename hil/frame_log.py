@@ -1,0 +1,80 @@
+"""Every frame on the wire, streamed to a candump log (``candump -L``): python-can, cantools and can-utils read it."""
+
+from pathlib import Path
+from types import TracebackType
+from typing import Self
+
+from hil.endpoint import Endpoint
+from hil.wire import ERROR_BUS, Wire
+from pkxyz_ctrl.can.frame import Frame
+
+BLOCK_FRAMES = 4096  # formatted and written together: about 0.3 s of a busy wire, and what a killed process loses
+ERROR_FLAG = 0x2000_0000  # CAN_ERR_FLAG of linux/can.h
+
+
+class FrameLog:
+    """Lines of ``(seconds.microseconds) channel ID#DATA``, FD frames as ``ID##<flags>DATA`` with flags 1 = BRS.
+
+    An existing file is overwritten. The file holds whole lines at any time, also if the program is interrupted.
+    """
+
+    def __init__(self, path: str | Path, channel: str) -> None:
+        if not channel or any(c.isspace() for c in channel):
+            raise ValueError(f"channel {channel!r}: the log's columns are separated by blanks")
+        self.path = Path(path)
+        self.channel = channel
+        self.frames = 0
+        self._rows: list[tuple[int, Frame]] = []
+        self._endpoint: Endpoint | None = None
+        self._file = self.path.open("w", encoding="ascii", newline="\n")
+
+    def attach(self, wire: Wire) -> None:
+        """Listen to ``wire``, error frames included, until closed."""
+        self._endpoint = wire.attach(f"log {self.path}", self.record, listen_only=True, error_frames=True)
+
+    def record(self, frame: Frame, t_us: int) -> None:
+        """Add one frame that ended at ``t_us``."""
+        rows = self._rows
+        rows.append((t_us, frame))
+        if len(rows) >= BLOCK_FRAMES:
+            self.flush()
+
+    def flush(self) -> None:
+        """Write what was recorded so far."""
+        if self._rows:
+            rows, self._rows = self._rows, []
+            self.frames += len(rows)
+            channel = self.channel
+            self._file.write("".join([_line(t_us, channel, frame) for t_us, frame in rows]))
+            self._file.flush()
+
+    def close(self) -> None:
+        if self._endpoint is not None:
+            self._endpoint.detach()
+            self._endpoint = None
+        if not self._file.closed:
+            try:
+                self.flush()
+            finally:
+                self._file.close()
+
+    def __enter__(self) -> Self:
+        return self
+
+    def __exit__(self, kind: type[BaseException] | None, error: BaseException | None, tb: TracebackType | None) -> None:
+        self.close()
+
+
+def _line(t_us: int, channel: str, frame: Frame) -> str:
+    can_id, data, is_fd, bitrate_switch, is_remote, is_extended, is_error = frame
+    seconds, micros = divmod(t_us, 1_000_000)
+    if is_error:
+        can_id |= ERROR_FLAG | ERROR_BUS  # without this class python-can's reader takes it for a data frame
+    identifier = f"{can_id:08X}" if is_extended or is_error else f"{can_id:03X}"
+    if is_fd:
+        payload = ("#1" if bitrate_switch else "#0") + data.hex().upper()
+    elif is_remote:
+        payload = f"R{len(data)}" if data else "R"
+    else:
+        payload = data.hex().upper()
+    return f"({seconds}.{micros:06d}) {channel} {identifier}#{payload}\n"
