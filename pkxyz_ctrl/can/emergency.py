@@ -76,7 +76,9 @@ def code_text(code: int) -> str:
     if exact is not None:
         return exact
     high = code >> 8
-    return _CLASS.get(high) or _CLASS.get(high & 0xF0) or "unknown error code"
+    if high in _CLASS:
+        return _CLASS[high]
+    return _CLASS[high & 0xF0] if high >= 0x10 and high & 0xF0 in _CLASS else "unknown error code"
 
 
 def decode_emergency(data: bytes, t_us: int) -> Emergency | None:

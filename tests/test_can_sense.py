@@ -1,0 +1,141 @@
+"""Sense PDOs that age: what is believed, what is flagged, over lost, late, repeated and damaged frames."""
+
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from pkxyz_ctrl.can.codec import ProcessCodec
+from pkxyz_ctrl.can.sense_input import (
+    SENSE_COUNTER,
+    SENSE_CRC,
+    SENSE_DUPLICATE,
+    SENSE_LENGTH,
+    SENSE_MISSING,
+    SenseInput,
+)
+
+CODEC = ProcessCodec(0x28A, protected=True)
+
+
+def frame(sample: int) -> bytes:
+    """The node's PDO of sample number ``sample``: the value tells which one it is."""
+    return CODEC.encode((sample, -sample, 7), sample & 0xFF)
+
+
+def tick(sense: SenseInput, *payloads: bytes) -> tuple[int, int]:
+    """One SYNC, what arrives after it, and what the controller gets: (first count, status)."""
+    sense.on_sync()
+    for payload in payloads:
+        sense.receive(payload)
+    first, second, third, status = sense.take()
+    assert (second, third) in ((-first, 7), (0, 0))
+    return first, status
+
+
+@pytest.fixture
+def running() -> SenseInput:
+    sense = SenseInput(CODEC)
+    assert tick(sense, frame(100)) == (100, 0)
+    return sense
+
+
+def test_nothing_received_is_missing_and_zero():
+    assert tick(SenseInput(CODEC)) == (0, SENSE_MISSING)
+
+
+def test_a_thousand_good_ticks_have_status_zero(running):
+    for sample in range(101, 1101):
+        assert tick(running, frame(sample)) == (sample, 0)
+
+
+def test_values_age(running):
+    assert running.fresh
+    assert tick(running) == (100, SENSE_MISSING)
+    assert not running.fresh
+
+
+def test_after_a_loss_the_next_frame_is_used_and_flagged(running):
+    assert tick(running) == (100, SENSE_MISSING)
+    assert tick(running, frame(102)) == (102, SENSE_COUNTER)
+    assert tick(running, frame(103)) == (103, 0)
+
+
+def test_late_frame_is_flagged_then_superseded_by_the_newer_one(running):
+    assert tick(running) == (100, SENSE_MISSING)
+    assert tick(running, frame(101), frame(102)) == (102, SENSE_COUNTER | SENSE_DUPLICATE)
+    assert tick(running, frame(103)) == (103, 0)
+
+
+def test_frame_after_take_is_reported_with_the_next_tick_and_its_value_is_not_used(running):
+    assert tick(running) == (100, SENSE_MISSING)
+    running.receive(frame(101))
+    running.receive(b"")
+    assert tick(running) == (101, SENSE_MISSING | SENSE_LENGTH)
+
+
+@pytest.mark.parametrize("back", [*range(0, 40), 254])
+def test_an_old_frame_played_again_is_never_used(running, back):
+    replayed = CODEC.encode((1, -1, 7), (100 - back) & 0xFF)
+    assert tick(running, replayed) == (100, SENSE_MISSING | SENSE_COUNTER)
+    assert tick(running, frame(102)) == (102, SENSE_COUNTER)
+
+
+def test_a_counter_from_the_future_is_not_used(running):
+    assert tick(running, CODEC.encode((1, -1, 7), 102)) == (100, SENSE_MISSING | SENSE_COUNTER)
+
+
+def test_repeated_frame_keeps_the_first_value(running):
+    again = CODEC.encode((55, -55, 7), 101)
+    assert tick(running, frame(101), again) == (101, SENSE_DUPLICATE)
+    assert tick(running, frame(102)) == (102, 0)
+
+
+@pytest.mark.parametrize("bit", range(64))
+def test_damaged_frame_is_not_used(running, bit):
+    damaged = (int.from_bytes(frame(101), "little") ^ 1 << bit).to_bytes(8, "little")
+    assert tick(running, damaged) == (100, SENSE_MISSING | SENSE_CRC)
+    assert tick(running, damaged, frame(102)) == (102, SENSE_CRC | SENSE_COUNTER)
+
+
+@pytest.mark.parametrize("length", [0, 1, 5, 6, 7, 9, 12, 64])
+def test_wrong_length_is_not_used(running, length):
+    assert tick(running, bytes(length)) == (100, SENSE_MISSING | SENSE_LENGTH)
+
+
+def test_after_255_silent_syncs_any_counter_is_taken(running):
+    for _ in range(254):
+        assert tick(running) == (100, SENSE_MISSING)
+    assert tick(running, CODEC.encode((9, -9, 7), 77)) == (9, SENSE_COUNTER)
+
+
+def test_a_node_that_starts_anew_may_start_at_any_counter(running):
+    running.reset()
+    assert tick(running, CODEC.encode((5, -5, 7), 200)) == (5, 0)
+
+
+def test_plain_pdo_knows_length_and_age_only():
+    plain = ProcessCodec(0x28A, protected=False)
+    sense = SenseInput(plain)
+    assert tick(sense, plain.encode((1, -1, 7), 0)) == (1, 0)
+    assert tick(sense, plain.encode((2, -2, 7), 0), plain.encode((3, -3, 7), 0)) == (3, SENSE_DUPLICATE)
+    assert tick(sense, frame(4)) == (3, SENSE_MISSING | SENSE_LENGTH)
+    assert tick(sense) == (3, SENSE_MISSING)
+
+
+@given(st.lists(st.sampled_from(["good", "lost", "damaged", "short", "replayed"]), max_size=60))
+def test_whatever_happens_the_value_is_this_ticks_sample_or_missing_is_set(events):
+    sense = SenseInput(CODEC)
+    tick(sense, frame(1000))
+    for sample, event in enumerate(events, 1001):
+        good = frame(sample)
+        arriving = {
+            "good": [good],
+            "lost": [],
+            "damaged": [good[:3] + bytes((good[3] ^ 0x10,)) + good[4:]],
+            "short": [good[:7]],
+            "replayed": [frame(sample - 70)],
+        }[event]
+        value, status = tick(sense, *arriving)
+        assert (status & SENSE_MISSING == 0) == (event == "good")
+        assert value == sample or status & SENSE_MISSING
+        assert status != 0 or event == "good"
