@@ -59,6 +59,8 @@ class Lockstep:
 
     def run_until_event(self) -> int | None:
         """Run all events of the next event's time; return that time, None (and time stands still) if there is none."""
+        if self.running:
+            raise ClockReentryError(f"run_until_event() called from inside the event at {self.now_us} us")
         t_us = self.next_event_us()
         if t_us is not None:
             self.run_until(t_us)

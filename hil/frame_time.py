@@ -67,7 +67,7 @@ def _fd_code(length: int) -> int:
 
 @njit(cache=True)
 def _id_bits(can_id: int, extended: bool) -> int:
-    """Start of frame and identifier: 12 bits, or 31 with SRR and IDE (both recessive) in their places."""
+    """Start of frame and identifier: 12 bits, or 32 with SRR and IDE (both recessive) in their places."""
     if extended:
         return (can_id >> 18) << 20 | 3 << 18 | (can_id & 0x3FFFF)
     return can_id
@@ -80,7 +80,7 @@ def _bit_counts(can_id: int, data: bytes, flags: int) -> int:
     extended = (flags & IS_EXTENDED) != 0
     if can_id < 0 or can_id >= (1 << 29 if extended else 1 << 11):
         return -1
-    header, n_header = _id_bits(can_id, extended), 31 if extended else 12
+    header, n_header = _id_bits(can_id, extended), 32 if extended else 12
     if flags & IS_FD == 0:
         if length > 8 or flags & BIT_RATE_SWITCH:
             return -1
@@ -184,7 +184,7 @@ def worst_case_frame_us(
     """
     frame = Frame(0, bytes(length), is_fd, bitrate_switch, is_extended=is_extended)
     frame_bit_counts(frame)
-    n_header = 31 if is_extended else 12
+    n_header = 32 if is_extended else 12
     if not is_fd:
         stuffable = n_header + 7 + 8 * length + 15
         bits = stuffable + (stuffable - 1) // 4 + 1 + ACK_TO_END_BITS + INTERFRAME_BITS
