@@ -1,0 +1,228 @@
+"""The amplifier driver against canopen's LocalNode: another implementation answers, no threads, no machine clock.
+
+canopen's node does no NMT gating, no boot-up after a reset and no SYNC-driven PDO (so says its source), therefore this
+file sends the boot-up, the heartbeats and the sense PDOs for it, packed by canopen's own PDO maps.
+"""
+
+from pathlib import Path
+
+import can
+import canopen
+import pytest
+
+from pkxyz_ctrl.can.codec import crc8
+from pkxyz_ctrl.can.driver import NODE_REBOOTED, AmplifierDriver, DriverState
+from pkxyz_ctrl.can.driver_config import DriverConfig
+from pkxyz_ctrl.can.frame import Frame
+from pkxyz_ctrl.can.sense_input import SENSE_COUNTER, SENSE_MISSING
+
+EDS = str(Path(__file__).resolve().parent.parent / "configs" / "comb_amplifier.eds")
+FRAME_US = 100
+
+
+class PeriodicTask:
+    """A cyclic transmission as canopen asks for one; ``due`` hands it out when the test's time has come."""
+
+    def __init__(self, message: can.Message, period_s: float) -> None:
+        self.message, self.period_us, self.next_us = message, round(1e6 * period_s), 0
+
+    def stop(self) -> None:
+        self.next_us = 1 << 62
+
+    def modify_data(self, message: can.Message) -> None:
+        self.message = message
+
+
+class MemoryBus:
+    """What canopen.Network needs of a bus: it collects what is sent."""
+
+    channel_info = "memory"
+
+    def __init__(self) -> None:
+        self.sent: list[Frame] = []
+        self.tasks: list[PeriodicTask] = []
+
+    def send(self, message: can.Message) -> None:
+        self.sent.append(to_frame(message))
+
+    def send_periodic(self, message: can.Message, period: float) -> PeriodicTask:
+        self.tasks.append(PeriodicTask(message, period))
+        return self.tasks[-1]
+
+
+def to_frame(message: can.Message) -> Frame:
+    return Frame(message.arbitration_id, bytes(message.data), message.is_fd, is_remote=message.is_remote_frame)
+
+
+class Bench:
+    """Driver and LocalNode on one wire; every frame takes 100 us."""
+
+    def __init__(self, config: DriverConfig, boots: bool = True) -> None:
+        self.t_us = 0
+        self.boots = boots
+        self.driver = AmplifierDriver(config)
+        self.bus = MemoryBus()
+        self.network = canopen.Network(self.bus)
+        self.node = self.network.create_node(config.node_id, EDS)
+
+    def to_node(self, frame: Frame) -> None:
+        self.t_us += FRAME_US
+        self.network.notify(frame.can_id, bytearray(frame.data), self.t_us * 1e-6)
+        if frame.can_id == 0 and self.boots:
+            if frame.data[0] == 0x81:
+                self.node.nmt.send_command(129)  # canopen sends the boot-up message here
+            self.node.nmt.send_command({0x81: 128, 0x01: 1, 0x80: 128}[frame.data[0]])
+
+    def from_node(self) -> list[Frame]:
+        for task in self.bus.tasks:
+            if self.t_us >= task.next_us:
+                self.bus.sent.append(to_frame(task.message))
+                task.next_us = self.t_us + task.period_us
+        sent, self.bus.sent = self.bus.sent, []
+        return sent
+
+    def settle(self, frames: tuple[Frame, ...], limit_us: int) -> None:
+        """Everything that is said until both are quiet and the time is over, or the driver has come to an end."""
+        waiting = list(frames)
+        end_us = self.t_us + limit_us
+        while self.t_us < end_us and self.driver.state not in (DriverState.OPERATIONAL, DriverState.FAILED):
+            if waiting:
+                self.to_node(waiting.pop(0))
+            else:
+                self.t_us += FRAME_US
+            for frame in self.from_node():
+                waiting += self.driver.receive(frame, self.t_us)
+            waiting += self.driver.poll(self.t_us)
+
+    def start(self) -> None:
+        self.settle(self.driver.start(self.t_us), 20_000_000)
+
+
+@pytest.mark.parametrize("protection", [True, False])
+def test_start_up_configures_canopens_node(protection):
+    bench = Bench(DriverConfig(protection=protection))
+    bench.start()
+    assert (bench.driver.state, bench.driver.failure) == (DriverState.OPERATIONAL, "")
+    assert bench.node.nmt.state == "OPERATIONAL"
+    sdo = bench.node.sdo
+    assert [sdo[0x1401][1].raw, sdo[0x1801][1].raw] == [0x30A, 0x4000028A]
+    assert [sdo[0x1401][2].raw, sdo[0x1801][2].raw] == [1, 1]
+    assert [sdo[0x6443][comb].raw for comb in (1, 2, 3)] == [1, 1, 1]
+    assert [sdo[0x6444][comb].raw for comb in (1, 2, 3)] == [0, 0, 0]
+    assert (sdo[0x1016][1].raw, sdo[0x1017].raw, sdo[0x1019].raw) == (127 << 16 | 50, 20, 240)
+    length = 8 if protection else 6
+    for pdo in (bench.node.rpdo[2], bench.node.tpdo[2]):
+        pdo.read(from_od=False)
+        assert (pdo.enabled, pdo.trans_type, len(pdo.data)) == (True, 1, length)
+    assert bench.bus.tasks[-1].period_us == 20_000
+
+
+def test_drive_and_sense_through_canopens_pdo_maps():
+    bench = Bench(DriverConfig())
+    bench.start()
+    drive, sense = bench.node.rpdo[2], bench.node.tpdo[2]
+    drive.read()
+    sense.read()
+    for tick in range(300):
+        bench.driver.sync(bench.t_us)
+        counts = (3 * tick, 32767 - tick, 17)
+        sent = bench.driver.drive(counts, bench.t_us)
+        drive.on_message(sent.can_id, bytearray(sent.data), bench.t_us * 1e-6)
+        assert tuple(variable.raw for variable in drive)[:4] == (*counts, tick & 0xFF)
+        assert drive[4].raw == crc8(b"\x0a\x03" + sent.data[:7])
+        for variable, value in zip(sense, (-tick, tick, -32768, tick & 0xFF, 0), strict=True):
+            variable.raw = value
+        sense[4].raw = crc8(b"\x8a\x02" + bytes(sense.data[:7]))
+        bench.driver.receive(Frame(sense.cob_id, bytes(sense.data)), bench.t_us)
+        assert bench.driver.take_sense() == (-tick, tick, -32768, 0)
+    bench.driver.sync(bench.t_us)
+    bench.driver.receive(Frame(sense.cob_id, bytes(sense.data)), bench.t_us)  # the same again
+    assert bench.driver.take_sense() == (-299, 299, -32768, SENSE_MISSING | SENSE_COUNTER)
+
+
+def test_canopens_emergency_producer_is_understood():
+    bench = Bench(DriverConfig())
+    bench.start()
+    bench.node.emcy.send(0x4210, register=0x09, data=b"hot")
+    for frame in bench.from_node():
+        bench.driver.receive(frame, bench.t_us)
+    assert bench.driver.emergencies[-1].text == (
+        "EMCY 0x4210: device temperature (error register 0x09, data 68 6f 74 00 00)"
+    )
+
+
+def test_wrong_identity():
+    bench = Bench(DriverConfig(product_code=4))
+    bench.start()
+    assert bench.driver.state is DriverState.FAILED
+    assert "0x1018:02 (product code) is 0x00000003, expected 0x00000004; check that this is" in bench.driver.failure
+    assert bench.node.nmt.state == "PRE-OPERATIONAL"
+
+
+@pytest.mark.parametrize(
+    ("index", "code", "remedy"),
+    [
+        (0x2000, "0x06020000", "set protection = false in the bus config"),
+        (0x6444, "0x06020000", "must not be used"),
+        (0x1016, "0x06020000", "must produce and consume heartbeats"),
+    ],
+)
+def test_an_object_that_canopens_node_lacks(index, code, remedy):
+    bench = Bench(DriverConfig())
+    del bench.node.object_dictionary[index]
+    if index == 0x2000:  # canopen stores any mapping; a device with PDO checks refuses it as it refuses the object
+        bench.node.add_write_callback(refuse_unknown_mapping(bench.node.object_dictionary))
+    bench.start()
+    assert bench.driver.state is DriverState.FAILED
+    assert remedy in bench.driver.failure
+    assert code in bench.driver.failure
+
+
+def refuse_unknown_mapping(dictionary):
+    def on_write(index, subindex, od, data):
+        mapped_index = int.from_bytes(data[2:4], "little")
+        if index in (0x1601, 0x1A01) and subindex and mapped_index not in dictionary:
+            raise canopen.SdoAbortedError(0x06020000)
+
+    return on_write
+
+
+def test_a_node_that_does_not_boot():
+    bench = Bench(DriverConfig(boot_timeout_us=5_000), boots=False)
+    bench.start()
+    assert bench.driver.state is DriverState.FAILED
+    assert "sent no boot-up message 0x70A within 5 ms of NMT reset, 3 times" in bench.driver.failure
+    assert 15_000 <= bench.t_us <= 16_000
+
+
+def test_a_lost_answer_costs_one_time_out():
+    bench = Bench(DriverConfig(sdo_timeout_us=3_000))
+    answered = bench.from_node
+    lost = []
+
+    def lose_the_twentieth() -> list[Frame]:
+        frames = answered()
+        if len(lost) < 20 and any(frame.can_id == 0x58A for frame in frames):
+            lost.append(frames)
+            return [] if len(lost) == 20 else frames
+        return frames
+
+    undisturbed = Bench(DriverConfig(sdo_timeout_us=3_000))
+    undisturbed.start()
+    bench.from_node = lose_the_twentieth
+    bench.start()
+    assert bench.driver.state is DriverState.OPERATIONAL
+    assert 3_000 <= bench.t_us - undisturbed.t_us <= 3_000 + 3 * FRAME_US
+
+
+def test_a_reset_while_running_is_seen_and_a_new_start_succeeds():
+    bench = Bench(DriverConfig())
+    bench.start()
+    bench.node.nmt.send_command(129)
+    for frame in bench.from_node():
+        bench.driver.receive(frame, bench.t_us)
+    assert bench.driver.state is DriverState.FAILED
+    assert bench.driver.node_events & NODE_REBOOTED
+    bench.start()
+    assert bench.driver.state is DriverState.OPERATIONAL
+    assert bench.driver.node_events == 0
