@@ -1,7 +1,7 @@
-"""Raster scan in three dimensions: lines along x, steps along y during the turn-around, layers along z, back and forth."""
+"""Raster scan in three dimensions: lines along x, steps along y during the turn-around, layers along z, to and fro."""
 
 import math
-from typing import Annotated, Literal
+from typing import Annotated, Literal, NamedTuple
 
 import numpy as np
 from pydantic import Field
@@ -39,7 +39,7 @@ class Raster(FrozenModel):
     def plan(self, start_m: Array) -> Plan:
         """Lead-in, lines and turn-arounds, lead-out to the centre."""
         centre = start_m if self.centre_m is None else np.array(self.centre_m)
-        limits = Limits(self.velocity_max_m_per_s, self.acceleration_max_m_per_s2, self.jerk_max_m_per_s3)
+        limits = self._limits()
         speed = self.line_speed_m_per_s()
         line_s = self.line_length_m / speed
         turn_s = 1 / self.line_rate_hz - line_s
@@ -59,9 +59,9 @@ class Raster(FrozenModel):
         return Plan(joined(parts), centre, scan_s=(begin, lines[-1][1]), lines_s=lines)
 
     def line_speed_m_per_s(self) -> float:
-        """Speed on the lines: the least at which pass and turn-around fit the line's period. ``TrajectoryError`` if none does."""
-        a, j = self.acceleration_max_m_per_s2, self.jerk_max_m_per_s3
-        step_s = step_time_s(max(self.line_pitch_m, self.layer_pitch_m if self.layers > 1 else 0.0), a, j)
+        """Least speed at which pass and turn-around fit the line's period; ``TrajectoryError`` if none does."""
+        v_max, a, j = limits = self._limits()
+        step_s = step_time_s(max(self.line_pitch_m, self.layer_pitch_m if self.layers > 1 else 0.0), limits)
 
         def period_s(v: float) -> float:
             return self.line_length_m / v + max(reversal_time_s(v, a, j), step_s)
@@ -69,16 +69,19 @@ class Raster(FrozenModel):
         # the period falls with v until the turn-around grows faster than the line shrinks
         jerk_bound = (self.line_length_m * math.sqrt(j / 2)) ** (2 / 3)
         fastest = jerk_bound if jerk_bound <= a * a / (2 * j) else math.sqrt(self.line_length_m * a / 2)
-        fastest = min(max(fastest, _reversible_speed(step_s, a, j)), self.velocity_max_m_per_s)
+        fastest = min(max(fastest, _reversible_speed(step_s, a, j)), v_max)
         if period_s(fastest) * self.line_rate_hz > 1:
             raise TrajectoryError(
-                f"raster: {self.line_rate_hz:g} lines/s is beyond the {1 / period_s(fastest):.4g} lines/s that its velocity, "
-                "acceleration and jerk limits allow; lower line_rate_hz or line_length_m, or raise the limits"
+                f"raster: {self.line_rate_hz:g} lines/s is beyond the {1 / period_s(fastest):.4g} lines/s that its "
+                "velocity, acceleration and jerk limits allow; lower line_rate_hz or line_length_m, or raise the limits"
             )
         low, high = self.line_length_m * self.line_rate_hz, fastest
         while (middle := low + (high - low) / 2) not in (low, high):
             low, high = (low, middle) if period_s(middle) * self.line_rate_hz <= 1 else (middle, high)
         return high
+
+    def _limits(self) -> Limits:
+        return Limits(self.velocity_max_m_per_s, self.acceleration_max_m_per_s2, self.jerk_max_m_per_s3)
 
     def _line_starts(self, centre: Array, speed: float) -> list[Array]:
         """State (3, 3) at the start of each line."""
@@ -96,14 +99,13 @@ class Raster(FrozenModel):
         return states
 
     def _turn(self, start: Array, end: Array, turn_s: float) -> Pieces:
-        a, j = self.acceleration_max_m_per_s2, self.jerk_max_m_per_s3
-        x = reversal(float(end[1, 0]), a, j, turn_s)
-        y, z = (step(float(d), a, j, turn_s) for d in (end[0] - start[0])[1:])
+        x = reversal(float(end[1, 0]), self._limits(), turn_s)
+        y, z = (step(float(d), self._limits(), turn_s) for d in (end[0] - start[0])[1:])
         return from_phases(start, [x, y, z], turn_s)
 
 
 def reversal_time_s(speed_m_per_s: float, a: float, j: float) -> float:
-    """Shortest time to turn ``speed`` into its opposite, acceleration zero at both ends, within acceleration a and jerk j."""
+    """Shortest time to turn ``speed`` into its opposite, within acceleration a (zero at both ends) and jerk j."""
     change = 2 * speed_m_per_s
     return 2 * math.sqrt(change / j) if change * j <= a * a else change / a + a / j
 
@@ -113,9 +115,9 @@ def _reversible_speed(time_s: float, a: float, j: float) -> float:
     return j * time_s**2 / 8 if time_s <= 2 * a / j else (time_s - a / j) * a / 2
 
 
-def reversal(velocity_after_m_per_s: float, a: float, j: float, duration_s: float) -> Phases:
-    """Phases from -velocity to +velocity: the shortest ones, stretched evenly to ``duration_s``, so no limit is passed."""
-    speed = abs(velocity_after_m_per_s)
+def reversal(velocity_after_m_per_s: float, limits: Limits, duration_s: float) -> Phases:
+    """Phases from -velocity to +velocity: the shortest ones, stretched evenly to ``duration_s``."""
+    speed, a, j = abs(velocity_after_m_per_s), limits.acceleration_m_per_s2, limits.jerk_m_per_s3
     total = reversal_time_s(speed, a, j)
     ramp = min(math.sqrt(2 * speed / j), a / j)
     stretch = duration_s / total
@@ -123,27 +125,42 @@ def reversal(velocity_after_m_per_s: float, a: float, j: float, duration_s: floa
     return Phases([ramp * stretch, (total - 2 * ramp) * stretch, ramp * stretch], [jerk, 0.0, -jerk])
 
 
-def step_time_s(distance_m: float, a: float, j: float) -> float:
-    """Shortest time from rest to rest over ``distance`` within acceleration a and jerk j."""
-    ramp, flat = _step_ramps(distance_m, a, j)
-    return 4 * ramp + 2 * flat
+class _StepShape(NamedTuple):
+    """Times of the shortest step: jerk ramp, constant acceleration, and constant velocity between the two halves."""
+
+    ramp_s: float
+    flat_s: float
+    cruise_s: float
+
+    @property
+    def total_s(self) -> float:
+        return 4 * self.ramp_s + 2 * self.flat_s + self.cruise_s
 
 
-def _step_ramps(distance_m: float, a: float, j: float) -> tuple[float, float]:
-    """Time of each of the four jerk ramps and of the two stretches of constant acceleration between them."""
-    ramp = (distance_m / (2 * j)) ** (1 / 3)
-    if ramp * j <= a:
-        return ramp, 0.0
-    ramp = a / j
-    return ramp, (-3 * ramp + math.sqrt(ramp * ramp + 4 * distance_m / a)) / 2  # a (ramp + flat)(2 ramp + flat) = distance
+def _step_shape(distance_m: float, limits: Limits) -> _StepShape:
+    v, a, j = limits
+    ramp, flat = (distance_m / (2 * j)) ** (1 / 3), 0.0
+    if ramp * j > a:
+        ramp = a / j
+        flat = (
+            -3 * ramp + math.sqrt(ramp * ramp + 4 * distance_m / a)
+        ) / 2  # a (ramp + flat)(2 ramp + flat) = distance
+    if j * ramp * (ramp + flat) <= v:
+        return _StepShape(ramp, flat, 0.0)
+    ramp, flat = (math.sqrt(v / j), 0.0) if v * j <= a * a else (a / j, v / a - a / j)
+    return _StepShape(ramp, flat, distance_m / v - 2 * ramp - flat)
 
 
-def step(displacement_m: float, a: float, j: float, duration_s: float) -> Phases:
-    """Phases from rest to rest over a signed ``displacement``: the shortest ones, stretched evenly to ``duration_s``."""
-    ramp, flat = _step_ramps(abs(displacement_m), a, j)
-    if ramp == 0:
+def step_time_s(distance_m: float, limits: Limits) -> float:
+    """Shortest time from rest to rest over ``distance`` inside the limits."""
+    return _step_shape(distance_m, limits).total_s
+
+
+def step(displacement_m: float, limits: Limits, duration_s: float) -> Phases:
+    """Phases from rest to rest over a signed ``displacement``, the shortest ones stretched evenly to ``duration_s``."""
+    shape = _step_shape(abs(displacement_m), limits)
+    if shape.ramp_s == 0:
         return Phases([duration_s], [0.0])
-    stretch = duration_s / (4 * ramp + 2 * flat)
-    ramp, flat = ramp * stretch, flat * stretch
-    jerk = displacement_m / (ramp * (ramp + flat) * (2 * ramp + flat))
-    return Phases([ramp, flat, ramp, ramp, flat, ramp], [jerk, 0.0, -jerk, -jerk, 0.0, jerk])
+    ramp, flat, cruise = (t * duration_s / shape.total_s for t in shape)
+    jerk = displacement_m / (ramp * (ramp + flat) * (2 * ramp + flat + cruise))
+    return Phases([ramp, flat, ramp, cruise, ramp, flat, ramp], [jerk, 0.0, -jerk, 0.0, -jerk, 0.0, jerk])

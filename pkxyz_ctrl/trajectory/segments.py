@@ -1,9 +1,11 @@
 """Segments of a reference: what someone writes in a scenario, each with the plan that it stands for.
 
-A kind of segment is a frozen model with a literal ``kind`` and ``plan(start_m) -> Plan``; ``trajectory.Segment`` lists them.
+A kind of segment is a frozen model with a literal ``kind`` and ``plan(start_m) -> Plan``;
+``trajectory.Segment`` lists them.
 Every segment starts and ends at rest. Positions are (x, y, z) in m relative to the rest pose.
 """
 
+import math
 from typing import Annotated, Literal, NamedTuple
 
 import numpy as np
@@ -73,28 +75,34 @@ class Limits(NamedTuple):
     jerk_m_per_s3: float
 
 
-_UM = 1e6  # ruckig's tolerances are absolute, near 1e-8: it plans in um and ms, where numbers here are of order one
-_MS = 1e3
+_NEAREST_M = 1e-12
+_NO_BOUND = 1e3  # far larger limits lose ruckig its digits, and could save no more than 1/1000 of the time
 
 
 def travel(start: Array, end: Array, limits: Limits) -> Pieces:
-    """Fastest synchronised pieces from one state (3, 3) to another with zero acceleration at both, by ruckig."""
-    if np.array_equal(start, end) and not start[1:].any():
-        raise TrajectoryError("move goes nowhere: the target is where the stage already stands; use a hold instead")
+    """Fastest synchronised pieces from one state (3, 3) to another with zero acceleration at both, by ruckig.
+
+    ruckig's tolerances are absolute, near 1e-8, and it refuses times above 7600: it gets the problem in units of the
+    problem's own size.
+    """
+    v, a, j = limits
+    distance_m = float(np.abs(end[0] - start[0]).max())
+    if distance_m < _NEAREST_M and not start[1:].any() and not end[1:].any():
+        raise TrajectoryError("goes nowhere: the target is where the stage already stands; use a hold instead")
+    length_m = max(distance_m, float(np.abs([start[1], end[1]]).max()) ** 2 / a)
+    time_s = length_m / v + math.sqrt(length_m / a) + (length_m / j) ** (1 / 3)
     problem = ruckig.InputParameter(3)
-    problem.current_position, problem.target_position = list(start[0] * _UM), list(end[0] * _UM)
-    problem.current_velocity, problem.target_velocity = list(start[1] * _UM / _MS), list(end[1] * _UM / _MS)
-    problem.max_velocity = [limits.velocity_m_per_s * _UM / _MS] * 3
-    problem.max_acceleration = [limits.acceleration_m_per_s2 * _UM / _MS**2] * 3
-    problem.max_jerk = [limits.jerk_m_per_s3 * _UM / _MS**3] * 3
+    problem.target_position = list((end[0] - start[0]) / length_m)
+    problem.current_velocity = list(start[1] * time_s / length_m)
+    problem.target_velocity = list(end[1] * time_s / length_m)
+    problem.max_velocity = [v * time_s / length_m] * 3
+    problem.max_acceleration = [min(a * time_s**2 / length_m, _NO_BOUND)] * 3
+    problem.max_jerk = [min(j * time_s**3 / length_m, _NO_BOUND**2)] * 3
     planned = ruckig.Trajectory(3)
     try:
-        result = ruckig.Ruckig(3).calculate(problem, planned)
-    except ruckig.RuckigError as error:
-        raise TrajectoryError(f"no move inside these limits: {error}") from None
-    if result != ruckig.Result.Working:
-        raise TrajectoryError(f"no move inside these limits: ruckig says {result}")
-    axes = [
-        Phases([t / _MS for t in profile.t], [j * _MS**3 / _UM for j in profile.j]) for profile in planned.profiles[0]
-    ]
-    return from_phases(start, axes, planned.duration / _MS)
+        ruckig.Ruckig(3).calculate(problem, planned)
+    except (ruckig.RuckigError, ValueError) as error:  # ValueError: a result that its Python binding has no name for
+        raise TrajectoryError(f"no way there inside these limits: {error}") from None
+    unit_jerk = length_m / time_s**3
+    axes = [Phases([t * time_s for t in axis.t], [k * unit_jerk for k in axis.j]) for axis in planned.profiles[0]]
+    return from_phases(start, axes, planned.duration * time_s)
