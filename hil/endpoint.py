@@ -97,6 +97,8 @@ class Endpoint:
         if is_remote or is_extended or is_error:
             flags |= (IS_REMOTE if is_remote else 0) | (IS_EXTENDED if is_extended else 0)
             key = arbitration_key(frame)
+            if is_error:
+                wire._refuse(frame)
         if self.transmit_errors >= 128 or self.receive_errors >= 128:
             flags |= ERROR_PASSIVE
         duration_ns = duration_ns_kernel(can_id, data, flags, wire.nominal_bitrate, wire._fast_bitrate)

@@ -208,9 +208,9 @@ class Wire:
             heapify(to_send)
         self._frames += 1
         if sender.transmit_errors or sender.receive_errors:
+            sender.transmit_errors = max(0, sender.transmit_errors - 1)
             if sender._is_passive():
                 sender._earliest_ns = self._free_ns + self._bits_ns(SUSPEND_BITS)
-            sender.transmit_errors = max(0, sender.transmit_errors - 1)
         if sender.on_sent is not None:
             sender.on_sent(entry[2], t_us)
 
@@ -276,11 +276,10 @@ class Wire:
         self._announce(kind | ERROR_BUS, senders[0] if senders else None)
 
     def _count_transmit_error(self, endpoint: Endpoint, kind: int) -> None:
+        if kind != ERROR_ACK or not endpoint._is_passive():  # a node alone on its bus does not go bus-off
+            endpoint.transmit_errors += 8
         if endpoint._is_passive():
             endpoint._earliest_ns = self._free_ns + self._bits_ns(SUSPEND_BITS)
-            if kind == ERROR_ACK:
-                return  # a node alone on its bus does not go bus-off
-        endpoint.transmit_errors += 8
         if endpoint.transmit_errors < 256:
             return
         endpoint.bus_off = True
