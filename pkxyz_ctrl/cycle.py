@@ -44,6 +44,8 @@ MEMORY = np.dtype(
         ("observation", OBSERVATION),
         ("row", ROW),
         ("setpoint", "f8", (9,)),  # what is held while enabled and not tracking
+        ("now", "f8", (9,)),  # scratch: rows of the reference
+        ("after", "f8", (9,)),
         ("tick_index", "i8"),
         ("reference_tick", "i8"),
         ("mode", "i4"),
@@ -87,7 +89,7 @@ def cycle(law_array, memory_array, reference) -> None:
     saturated = 0
     if LOOP_CLOSED[memory["mode"]] != 0:
         delay = law["tick"]["delay_periods"]
-        now, after = np.empty(9), np.empty(9)
+        now, after = memory["now"], memory["after"]
         _reference_row(memory, reference, delay, now)
         _reference_row(memory, reference, delay + 1, after)
         saturated = 1 if tick.act(law["tick"], memory["tick"], now, after) else 0
@@ -189,7 +191,7 @@ def _monitor(law, memory, saturated: int) -> int:
 def _write_row(law, memory, reference, trips: int, saturated: int) -> None:
     row, seen, state = memory["row"], memory["input"], memory["tick"]
     estimate, drive, origin = state["estimate"], law["tick"]["drive"], law["tick"]["estimator"]["operating_point_m"]
-    setpoint = np.empty(9)
+    setpoint = memory["now"]
     _reference_row(memory, reference, 0, setpoint)
     row["t_us"] = memory["tick_index"] * law["period_us"]
     row["tick"] = memory["tick_index"]

@@ -142,13 +142,13 @@ class Stage:
         flat, leading = self._checked(position_m)
         out = np.empty((len(flat), *shape))
         kernel(self.geometry, flat, out)
-        return out.reshape(*leading, *shape)
+        return out.reshape((*leading, *shape))
 
     def _at_elastic(self, position_m: ArrayLike, kernel: Callable[..., None], shape: tuple[int, ...]) -> Array:
         flat, leading = self._checked(position_m)
         out = np.empty((len(flat), *shape))
         kernel(self.geometry, self.elasticity, flat, out)
-        return out.reshape(*leading, *shape)
+        return out.reshape((*leading, *shape))
 
     def _checked(self, position_m: ArrayLike) -> tuple[Array, tuple[int, ...]]:
         position = _triples(position_m, "position_m")

@@ -12,7 +12,7 @@ import numpy as np
 from numba import njit
 from numpy.typing import NDArray
 
-from pkxyz_ctrl.core.kinematics import jacobian, strokes
+from pkxyz_ctrl.core.kinematics import crank, jacobian, link, stroke
 
 Array = NDArray[np.float64]
 
@@ -29,68 +29,63 @@ ELASTICITY = np.dtype(
 @njit(cache=True)
 def energy(geometry, elasticity, position_m: Array) -> float:
     """Strain energy in J at ``position_m`` (3,), 0 at rest."""
-    q = np.empty(3)
-    strokes(geometry, position_m, q)
-    crank, n = geometry["crank_m"], geometry["n"]
+    x, y = position_m[0], position_m[1]
+    _, delta, drop = link(geometry, position_m[2])
     total = 0.0
     for i in range(3):
-        theta = math.asin((n[i, 0] * position_m[0] + n[i, 1] * position_m[1]) / crank)
-        total += 0.5 * elasticity["slider_n_per_m"] * q[i] * q[i] + 0.5 * elasticity["crank_n_m_per_rad"] * theta * theta
-    tilt = _elevation_change(geometry, position_m[2])
+        s, c = crank(geometry, i, x, y)
+        q = stroke(geometry, i, x, y, s, c, drop)
+        theta = math.asin(s / geometry["crank_m"])
+        total += 0.5 * elasticity["slider_n_per_m"] * q * q + 0.5 * elasticity["crank_n_m_per_rad"] * theta * theta
+    tilt = _elevation_change(geometry, position_m[2], delta)
     return total + 0.5 * elasticity["link_n_m_per_rad"] * tilt * tilt
 
 
 @njit(cache=True)
-def _elevation_change(geometry, dz: float) -> float:
+def _elevation_change(geometry, dz: float, delta: float) -> float:
     """alpha - alpha_0 in rad from its sine, z delta_0 - delta z_0 over L2^2, with the small difference written as a quotient."""
-    link, z0, d0 = geometry["link_m"], geometry["height_rest_m"], geometry["projection_rest_m"]
-    z = z0 + dz
-    d = math.sqrt((link - z) * (link + z))
-    return math.asin(dz * (d0 + z0 * (z + z0) / (d + d0)) / (link * link))
+    z0, delta0, reach = geometry["height_rest_m"], geometry["projection_rest_m"], geometry["link_m"]
+    return math.asin(dz * (delta0 + z0 * (dz + 2.0 * z0) / (delta + delta0)) / (reach * reach))
 
 
 @njit(cache=True)
 def energy_gradient(geometry, elasticity, position_m: Array, out: Array) -> None:
     """dV/dx (3,) in N: the force at the platform that holds it at ``position_m``."""
-    q = np.empty(3)
-    j = np.empty((3, 3))
-    strokes(geometry, position_m, q)
-    jacobian(geometry, position_m, j)
-    crank, link, n = geometry["crank_m"], geometry["link_m"], geometry["n"]
+    e, n = geometry["e"], geometry["n"]
     k1, k2 = elasticity["slider_n_per_m"], elasticity["crank_n_m_per_rad"]
-    out[0] = out[1] = out[2] = 0.0
+    x, y = position_m[0], position_m[1]
+    z, delta, drop = link(geometry, position_m[2])
+    fx = fy = pull = 0.0
     for i in range(3):
-        s = n[i, 0] * position_m[0] + n[i, 1] * position_m[1]
-        turn = k2 * math.asin(s / crank) / math.sqrt((crank - s) * (crank + s))
-        out[0] += k1 * q[i] * j[i, 0] + turn * n[i, 0]
-        out[1] += k1 * q[i] * j[i, 1] + turn * n[i, 1]
-        out[2] += k1 * q[i] * j[i, 2]
-    z = geometry["height_rest_m"] + position_m[2]
-    out[2] += elasticity["link_n_m_per_rad"] * _elevation_change(geometry, position_m[2]) / math.sqrt((link - z) * (link + z))
+        s, c = crank(geometry, i, x, y)
+        force = k1 * stroke(geometry, i, x, y, s, c, drop)
+        across = (force * s + k2 * math.asin(s / geometry["crank_m"])) / c
+        fx += force * e[i, 0] + across * n[i, 0]
+        fy += force * e[i, 1] + across * n[i, 1]
+        pull += force
+    out[0] = fx
+    out[1] = fy
+    out[2] = (pull * z + elasticity["link_n_m_per_rad"] * _elevation_change(geometry, position_m[2], delta)) / delta
 
 
 @njit(cache=True)
 def stiffness(geometry, elasticity, position_m: Array, out: Array) -> None:
     """d2V/dx2 (3,3) in N/m at ``position_m``; at rest it is Eq. 19."""
-    q = np.empty(3)
     j = np.empty((3, 3))
-    strokes(geometry, position_m, q)
     jacobian(geometry, position_m, j)
-    crank, link, n = geometry["crank_m"], geometry["link_m"], geometry["n"]
+    length, reach, n = geometry["crank_m"], geometry["link_m"], geometry["n"]
     k1, k2, k3 = elasticity["slider_n_per_m"], elasticity["crank_n_m_per_rad"], elasticity["link_n_m_per_rad"]
-    z = geometry["height_rest_m"] + position_m[2]
-    delta2 = (link - z) * (link + z)
-    delta = math.sqrt(delta2)
+    x, y = position_m[0], position_m[1]
+    z, delta, drop = link(geometry, position_m[2])
     for a in range(3):
         for b in range(3):
             out[a, b] = k1 * (j[0, a] * j[0, b] + j[1, a] * j[1, b] + j[2, a] * j[2, b])
     for i in range(3):
-        s = n[i, 0] * position_m[0] + n[i, 1] * position_m[1]
-        c2 = (crank - s) * (crank + s)
-        c = math.sqrt(c2)
-        across = k1 * q[i] * crank * crank / (c2 * c) + k2 * (1.0 / c2 + math.asin(s / crank) * s / (c2 * c))
+        s, c = crank(geometry, i, x, y)
+        q = stroke(geometry, i, x, y, s, c, drop)
+        across = k1 * q * length * length / c**3 + k2 * (1.0 / c**2 + math.asin(s / length) * s / c**3)
         for a in range(2):
             for b in range(2):
                 out[a, b] += across * n[i, a] * n[i, b]
-        out[2, 2] += k1 * q[i] * link * link / (delta2 * delta)
-    out[2, 2] += k3 * (1.0 / delta2 + _elevation_change(geometry, position_m[2]) * z / (delta2 * delta))
+        out[2, 2] += k1 * q * reach * reach / delta**3
+    out[2, 2] += k3 * (1.0 / delta**2 + _elevation_change(geometry, position_m[2], delta) * z / delta**3)

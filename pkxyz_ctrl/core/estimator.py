@@ -16,8 +16,7 @@ from numba import njit
 from numpy.typing import NDArray
 
 from pkxyz_ctrl.core.elasticity import energy_gradient
-from pkxyz_ctrl.core.kinematics import jacobian
-from pkxyz_ctrl.core.linear3 import multiply3_transposed
+from pkxyz_ctrl.core.kinematics import platform_force
 
 Array = NDArray[np.float64]
 
@@ -59,17 +58,19 @@ def update(estimator, estimate, measured_m: Array, has_measurement: bool) -> Non
 @njit(cache=True)
 def net_input(geometry, elasticity, estimator, position_m: Array, force_n: Array, force_old_n: Array, w: Array, w_change: Array) -> None:
     """w (3,) and w_old - w (3,) in N at an estimated position, for the comb forces that act now and those that acted before."""
-    j, gradient, difference = np.empty((3, 3)), np.empty(3), np.empty(3)
-    jacobian(geometry, position_m, j)
-    energy_gradient(geometry, elasticity, position_m, gradient)
     stiffness, origin = estimator["stiffness_n_per_m"], estimator["operating_point_m"]
-    multiply3_transposed(j, force_n, w)
+    energy_gradient(geometry, elasticity, position_m, w_change)
+    platform_force(geometry, position_m, force_n, w)
     for i in range(3):
-        difference[i] = force_old_n[i] - force_n[i]
+        internal = w_change[i]
         for k in range(3):
-            w[i] += stiffness[i, k] * (position_m[k] - origin[k])
-        w[i] -= gradient[i]
-    multiply3_transposed(j, difference, w_change)
+            internal -= stiffness[i, k] * (position_m[k] - origin[k])
+        w_change[i] = -w[i]
+        w[i] -= internal
+    acted = (w_change[0], w_change[1], w_change[2])
+    platform_force(geometry, position_m, force_old_n, w_change)
+    for i in range(3):
+        w_change[i] += acted[i]
 
 
 @njit(cache=True)

@@ -12,8 +12,6 @@ import numpy as np
 from numba import njit
 from numpy.typing import NDArray
 
-from pkxyz_ctrl.core.elasticity import energy_gradient
-
 Array = NDArray[np.float64]
 
 FEEDBACK = np.dtype(
@@ -31,31 +29,28 @@ FEEDBACK = np.dtype(
 
 
 @njit(cache=True)
-def ahead(feedback, now: Array, after: Array, position_m: Array, velocity: Array, acceleration: Array) -> None:
-    """Reference (three times (3,)) at ``lead_s`` past the row ``now``: constant jerk towards the row ``after``, one period later.
+def ahead(feedback, now: Array, after: Array, out: Array) -> None:
+    """Reference row (9,) at ``lead_s`` past the row ``now``: constant jerk towards the row ``after``, one period later.
 
-    A row is (9,): position m, velocity m/s, acceleration m/s^2.
+    A row is position m, velocity m/s, acceleration m/s^2.
     """
     h = feedback["lead_s"]
     per_period = 1.0 / feedback["period_s"]
     for i in range(3):
         jerk = (after[6 + i] - now[6 + i]) * per_period
-        position_m[i] = now[i] + h * (now[3 + i] + h * (0.5 * now[6 + i] + h * jerk / 6.0))
-        velocity[i] = now[3 + i] + h * (now[6 + i] + 0.5 * h * jerk)
-        acceleration[i] = now[6 + i] + h * jerk
+        out[i] = now[i] + h * (now[3 + i] + h * (0.5 * now[6 + i] + h * jerk / 6.0))
+        out[3 + i] = now[3 + i] + h * (now[6 + i] + 0.5 * h * jerk)
+        out[6 + i] = now[6 + i] + h * jerk
 
 
 @njit(cache=True)
-def feedforward(geometry, elasticity, feedback, now: Array, after: Array, out: Array) -> None:
-    """Platform force (3,) in N that drives the stage along the reference in the interval after the row ``now``."""
-    position, velocity, acceleration = np.empty(3), np.empty(3), np.empty(3)
-    ahead(feedback, now, after, position, velocity, acceleration)
-    energy_gradient(geometry, elasticity, position, out)
+def add_motion(feedback, row: Array, out: Array) -> None:
+    """Add damping and inertia of a reference row (9,) to the force ``out`` (3,): C v + m a."""
     damping, mass = feedback["damping_n_s_per_m"], feedback["mass_kg"]
     for i in range(3):
-        out[i] += mass * acceleration[i]
+        out[i] += mass * row[6 + i]
         for k in range(3):
-            out[i] += damping[i, k] * velocity[k]
+            out[i] += damping[i, k] * row[3 + k]
 
 
 @njit(cache=True)

@@ -16,7 +16,6 @@ import numpy as np
 from numba import njit
 from numpy.typing import NDArray
 
-from pkxyz_ctrl.core.linear3 import inverse3
 from pkxyz_ctrl.stage_config import GeometryConfig
 
 Array = NDArray[np.float64]
@@ -55,10 +54,9 @@ def geometry_record(config: GeometryConfig) -> NDArray[np.void]:
 @njit(cache=True)
 def in_domain(geometry, position_m: Array) -> int:
     """0 if the links can reach ``position_m`` (3,); 1, 2, 3 if the crank of that chain can't; 4 if the links can't (|z_0 + z| >= L2)."""
-    crank = geometry["crank_m"]
     n = geometry["n"]
     for i in range(3):
-        if not abs(n[i, 0] * position_m[0] + n[i, 1] * position_m[1]) < crank:
+        if not abs(n[i, 0] * position_m[0] + n[i, 1] * position_m[1]) < geometry["crank_m"]:
             return i + 1
     if not abs(geometry["height_rest_m"] + position_m[2]) < geometry["link_m"]:
         return 4
@@ -66,32 +64,68 @@ def in_domain(geometry, position_m: Array) -> int:
 
 
 @njit(cache=True)
+def link(geometry, dz: float) -> tuple[float, float, float]:
+    """The out-of-plane links at height ``dz`` above rest: height z, projection delta, and delta_0 - delta, all in m."""
+    reach, z0 = geometry["link_m"], geometry["height_rest_m"]
+    z = z0 + dz
+    delta = math.sqrt((reach - z) * (reach + z))
+    return z, delta, dz * (z + z0) / (delta + geometry["projection_rest_m"])
+
+
+@njit(cache=True)
+def crank(geometry, i: int, x: float, y: float) -> tuple[float, float]:
+    """Chain i's crank at (x, y): s = L1 sin(theta), across its direction of action, and c = L1 cos(theta), in m."""
+    n, length = geometry["n"], geometry["crank_m"]
+    s = n[i, 0] * x + n[i, 1] * y
+    return s, math.sqrt((length - s) * (length + s))
+
+
+@njit(cache=True)
+def stroke(geometry, i: int, x: float, y: float, s: float, c: float, drop: float) -> float:
+    """q_i in m from what ``crank`` and ``link`` say."""
+    e = geometry["e"]
+    return e[i, 0] * x + e[i, 1] * y + drop + s * s / (geometry["crank_m"] + c)
+
+
+@njit(cache=True)
 def strokes(geometry, position_m: Array, out: Array) -> None:
     """Inverse kinematics (Eq. 8): strokes q (3,) in m relative to rest. ``position_m`` must be ``in_domain``."""
-    crank, link, z0 = geometry["crank_m"], geometry["link_m"], geometry["height_rest_m"]
-    e, n = geometry["e"], geometry["n"]
-    x, y, dz = position_m[0], position_m[1], position_m[2]
-    z = z0 + dz
-    delta = math.sqrt((link - z) * (link + z))
-    drop = dz * (z + z0) / (delta + geometry["projection_rest_m"])
+    x, y = position_m[0], position_m[1]
+    _, _, drop = link(geometry, position_m[2])
     for i in range(3):
-        s = n[i, 0] * x + n[i, 1] * y
-        out[i] = e[i, 0] * x + e[i, 1] * y + drop + s * s / (crank + math.sqrt((crank - s) * (crank + s)))
+        s, c = crank(geometry, i, x, y)
+        out[i] = stroke(geometry, i, x, y, s, c, drop)
 
 
 @njit(cache=True)
 def jacobian(geometry, position_m: Array, out: Array) -> None:
     """dq/dx (3,3) at ``position_m``: rows [e_i + n_i tan(theta_i), tan(alpha)]. Eq. 12 is its value at rest."""
-    crank, link = geometry["crank_m"], geometry["link_m"]
     e, n = geometry["e"], geometry["n"]
-    z = geometry["height_rest_m"] + position_m[2]
-    slope = z / math.sqrt((link - z) * (link + z))
+    z, delta, _ = link(geometry, position_m[2])
+    slope = z / delta
     for i in range(3):
-        s = n[i, 0] * position_m[0] + n[i, 1] * position_m[1]
-        tangent = s / math.sqrt((crank - s) * (crank + s))
+        s, c = crank(geometry, i, position_m[0], position_m[1])
+        tangent = s / c
         out[i, 0] = e[i, 0] + n[i, 0] * tangent
         out[i, 1] = e[i, 1] + n[i, 1] * tangent
         out[i, 2] = slope
+
+
+@njit(cache=True)
+def platform_force(geometry, position_m: Array, comb_force_n: Array, out: Array) -> None:
+    """J^T F (3,) in N: what comb forces (3,) do to the platform at ``position_m`` (Eq. 23)."""
+    e, n = geometry["e"], geometry["n"]
+    z, delta, _ = link(geometry, position_m[2])
+    fx = fy = pull = 0.0
+    for i in range(3):
+        s, c = crank(geometry, i, position_m[0], position_m[1])
+        across = comb_force_n[i] * s / c
+        fx += comb_force_n[i] * e[i, 0] + across * n[i, 0]
+        fy += comb_force_n[i] * e[i, 1] + across * n[i, 1]
+        pull += comb_force_n[i]
+    out[0] = fx
+    out[1] = fy
+    out[2] = pull * z / delta
 
 
 @njit(cache=True)
@@ -100,21 +134,31 @@ def newton_step(geometry, strokes_m: Array, position_m: Array) -> float:
 
     The Jacobian is the exact one at the position handed in, so the error that is left is quadratic in the step: a step of
     1 um leaves about 1 nm, one of 30 nm less than 1 pm. Returns inf and moves nothing where the Jacobian is singular.
+
+    The third column of J is the same in every row, so z is eliminated by differences and two unknowns remain.
     """
-    q = np.empty(3)
-    j = np.empty((3, 3))
-    strokes(geometry, position_m, q)
-    jacobian(geometry, position_m, j)
-    inverse = np.empty((3, 3))
-    if inverse3(j, inverse) == 0.0:
+    e, n = geometry["e"], geometry["n"]
+    x, y = position_m[0], position_m[1]
+    z, delta, drop = link(geometry, position_m[2])
+    s, c = crank(geometry, 0, x, y)
+    r0 = strokes_m[0] - stroke(geometry, 0, x, y, s, c, drop)
+    a0, b0 = e[0, 0] + n[0, 0] * (s / c), e[0, 1] + n[0, 1] * (s / c)
+    s, c = crank(geometry, 1, x, y)
+    r1 = strokes_m[1] - stroke(geometry, 1, x, y, s, c, drop) - r0
+    a1, b1 = e[1, 0] + n[1, 0] * (s / c) - a0, e[1, 1] + n[1, 1] * (s / c) - b0
+    s, c = crank(geometry, 2, x, y)
+    r2 = strokes_m[2] - stroke(geometry, 2, x, y, s, c, drop) - r0
+    a2, b2 = e[2, 0] + n[2, 0] * (s / c) - a0, e[2, 1] + n[2, 1] * (s / c) - b0
+    determinant = a1 * b2 - a2 * b1
+    if determinant == 0.0 or z == 0.0:
         return math.inf
-    r0, r1, r2 = strokes_m[0] - q[0], strokes_m[1] - q[1], strokes_m[2] - q[2]
-    size = 0.0
-    for i in range(3):
-        step = inverse[i, 0] * r0 + inverse[i, 1] * r1 + inverse[i, 2] * r2
-        position_m[i] += step
-        size = max(size, abs(step))
-    return size
+    dx = (r1 * b2 - r2 * b1) / determinant
+    dy = (a1 * r2 - a2 * r1) / determinant
+    dz = (r0 - a0 * dx - b0 * dy) * delta / z
+    position_m[0] = x + dx
+    position_m[1] = y + dy
+    position_m[2] += dz
+    return max(abs(dx), abs(dy), abs(dz))
 
 
 @njit(cache=True)

@@ -44,6 +44,24 @@ LAW = np.dtype(
 
 DELAY_MAX = 2
 
+SCRATCH = np.dtype(
+    [
+        ("jacobian", "f8", (3, 3)),
+        ("inverse", "f8", (3, 3)),
+        ("state", "f8", (9,)),
+        ("row", "f8", (9,)),
+        ("position_m", "f8", (3,)),
+        ("w_n", "f8", (3,)),
+        ("w_change_n", "f8", (3,)),
+        ("acting_n", "f8", (3,)),
+        ("acted_n", "f8", (3,)),
+        ("lower_n", "f8", (3,)),
+        ("upper_n", "f8", (3,)),
+    ],
+    align=True,
+)
+"""Room for intermediate results, because an allocation costs more than a Jacobian. Nothing in it outlives a tick."""
+
 MEMORY = np.dtype(
     [
         ("estimate", filtering.ESTIMATE),
@@ -57,6 +75,7 @@ MEMORY = np.dtype(
         ("slack_n", "f8", (3,)),
         ("force_n", "f8", (3,)),
         ("active_set_steps", "i4"),
+        ("scratch", SCRATCH),
     ],
     align=True,
 )
@@ -78,21 +97,20 @@ def measure(law, memory, sense_count: NDArray[np.int32]) -> None:
 @njit(cache=True)
 def estimate(law, memory, has_measurement: bool) -> None:
     """Filter the measurement, then predict to the next sample and on to the instant from which this tick's force acts."""
-    estimator, state, drive = law["estimator"], memory["estimate"], law["drive"]
+    estimator, state, drive, scratch = law["estimator"], memory["estimate"], law["drive"], memory["scratch"]
     filtering.update(estimator, state, memory["measurement_m"], has_measurement)
-    position, w, w_change = np.empty(3), np.empty(3), np.empty(3)
-    force, force_old = np.empty(3), np.empty(3)
+    position, w, w_change = scratch["position_m"], scratch["w_n"], scratch["w_change_n"]
+    acting, acted, start = scratch["acting_n"], scratch["acted_n"], scratch["state"]
     origin, ahead = estimator["operating_point_m"], state["ahead"]
-    start = np.empty(9)
     start[:] = state["filtered"]
     delay = law["delay_periods"]
     for step in range(delay):
-        acting = delay - 1 - step
-        voltage.forces_of_counts(drive, memory["count"][acting], force)
-        voltage.forces_of_counts(drive, memory["count"][acting + 1], force_old)
+        age = delay - 1 - step
+        voltage.forces_of_counts(drive, memory["count"][age], acting)
+        voltage.forces_of_counts(drive, memory["count"][age + 1], acted)
         for i in range(3):
             position[i] = origin[i] + start[i]
-        filtering.net_input(law["geometry"], law["elasticity"], estimator, position, force, force_old, w, w_change)
+        filtering.net_input(law["geometry"], law["elasticity"], estimator, position, acting, acted, w, w_change)
         filtering.predict(estimator, start, w, w_change, ahead)
         if step == 0:
             state["predicted"][:] = ahead
@@ -105,21 +123,19 @@ def act(law, memory, now: Array, after: Array) -> bool:
 
     Writes demand, comb forces, slack and the new counts. Returns whether a comb force met a limit.
     """
-    geometry, gains, drive = law["geometry"], law["feedback"], law["drive"]
-    demand, force = memory["demand_n"], memory["force_n"]
-    j, inverse = np.empty((3, 3)), np.empty((3, 3))
-    holding, lower, upper, given = np.empty(3), np.empty(3), np.empty(3), np.empty(3)
-    target = now[0:3]
-    kinematics.jacobian(geometry, target, j)
+    geometry, gains, drive, scratch = law["geometry"], law["feedback"], law["drive"], memory["scratch"]
+    demand, force, count = memory["demand_n"], memory["force_n"], memory["count"]
+    j, inverse, row, given = scratch["jacobian"], scratch["inverse"], scratch["row"], scratch["w_n"]
+    kinematics.jacobian(geometry, now[0:3], j)
     inverse3(j, inverse)
-    energy_gradient(geometry, law["elasticity"], target, holding)
-    share = feedback.authority(gains, inverse, holding)
-    feedback.feedforward(geometry, law["elasticity"], gains, now, after, demand)
+    feedback.ahead(gains, now, after, row)
+    energy_gradient(geometry, law["elasticity"], row[0:3], demand)
+    share = feedback.authority(gains, inverse, demand)
+    feedback.add_motion(gains, row, demand)
     feedback.add_feedback(gains, law["estimator"]["operating_point_m"], memory["estimate"]["ahead"], now, share, demand)
     _push(memory)
-    count = memory["count"]
-    voltage.force_limits(drive, count[1], lower, upper)
-    memory["active_set_steps"] = allocation.allocate(j, inverse, demand, lower, upper, force)
+    voltage.force_limits(drive, count[1], scratch["lower_n"], scratch["upper_n"])
+    memory["active_set_steps"] = allocation.allocate(j, inverse, demand, scratch["lower_n"], scratch["upper_n"], force)
     voltage.counts_for_forces(drive, force, count[1], memory["carry_v"], count[0])
     multiply3_transposed(j, force, given)
     for i in range(3):

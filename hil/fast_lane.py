@@ -1,0 +1,26 @@
+"""The fast lane: the same cycle and the same plant in one compiled loop, with the delays and the quantisation of the bus.
+
+No frames, no gate, no driver: on a fault-free scenario they change no bit, and a test holds the two lanes to that.
+"""
+
+from numba import njit
+
+from hil.truth import append
+from pkxyz_ctrl.cycle import cycle
+from sim import kernels
+
+
+@njit(cache=True)
+def run_block(law, memory, reference, plant_params, plant_state, sample_us, rows, count) -> None:
+    """Run ``count`` ticks and write their rows to ``rows[:count]``.
+
+    ``sample_us`` (count,) int64: plant time of each sample. At a sample the drive counts of the last tick are applied, as
+    the amplifier does on SYNC.
+    """
+    seen, counts = memory[0]["input"], memory[0]["row"]["drive_count"]
+    for i in range(count):
+        kernels.advance(plant_params, plant_state, sample_us[i] - plant_state[0]["t_us"])
+        kernels.drive(plant_params, plant_state, counts)
+        kernels.sample(plant_params, plant_state, seen["sense_count"])
+        cycle(law, memory, reference)
+        append(memory, plant_params, plant_state, rows, i)

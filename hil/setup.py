@@ -1,0 +1,53 @@
+"""Everything that a run consists of, resolved: what the lanes are handed."""
+
+from dataclasses import dataclass
+from functools import cached_property
+
+import numpy as np
+from numpy.typing import NDArray
+
+from pkxyz_ctrl.bus_config import BusConfig
+from pkxyz_ctrl.controller_config import ControllerConfig
+from pkxyz_ctrl.design.law import design_law
+from pkxyz_ctrl.stage import Stage
+from pkxyz_ctrl.stage_config import StageConfig
+from pkxyz_ctrl.trajectory import Trajectory
+from sim.config import Device, PlantConfig
+from sim.plant import Plant
+
+
+@dataclass(frozen=True)
+class Setup:
+    """One run, ready to be run by either lane."""
+
+    stage: StageConfig
+    device: Device
+    """What the plant knows of the stage, read from the same file on its own."""
+    plant: PlantConfig
+    controller: ControllerConfig
+    bus: BusConfig
+    trajectory: Trajectory
+    duration_s: float
+    seed: int
+
+    @property
+    def ticks(self) -> int:
+        """Ticks in ``duration_s``."""
+        return round(self.duration_s * 1e6 / self.bus.period_us)
+
+    @cached_property
+    def law(self) -> NDArray[np.void]:
+        """The numbers that the cycle runs on, designed and cross-checked."""
+        return design_law(Stage(self.stage), self.controller, self.bus, autostart=True)
+
+    def new_plant(self) -> Plant:
+        """A plant at rest, at its time 0."""
+        return Plant(
+            self.plant,
+            self.device,
+            period_us=self.bus.period_us,
+            seed=self.seed,
+            drive_scale_v_per_count=self.bus.analog.drive_volt_per_count,
+            sense_scale_f_per_count=self.bus.analog.sense_farad_per_count,
+            sense_offset_f=self.bus.analog.sense_offset_f,
+        )
