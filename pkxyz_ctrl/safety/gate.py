@@ -149,6 +149,7 @@ class TransmitGate:
     The first frame that it blocks latches it: until :meth:`clear`, only :data:`ALWAYS` passes. ``latched`` is that
     first reason, empty if there is none. What the combs hold counts as unknown at the beginning, after any NMT
     command, and when the node has timed out; then only 0 V passes, and after that the slew limit starts from 0.
+    A voltage passes once per SYNC, so that every step that passed is a step that the combs make.
     """
 
     def __init__(self, config: GateConfig) -> None:
@@ -211,7 +212,7 @@ class TransmitGate:
         return reason
 
     def _judge_drive(self, data: bytes, row: int, t_us: int) -> str | None:
-        # One straight line, since it runs every tick: 0.3 us less than split into its five questions.
+        # One straight line, since it runs every tick: 0.3 us less than split into its questions.
         if len(data) != self._drive_length:
             return f"drive PDO has {len(data)} bytes instead of {self._drive_length}"
         protected = self._drive_length == _PROTECTED_LENGTH
@@ -228,6 +229,8 @@ class TransmitGate:
                 return f"drive PDO repeats alive counter {counter}: the node would ignore it"
             if was_a == was_b == was_c == 0 and t_us - self._time_us < self._spacing_us:
                 return self._too_soon(t_us)
+            # The node may ignore a frame whose counter jumped: then its combs hold it only from the next one on.
+            known = not protected or self._counter < 0 or counter == self._counter_next
         else:
             if not row & _DRIVE:
                 return "the gate is latched" if self.latched else _not_now(FrameKind.DRIVE)
@@ -237,6 +240,8 @@ class TransmitGate:
             if not self._known or self._syncs >= self._drive_timeout_syncs:
                 self._known = False
                 return "what the combs hold is unknown (start, NMT command or pause): a frame with 0 V must come first"
+            if self._syncs == 0:
+                return "a second drive PDO in one tick: no SYNC went out since the one before"
             slew = self._count_slew_max
             if not (-slew <= a - was_a <= slew and -slew <= b - was_b <= slew and -slew <= c - was_c <= slew):
                 return f"drive counts {a}, {b}, {c} after {was_a}, {was_b}, {was_c}: a step beyond {slew}"
@@ -244,13 +249,14 @@ class TransmitGate:
                 return self._too_soon(t_us)
             if protected and counter != self._counter_next and self._counter >= 0:
                 return f"drive PDO has alive counter {counter} instead of {self._counter_next}"
+            known = True
         if protected:
             if crc != _CRC_1[a] ^ _CRC_2[b] ^ _CRC_3[c] ^ _CRC[counter] ^ self._crc_start:
                 return f"drive PDO has a wrong CRC, 0x{crc:02X}"
             self._counter = counter
             self._counter_next = counter + 1 & 0xFF
         self._counts = (a, b, c)
-        self._known = True
+        self._known = known
         self._time_us = t_us
         self._syncs = 0
         return None

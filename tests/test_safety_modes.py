@@ -1,0 +1,133 @@
+"""The mode table, state by event, against an expectation written by hand, and the laws that it must obey."""
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from pkxyz_ctrl.safety import modes
+from pkxyz_ctrl.safety.modes import Event, Mode, enable_event, next_homed, next_mode, refusal
+
+# Columns: mode now. Rows: event. Cell: mode then; "-" is refused, the mode stays.
+EXPECTED = """
+                BOOT            PRE_OPERATIONAL  IDLE     HOMING  ENABLED   TRACKING  FAULT
+NONE            -               -                -        -       -         -         -
+NODE_FOUND      PRE_OPERATIONAL -                -        -       -         -         -
+NODE_READY      -               IDLE             -        -       -         -         -
+NODE_LOST       -               BOOT             BOOT     BOOT    FAULT     FAULT     -
+HOME            -               -                HOMING   -       -         -         -
+HOMED           -               -                -        IDLE    -         -         -
+ENABLE          -               -                ENABLED  -       -         -         -
+ENABLE_UNHOMED  -               -                -        -       -         -         -
+TRACK           -               -                -        -       TRACKING  -         -
+HOLD            -               -                -        -       -         ENABLED   -
+DISABLE         -               -                -        IDLE    IDLE      IDLE      -
+TRIP            FAULT           FAULT            FAULT    FAULT   FAULT     FAULT     -
+CLEAR           -               -                -        -       -         -         BOOT
+"""
+
+
+def expected_cells() -> list[tuple[str, str, str]]:
+    header, *rows = (line.split() for line in EXPECTED.strip().splitlines())
+    return [(mode, row[0], cell) for row in rows for mode, cell in zip(header, row[1:], strict=True)]
+
+
+def test_expectation_names_every_pair_once() -> None:
+    pairs = [(mode, event) for mode, event, _ in expected_cells()]
+    assert sorted(pairs) == sorted((mode.name, event.name) for mode in Mode for event in Event)
+
+
+@pytest.mark.parametrize(("mode_name", "event_name", "cell"), expected_cells())
+def test_every_mode_and_event(mode_name: str, event_name: str, cell: str) -> None:
+    mode, event = Mode[mode_name], Event[event_name]
+    target = mode if cell == "-" else Mode[cell]
+    assert next_mode(int(mode), int(event)) == target
+    assert (refusal(mode, event) is None) == (cell != "-" or event is Event.NONE)
+
+
+@pytest.mark.parametrize(
+    ("mode", "may_energise", "loop_closed", "node_expected"),
+    [
+        (Mode.BOOT, 0, 0, 0),
+        (Mode.PRE_OPERATIONAL, 0, 0, 0),
+        (Mode.IDLE, 0, 0, 1),
+        (Mode.HOMING, 0, 0, 1),
+        (Mode.ENABLED, 1, 1, 1),
+        (Mode.TRACKING, 1, 1, 1),
+        (Mode.FAULT, 0, 0, 0),
+    ],
+)
+def test_facts_by_mode(mode: Mode, may_energise: int, loop_closed: int, node_expected: int) -> None:
+    facts = modes.MAY_ENERGISE[mode], modes.LOOP_CLOSED[mode], modes.NODE_EXPECTED[mode]
+    assert facts == (may_energise, loop_closed, node_expected)
+
+
+def test_numbers_are_a_contract_of_recordings() -> None:
+    assert [mode.value for mode in Mode] == list(range(7))
+    assert [event.value for event in Event] == list(range(13))
+
+
+@pytest.mark.parametrize("mode", [-1, 7, 127])
+def test_unknown_mode_is_a_fault(mode: int) -> None:
+    assert all(next_mode(mode, int(event)) == Mode.FAULT for event in Event)
+
+
+@pytest.mark.parametrize("event", [-1, 13, 1 << 20])
+def test_unknown_event_is_refused(event: int) -> None:
+    assert all(next_mode(int(mode), event) == mode for mode in Mode)
+
+
+def test_tables_cannot_be_changed() -> None:
+    for table in (modes.TRANSITION_TABLE, modes.MAY_ENERGISE, modes.LOOP_CLOSED, modes.NODE_EXPECTED):
+        with pytest.raises(ValueError, match="read-only"):
+            table[...] = np.int8(1)
+
+
+def test_voltage_is_entered_only_by_enable_and_left_by_trip_in_one_step() -> None:
+    energised = {mode for mode in Mode if modes.MAY_ENERGISE[mode]}
+    entries = {
+        (mode, event)
+        for mode in set(Mode) - energised
+        for event in Event
+        if next_mode(int(mode), int(event)) in energised
+    }
+    assert entries == {(Mode.IDLE, Event.ENABLE)}
+    assert all(next_mode(int(mode), int(Event.TRIP)) == Mode.FAULT for mode in Mode)
+
+
+def test_refusal_tells_where_it_would_be_possible() -> None:
+    assert "TRACK is not possible in IDLE" in str(refusal(Mode.IDLE, Event.TRACK))
+    assert str(refusal(Mode.IDLE, Event.TRACK)).endswith("ENABLED")
+    assert "home first" in str(refusal(Mode.IDLE, Event.ENABLE_UNHOMED))
+
+
+@settings(max_examples=200, deadline=None)
+@given(st.lists(st.sampled_from(Event), max_size=60))
+def test_loop_closes_only_after_homing_since_the_last_boot(events: list[Event]) -> None:
+    """Whoever asks through ``enable_event`` cannot close the loop on offsets of another life."""
+    mode, homed = int(Mode.BOOT), False
+    homed_since_boot = False
+    for event in events:
+        asked = enable_event(homed) if event in (Event.ENABLE, Event.ENABLE_UNHOMED) else int(event)
+        was = mode
+        homed, mode = next_homed(homed, mode, asked), int(next_mode(mode, asked))
+        if was == Mode.HOMING and event is Event.HOMED:
+            homed_since_boot = True
+        if mode == Mode.BOOT:
+            homed_since_boot = False
+        assert homed == homed_since_boot
+        if modes.LOOP_CLOSED[mode]:
+            assert homed_since_boot
+
+
+def test_the_way_to_tracking_and_back() -> None:
+    mode = int(Mode.BOOT)
+    path = [Event.NODE_FOUND, Event.NODE_READY, Event.HOME, Event.HOMED, Event.ENABLE, Event.TRACK, Event.HOLD]
+    path += [Event.TRACK, Event.TRIP, Event.CLEAR]
+    visited = []
+    for event in path:
+        mode = int(next_mode(mode, int(event)))
+        visited.append(Mode(mode).name)
+    assert visited == [
+        "PRE_OPERATIONAL", "IDLE", "HOMING", "IDLE", "ENABLED", "TRACKING", "ENABLED", "TRACKING", "FAULT", "BOOT",
+    ]  # fmt: skip
