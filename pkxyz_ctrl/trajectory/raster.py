@@ -72,7 +72,7 @@ class Raster(FrozenModel):
         fastest = min(max(fastest, _reversible_speed(step_s, a, j)), v_max)
         if period_s(fastest) * self.line_rate_hz > 1:
             raise TrajectoryError(
-                f"raster: {self.line_rate_hz:g} lines/s is beyond the {1 / period_s(fastest):.4g} lines/s that its "
+                f"{self.line_rate_hz:g} lines/s is beyond the {1 / period_s(fastest):.4g} lines/s that its "
                 "velocity, acceleration and jerk limits allow; lower line_rate_hz or line_length_m, or raise the limits"
             )
         low, high = self.line_length_m * self.line_rate_hz, fastest

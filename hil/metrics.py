@@ -1,0 +1,153 @@
+"""Figures of a run, taken block by block, and the verdict on a scenario's checks.
+
+Errors are true position less reference at the same sample, in nm; "scanning" is the scan with its turn-arounds, without
+lead-in and lead-out; hold noise is the standard deviation of the true position in holds, after their settling time.
+"""
+
+import math
+from collections.abc import Mapping
+from typing import Any, Protocol
+
+import numpy as np
+from numpy.typing import NDArray
+
+from pkxyz_ctrl.row import ROW
+from pkxyz_ctrl.safety.modes import Mode
+from pkxyz_ctrl.trajectory import Trajectory
+
+METRICS: dict[str, str] = {
+    "rms_error_nm": "RMS error while scanning, each axis",
+    "max_error_nm": "largest error while scanning, each axis",
+    "hold_noise_nm": "standard deviation of the true position in holds, each axis",
+    "estimate_error_nm": "RMS of estimated less true position while scanning, each axis",
+    "ticks": "ticks recorded",
+    "saturated_ticks": "ticks in which a comb force met a bound",
+    "missed_ticks": "ticks that were skipped because one before took too long",
+    "faults": "number of faults",
+    "bus_load": "share of time in which the bus was busy, 0 to 1",
+    "realtime_factor": "stage time by wall-clock time",
+}
+"""What a scenario's checks may bound; a bound on a metric of each axis holds for each of the three."""
+
+AXES = ("x", "y", "z")
+_NM = 1e9
+
+
+class _HasBounds(Protocol):
+    @property
+    def min(self) -> float | None: ...
+    @property
+    def max(self) -> float | None: ...
+
+
+class _Sums:
+    """Count, sum and sum of squares of (n, 3) values, and the largest magnitudes."""
+
+    def __init__(self) -> None:
+        self.count = 0
+        self.total = np.zeros(3)
+        self.squares = np.zeros(3)
+        self.largest = np.zeros(3)
+
+    def add(self, values: NDArray[np.float64]) -> None:
+        if len(values):
+            self.count += len(values)
+            self.total += values.sum(axis=0)
+            self.squares += (values * values).sum(axis=0)
+            self.largest = np.maximum(self.largest, np.abs(values).max(axis=0))
+
+    def rms(self) -> NDArray[np.float64]:
+        return np.sqrt(self.squares / self.count)
+
+    def squared_deviations(self) -> NDArray[np.float64]:
+        return np.maximum(self.squares - self.total**2 / self.count, 0.0)
+
+
+class Metrics:
+    """Accumulates the figures of one run; holds sums, never rows."""
+
+    def __init__(self, trajectory: Trajectory, period_us: int) -> None:
+        self._period_us = period_us
+        self._scans = [s.scan_us for s in trajectory.segments if s.scan_us]
+        self._stills = [s.still_us for s in trajectory.segments if s.still_us]
+        self._error = _Sums()
+        self._estimate = _Sums()
+        self._noise = [_Sums() for _ in self._stills]
+        self.ticks = 0
+        self.saturated_ticks = 0
+        self.fault_ticks = 0
+
+    def update(self, block: NDArray[np.void]) -> None:
+        """Take in a block (n,) of ``ROW``."""
+        if block.dtype != ROW:
+            raise TypeError(f"a block of rows is expected, got {block.dtype}")
+        self.ticks += len(block)
+        self.saturated_ticks += int(np.count_nonzero(block["saturated"]))
+        self.fault_ticks += int(np.count_nonzero(block["mode"] == Mode.FAULT))
+        tick = block["reference_tick"]
+        t_us = np.where((tick >= 0) & (block["mode"] == Mode.TRACKING), tick * self._period_us, -1)
+        for window in self._scans:
+            inside = (t_us >= window[0]) & (t_us < window[1])
+            if inside.any():
+                truth = block["position_m"][inside]
+                self._error.add(truth - block["reference_m"][inside])
+                self._estimate.add(block["estimate_m"][inside] - truth)
+        for window, noise in zip(self._stills, self._noise, strict=True):
+            inside = (t_us >= window[0]) & (t_us < window[1])
+            if inside.any():  # less the reference, which is constant here: keeps digits
+                noise.add(block["position_m"][inside] - block["reference_m"][inside])
+
+    def figures(self) -> dict[str, Any]:
+        """Figures by name of ``METRICS``, those that come from rows; None for what did not take place."""
+        scanned = self._error.count > 0
+        return {
+            "ticks": self.ticks,
+            "saturated_ticks": self.saturated_ticks,
+            "rms_error_nm": _by_axis(self._error.rms()) if scanned else None,
+            "max_error_nm": _by_axis(self._error.largest) if scanned else None,
+            "hold_noise_nm": self._hold_noise(),
+            "estimate_error_nm": _by_axis(self._estimate.rms()) if scanned else None,
+        }
+
+    def _hold_noise(self) -> dict[str, float] | None:
+        """About each hold's own mean, pooled over the holds."""
+        holds = [noise for noise in self._noise if noise.count > 1]
+        if not holds:
+            return None
+        squares = np.sum([h.squared_deviations() for h in holds], axis=0)
+        return _by_axis(np.sqrt(squares / sum(h.count - 1 for h in holds)))
+
+
+def evaluate(checks: Mapping[str, _HasBounds], summary: Mapping[str, Any]) -> list[dict[str, Any]]:
+    """The verdict on each check: name, value, min and max where bounded, ok.
+
+    The value of a metric of three axes is that of the worst one. Without a value a check is not met, save that of the bus
+    load where there is no bus: there ``ok`` is None.
+    """
+    verdicts = []
+    for name, bound in checks.items():
+        bounds = {key: limit for key, limit in (("min", bound.min), ("max", bound.max)) if limit is not None}
+        measured = summary.get(name)
+        values = _values(measured)
+        if not values:
+            verdicts.append({"name": name, "value": None, **bounds, "ok": None if name == "bus_load" else False})
+            continue
+        low = bound.min is not None and min(values) < bound.min
+        worst = min(values) if low or bound.max is None else max(values)
+        ok = not low and (bound.max is None or max(values) <= bound.max) and all(map(math.isfinite, values))
+        verdicts.append({"name": name, "value": worst, **bounds, "ok": ok})
+    return verdicts
+
+
+def _values(measured: Any) -> list[float]:
+    if measured is None:
+        return []
+    if isinstance(measured, Mapping):
+        return [float(v) for v in measured.values()]
+    if isinstance(measured, list | tuple):
+        return [float(len(measured))]
+    return [float(measured)]
+
+
+def _by_axis(values_m: NDArray[np.float64]) -> dict[str, float]:
+    return {axis: float(value) * _NM for axis, value in zip(AXES, values_m, strict=True)}

@@ -1,0 +1,152 @@
+"""Scenarios: one file that says what is run, on what, and what it has to reach.
+
+>>> scenario = load_scenario("raster")
+>>> setup = scenario.setup()
+"""
+
+import difflib
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Annotated, Any, Self
+
+from pydantic import BaseModel, Field, field_validator, model_validator
+
+from hil.metrics import METRICS
+from hil.setup import Setup
+from pkxyz_ctrl import config
+from pkxyz_ctrl.bus_config import BusConfig
+from pkxyz_ctrl.config import ConfigError, FrozenModel
+from pkxyz_ctrl.controller_config import ControllerConfig
+from pkxyz_ctrl.stage import Stage
+from pkxyz_ctrl.stage_config import StageConfig
+from pkxyz_ctrl.trajectory import Segment, Trajectory, TrajectoryError
+from pkxyz_ctrl.trajectory.check import check_against
+from sim.config import Device, PlantConfig
+
+Text = Annotated[str, Field(min_length=1)]
+
+
+class Bound(FrozenModel):
+    """Where a metric has to lie, ends included. Two-sided bounds also catch an improvement that nobody can explain."""
+
+    min: float | None = None
+    max: float | None = None
+
+    @model_validator(mode="after")
+    def _bounds_something(self) -> Self:
+        if self.min is None and self.max is None:
+            raise ValueError("give max, min or both")
+        if self.min is not None and self.max is not None and self.min > self.max:
+            raise ValueError(f"min {self.min:g} is above max {self.max:g}, so no value could pass")
+        return self
+
+
+class ScenarioConfig(FrozenModel):
+    """A scenario file."""
+
+    name: Text
+    description: str = ""
+    duration_s: Annotated[float, Field(gt=0, le=36_000)]
+    """stage time from power-on, start-up and homing included"""
+    seed: Annotated[int, Field(ge=0, lt=2**32)]
+    stage: Text
+    """each of these four: the name of a shipped file or a path, relative to this file's folder"""
+    plant: Text
+    controller: Text
+    bus: Text
+    reference: Annotated[tuple[Segment, ...], Field(min_length=1)]
+    """starts when the controller starts to track"""
+    checks: dict[str, Bound] = {}
+
+    @field_validator("checks", mode="after")
+    @classmethod
+    def _metrics_exist(cls, checks: dict[str, Bound]) -> dict[str, Bound]:
+        for name in checks:
+            if name not in METRICS:
+                near = difflib.get_close_matches(name, METRICS, n=1)
+                hint = f"did you mean {near[0]!r}?" if near else f"known: {', '.join(METRICS)}"
+                raise ValueError(f"no metric is called {name!r}; {hint}")
+        return checks
+
+
+@dataclass(frozen=True)
+class Scenario:
+    """A scenario with everything that it names, read and checked."""
+
+    source: Path
+    config: ScenarioConfig
+    stage: StageConfig
+    device: Device
+    plant: PlantConfig
+    controller: ControllerConfig
+    bus: BusConfig
+    trajectory: Trajectory
+
+    def setup(self) -> Setup:
+        """What the lanes are handed."""
+        return Setup(
+            self.stage, self.device, self.plant, self.controller, self.bus, self.trajectory,
+            self.config.duration_s, self.config.seed,
+        )  # fmt: skip
+
+
+def load_scenario(
+    name_or_path: str | Path,
+    *,
+    seed: int | None = None,
+    stage: str | None = None,
+    plant: str | None = None,
+    controller: str | None = None,
+    bus: str | None = None,
+) -> Scenario:
+    """Read a scenario and all that it names, with what the caller wants otherwise (paths relative to the working folder).
+
+    Raises ``ConfigError`` with one line for each thing that is wrong, over all the files; ``TrajectoryError``, which is
+    one, for a reference that the stage can't follow.
+    """
+    source = config.find("scenarios", name_or_path)
+    wanted = {"seed": seed, "stage": stage, "plant": plant, "controller": controller, "bus": bus}
+    given = {key: value for key, value in wanted.items() if value is not None}
+    scenario = config.parse({**config.read_toml(source), **given}, ScenarioConfig, str(source))
+    parts: dict[str, Any] = {}
+    problems: list[str] = []
+    for key, (kind, name, model) in {
+        "stage": ("stages", scenario.stage, StageConfig),
+        "device": ("stages", scenario.stage, Device),
+        "plant": ("plants", scenario.plant, PlantConfig),
+        "controller": ("controllers", scenario.controller, ControllerConfig),
+        "bus": ("buses", scenario.bus, BusConfig),
+    }.items():
+        folder = Path() if kind.startswith(tuple(given)) else source.parent
+        try:
+            parts[key] = _part(kind, name, model, folder)
+        except ConfigError as error:
+            problems += str(error).splitlines()
+    if problems:
+        raise ConfigError("\n".join(dict.fromkeys(problems)))
+    try:
+        trajectory = Trajectory(scenario.reference)
+        check_against(Stage(parts["stage"]), trajectory)
+    except TrajectoryError as error:
+        raise TrajectoryError(f"{source}: {error}") from None
+    if trajectory.duration_us * 1e-6 > scenario.duration_s:
+        raise ConfigError(
+            f"{source}: duration_s: {scenario.duration_s:g} s are over before the reference, which alone takes "
+            f"{trajectory.duration_us * 1e-6:.4g} s; give more, start-up included, or a shorter reference"
+        )
+    return Scenario(source, scenario, trajectory=trajectory, **parts)
+
+
+def _part(kind: str, name_or_path: str, model: type[BaseModel], folder: Path) -> BaseModel:
+    """One file that a scenario names; a path is taken from ``folder``."""
+    is_path = name_or_path.endswith(".toml") or "/" in name_or_path
+    path = config.find(kind, folder / name_or_path if is_path else name_or_path)
+    return config.parse(config.read_toml(path), model, str(path))
+
+
+def resolve(scenario: Scenario) -> dict[str, Any]:
+    """Everything that decides about the run as plain data, files inlined, with its ``digest``."""
+    data = config.plain(scenario.config)
+    for key in ("stage", "plant", "controller", "bus"):
+        data[key] = config.plain(getattr(scenario, key))
+    return {**data, "digest": config.digest(data)}
