@@ -190,6 +190,32 @@ def test_start_up_ends_at_the_first_wrong_answer(asked, answer, expected):
     assert driver.poll(10**9) == ()
 
 
+@pytest.mark.parametrize("line", [line for line in WRITES if line[3:8] in ("43 64", "44 64", "29 10", "10 20")])
+def test_an_amplifier_without_a_safe_state_is_refused(line):
+    driver = AmplifierDriver(DriverConfig())
+    driver.start(0)
+    server = ObedientServer({line: f"80 {line[3:11]} 30 00 09 06"})
+    assert run_dialogue(driver, server, driver.receive(heartbeat(BOOT_UP), 0)) == []
+    assert "0x06090030, invalid value" in driver.failure
+    assert driver.failure.endswith("an amplifier that cannot be told to go to 0 V by itself must not be used")
+
+
+def test_repetitions_of_the_reset_do_not_use_up_those_of_the_start():
+    driver = AmplifierDriver(DriverConfig(boot_timeout_us=1000, start_timeout_us=1000, retries=1))
+    driver.start(0)
+    assert text(driver.poll(1000)) == [RESET]
+    run_dialogue(driver, ObedientServer(), driver.receive(heartbeat(BOOT_UP), 1500), 1500)
+    assert text(driver.poll(2500)) == [START]
+
+
+def test_a_boot_up_while_starting_silences_our_heartbeat_until_the_node_is_configured_again():
+    driver = AmplifierDriver(DriverConfig())
+    driver.start(0)
+    run_dialogue(driver, ObedientServer(), driver.receive(heartbeat(BOOT_UP), 0))
+    driver.receive(heartbeat(BOOT_UP), 10)
+    assert driver.heartbeat_due(10**9) is None
+
+
 def test_identity_may_be_left_open():
     answers = {"40 18 10 01 00 00 00 00": "43 18 10 01 01 00 00 00"}
     driver = AmplifierDriver(DriverConfig(vendor_id=None))
@@ -253,9 +279,18 @@ def test_a_second_boot_up_begins_the_dialogue_again_but_not_for_ever():
 
 def test_start_is_possible_from_a_failure():
     driver = started()
+    driver.sync(0)
+    driver.drive((0, 0, 0), 0)
+    sense = [Frame(0x28A, ProcessCodec(0x28A, True).encode((1, 2, 3), counter)) for counter in (50, 9)]
+    driver.receive(sense[0], 0)
+    driver.receive(frame("08a 10 23 03 00 00 00 00 00"), 5)
     driver.receive(heartbeat(BOOT_UP), 10)
     assert driver.state is DriverState.FAILED
     assert text(driver.start(20)) == [RESET]
+    assert driver.take_sense() == (0, 0, 0, SENSE_MISSING)
+    assert (driver.sync(21).data[0], driver.drive((0, 0, 0), 21).data[6], len(driver.emergencies)) == (1, 0, 0)
+    driver.receive(sense[1], 22)
+    assert driver.take_sense() == (1, 2, 3, 0)
     assert (driver.failure, driver.node_events, driver.state) == ("", 0, DriverState.RESETTING)
     assert run_dialogue(driver, ObedientServer(), driver.receive(heartbeat(BOOT_UP), 30)) == [OUR_HEARTBEAT, START]
 
@@ -328,6 +363,7 @@ def test_stop_is_zero_volts_then_pre_operational():
     assert sent[0] == Frame(0x30A, ProcessCodec(0x30A, True).encode((0, 0, 0), 1), True, True)
     assert text(sent[1:]) == [PRE_OP]
     assert driver.state is DriverState.OFF
+    driver.heartbeat_sent(100)
     assert driver.heartbeat_due(10**9) is None
     driver.sync(10**9)
     assert driver.node_events == 0  # nobody is watched any more

@@ -90,6 +90,20 @@ def test_answers_to_something_else_are_ignored(stray):
     assert dialogue.done
 
 
+def test_an_answer_without_a_size_is_taken_as_long_as_asked():
+    dialogue = SdoDialogue((read(3, 2),), timeout_us=1000, retries=0)
+    dialogue.begin(0)
+    dialogue.receive(bytes.fromhex("42 18 10 02 03 00 99 99"), 1)
+    assert dialogue.done
+
+
+def test_a_segmented_answer_does_not_end_a_write():
+    dialogue = SdoDialogue((write(20),), timeout_us=1000, retries=0)
+    dialogue.begin(0)
+    dialogue.receive(bytes.fromhex("41 17 10 00 20 00 00 00"), 1)
+    assert (dialogue.done, dialogue.failure) == (False, "")
+
+
 def test_silence_is_repeated_then_reported():
     dialogue = SdoDialogue((read(3),), timeout_us=1000, retries=2)
     dialogue.begin(0)
@@ -172,5 +186,9 @@ def test_emergency_frame():
     assert emergency == (42, 0x2310, 0x03, b"\x01\0\0\0\0")
     assert emergency.text == "EMCY 0x2310: current, output side (error register 0x03, data 01 00 00 00 00)"
     assert not emergency.is_reset
-    assert decode_emergency(bytes(8), 0).is_reset
+    assert [decode_emergency(bytes.fromhex(code + 12 * "0"), 0).is_reset for code in ("0000", "ff00", "0001")] == [
+        True,
+        True,
+        False,
+    ]
     assert decode_emergency(bytes(7), 0) is None

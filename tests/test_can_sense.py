@@ -84,9 +84,9 @@ def test_a_counter_from_the_future_is_not_used(running):
     assert tick(running, CODEC.encode((1, -1, 7), 102)) == (100, SENSE_MISSING | SENSE_COUNTER)
 
 
-def test_repeated_frame_keeps_the_first_value(running):
-    again = CODEC.encode((55, -55, 7), 101)
-    assert tick(running, frame(101), again) == (101, SENSE_DUPLICATE)
+@pytest.mark.parametrize("counter", [101, 103, 100])
+def test_repeated_or_odd_second_frame_keeps_the_first_value(running, counter):
+    assert tick(running, frame(101), CODEC.encode((55, -55, 7), counter)) == (101, SENSE_DUPLICATE)
     assert tick(running, frame(102)) == (102, 0)
 
 
@@ -102,10 +102,12 @@ def test_wrong_length_is_not_used(running, length):
     assert tick(running, bytes(length)) == (100, SENSE_MISSING | SENSE_LENGTH)
 
 
-def test_after_255_silent_syncs_any_counter_is_taken(running):
-    for _ in range(254):
+@pytest.mark.parametrize(("silent", "taken"), [(252, False), (253, False), (254, True), (255, True), (1000, True)])
+def test_after_255_syncs_any_counter_is_taken(running, silent, taken):
+    for _ in range(silent):
         assert tick(running) == (100, SENSE_MISSING)
-    assert tick(running, CODEC.encode((9, -9, 7), 77)) == (9, SENSE_COUNTER)
+    same_counter = CODEC.encode((9, -9, 7), 100)
+    assert tick(running, same_counter) == ((9, SENSE_COUNTER) if taken else (100, SENSE_MISSING | SENSE_COUNTER))
 
 
 def test_a_node_that_starts_anew_may_start_at_any_counter(running):

@@ -201,7 +201,6 @@ class AmplifierDriver:
             return self._on_boot_up(t_us)
         if self.state is DriverState.STARTING and node_state == NmtState.OPERATIONAL:
             self.state = DriverState.OPERATIONAL
-            self._deadline_us = _NEVER_US
         if self.state is DriverState.OPERATIONAL:
             self._node_deadline_us = t_us + self._node_timeout_us
             if node_state != NmtState.OPERATIONAL:
