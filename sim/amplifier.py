@@ -1,19 +1,21 @@
 """From counts to volts at the combs.
 
-    target = counts * volt_per_count + offset;   dV/dt = clip((target - V) / tau, +-limit),   limit = min(slew, I / (C(q) + stray))
+    target = counts * volt_per_count + offset
+    dV/dt = clip((target - V) / tau, +-limit),   limit = min(slew, I / (C(q) + stray))
 
-Solved piecewise: while |target - V| > limit * tau a straight ramp, then an exponential. So over a segment without a switch
-every channel is  V(t) = base + slope t + error exp(-t / tau),  with slope or error zero."""
+Solved piecewise: while |target - V| > limit * tau a straight ramp, then an exponential. So over a segment without a
+switch every channel is  V(t) = base + slope t + error exp(-t / tau),  with slope or error zero."""
 
 import math
 
+import numpy as np
 from numba import njit
 
 from sim.geometry import strokes
 
 
 @njit(cache=True)
-def drive(params, state, counts):
+def drive(params: np.ndarray, state: np.ndarray, counts: np.ndarray) -> None:
     """Put ``counts`` (3,) integers on the converters now."""
     p = params[0]
     s = state[0]
@@ -24,7 +26,7 @@ def drive(params, state, counts):
 
 
 @njit(cache=True, error_model="numpy")
-def plan(p, s, remaining_s):
+def plan(p: np.void, s: np.void, remaining_s: float) -> float:
     """Set base, slope and error of all channels from now on; returns how long they hold, s, at most ``remaining_s``."""
     tau = p["amplifier_s"]
     duration = remaining_s
@@ -49,7 +51,7 @@ def plan(p, s, remaining_s):
 
 
 @njit(cache=True, error_model="numpy")
-def pass_time(s, h_s, decay):
+def pass_time(s: np.void, h_s: float, decay: float) -> None:
     """Move the channels on by h_s, over which the exponential falls by the factor ``decay``."""
     for i in range(3):
         s["base_v"][i] += s["slope_v_per_s"][i] * h_s
@@ -58,8 +60,9 @@ def pass_time(s, h_s, decay):
 
 
 @njit(cache=True, error_model="numpy")
-def charge(p, s, dt_s):
-    """Dielectric charging over dt_s: the opposing voltage relaxes towards its share of the comb's voltage at the end of the step."""
+def charge(p: np.void, s: np.void, dt_s: float) -> None:
+    """Dielectric charging over dt_s: the opposing voltage relaxes towards its share of the comb's voltage at the end
+    of the step."""
     kept = math.exp(-dt_s / p["charging_s"])
     for i in range(3):
         goal = p["charging_fraction"] * s["voltage_v"][i]
@@ -67,7 +70,7 @@ def charge(p, s, dt_s):
 
 
 @njit(cache=True, error_model="numpy")
-def snapped(p, s):
+def snapped(p: np.void, s: np.void) -> int:
     """Look for lateral pull-in; snapped fingers short their comb and hold the slider. Returns the chain or -1."""
     strokes(p, s["motion"], s["strokes_m"])
     for i in range(3):

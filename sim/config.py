@@ -1,7 +1,8 @@
-"""What one plant is: a device read from a stage file, and the effects of a plant file, each with its own switch and size.
+"""What one plant is: a device read from a stage file, and a plant file's effects, each with its own switch and size.
 
-Both are read here on their own: the stage file is shared with the controller as data, no code is. SI units. Every effect has
-``on``; with ``on = false`` its sizes change nothing. Random effects have ``seed_offset``, which moves that stream alone."""
+Both are read here on their own: the stage file is shared with the controller as data, no code is. SI units. Every
+effect has ``on``; with ``on = false`` its sizes change nothing. Random effects have ``seed_offset``, which moves that
+stream alone."""
 
 import math
 import tomllib
@@ -134,8 +135,8 @@ class Damping(_Model):
 
 
 class Gravity(_Model):
-    """Weight of the moving mass, with the stage turned by small angles about x and y. With ``level_is_rest`` the rest pose was
-    measured on the level stage, so only the change by the tilt acts."""
+    """Weight of the moving mass, with the stage turned by small angles about x and y. With ``level_is_rest`` the rest
+    pose was measured on the level stage, so only the change by the tilt acts."""
 
     on: bool = False
     tilt_x_rad: Finite = 0.0
@@ -145,8 +146,9 @@ class Gravity(_Model):
 
 
 class Parasitic(_Model):
-    """One more mode, moved by the comb forces and seen by the sense combs through the same shape (that is: passively), and by the
-    table through its own. ``compliance_share``: its static compliance as a share of the stage's in-plane 1/K_xx."""
+    """One more mode, moved by the comb forces and seen by the sense combs through the same shape (that is:
+    passively), and by the table through its own. ``compliance_share``: its static compliance as a share of the
+    stage's in-plane 1/K_xx."""
 
     on: bool = False
     frequency_hz: Positive = 2600.0
@@ -175,7 +177,8 @@ class Brownian(_Model):
 
 
 class Stops(_Model):
-    """Mechanical stops, ``clearance_m`` beyond both ends of the stroke range. Force k d (1 + damping d'), never pulling."""
+    """Mechanical stops, ``clearance_m`` beyond both ends of the stroke range. Force k d (1 + damping d'), never
+    pulling."""
 
     on: bool = True
     clearance_m: NotNegative = 2e-6
@@ -205,8 +208,8 @@ class Levitation(_Model):
 
 
 class PullIn(_Model):
-    """Lateral instability of the drive combs: once 2 n eps0 h (y0 + q) V^2 / g^3 passes ``lateral_stiffness_ratio`` times the
-    springs' lateral stiffness, the fingers snap together, short the comb and hold the slider where it is."""
+    """Lateral instability of the drive combs: once 2 n eps0 h (y0 + q) V^2 / g^3 passes ``lateral_stiffness_ratio``
+    times the springs' lateral stiffness, the fingers snap together, short the comb and hold the slider where it is."""
 
     on: bool = True
     lateral_stiffness_ratio: Positive = 1.0
@@ -249,7 +252,8 @@ class AmplifierOffset(_Model):
 
 
 class Dac(_Model):
-    """A converter coarser than the counts on the wire. Off: as fine as the counts, which are themselves a quantisation."""
+    """A converter coarser than the counts on the wire. Off: as fine as the counts, which are themselves a
+    quantisation."""
 
     on: bool = False
     step_counts: Annotated[int, Field(ge=1, le=4096)] = 1

@@ -1,13 +1,14 @@
 """The mechanism's loop closure, solved from its points.
 
-Chain i: a slider on the line through the centre along e_i; a crank of length L1 in the plane, from the slider to a pin; a link of
-length L2 from the pin up to the table, which the parallelogram keeps in the vertical plane of e_i. Hence, for a table at (p, z),
+Chain i: a slider on the line through the centre along e_i; a crank of length L1 in the plane, from the slider to a
+pin; a link of length L2 from the pin up to the table, which the parallelogram keeps in the vertical plane of e_i.
+Hence, for a table at (p, z),
 
     pin_i = p - delta e_i,   delta = sqrt(L2^2 - z^2)      (the link's projection)
     slider_i: the point of the line along e_i at distance L1 from pin_i, on the outer side.
 
-With u = p.e_i and w = p.n_i the pin lies w beside the line, so the slider is sqrt(L1^2 - w^2) =: c behind it. The strokes are
-written as differences from the rest pose (w = 0, z = z0), so nothing cancels: L1 - c = w^2 / (L1 + c) and so on.
+With u = p.e_i and w = p.n_i the pin lies w beside the line, so the slider is sqrt(L1^2 - w^2) =: c behind it: the
+stroke is q = u + (delta_0 - delta) + (L1 - c), whose differences of half-millimetres round to about 1e-19 m.
 Frame: origin of the table at rest, z up; e_i at 90, 210, 330 degrees, n_i = e_i turned by +90 degrees."""
 
 import math
@@ -26,32 +27,31 @@ STRAIGHT = 0.01
 
 
 @njit(cache=True)
-def leg(length_m, across_m):
+def leg(length_m: float, across_m: float) -> float:
     """Length of the other leg of a right triangle with hypotenuse ``length_m``."""
     return math.sqrt(max(length_m * length_m - across_m * across_m, (STRAIGHT * length_m) ** 2))
 
 
 @njit(cache=True, error_model="numpy")
-def lift(p, z_m):
+def lift(p: np.void, z_m: float) -> tuple[float, float, float]:
     """For a table z_m above rest: link height, its projection, and how far that has drawn the pins outward, m."""
     height_m = p["height_rest_m"] + z_m
     projection_m = leg(p["link_m"], height_m)
-    drawn_m = z_m * (p["height_rest_m"] + height_m) / (projection_m + p["projection_rest_m"])
-    return height_m, projection_m, drawn_m
+    return height_m, projection_m, p["projection_rest_m"] - projection_m
 
 
 @njit(cache=True, error_model="numpy")
-def strokes(p, motion, out_m):
+def strokes(p: np.void, motion: np.ndarray, out_m: np.ndarray) -> None:
     """Strokes (3,) of the sliders from rest, positive inward, for the pose in motion[:3]."""
     _, _, drawn_m = lift(p, motion[2])
     for i in range(3):
         u = E_X[i] * motion[0] + E_Y[i] * motion[1]
         w = N_X[i] * motion[0] + N_Y[i] * motion[1]
-        out_m[i] = u + drawn_m + w * w / (p["crank_m"] + leg(p["crank_m"], w))
+        out_m[i] = u + drawn_m + p["crank_m"] - leg(p["crank_m"], w)
 
 
 @njit(cache=True, error_model="numpy")
-def stroke_rates(p, motion, out_m_per_s):
+def stroke_rates(p: np.void, motion: np.ndarray, out_m_per_s: np.ndarray) -> None:
     """Rates (3,) of the strokes for pose and velocity in motion (6,)."""
     height_m, projection_m, _ = lift(p, motion[2])
     for i in range(3):
@@ -62,7 +62,7 @@ def stroke_rates(p, motion, out_m_per_s):
         out_m_per_s[i] = along + across * tangent + motion[5] * height_m / projection_m
 
 
-def sight_matrix(p: np.ndarray, position_m: np.ndarray) -> np.ndarray:
+def jacobian(p: np.ndarray, position_m: np.ndarray) -> np.ndarray:
     """d(strokes)/d(position) (3, 3) at a pose; for starting up and looking in, not for the inner loop."""
     rows = np.empty((3, 3))
     column = np.empty(3)

@@ -1,9 +1,13 @@
-"""One step of the table's motion: Dormand and Prince's 12-stage method of order 8, with the amplifier's transient taken out.
+"""One step of the table's motion: Dormand and Prince's method of order 8, the amplifier's transient taken out first.
 
-Between two switches of a channel V_i - V_c = b + s t + e E with E = exp(-t / tau), so the comb forces hold terms in E and E^2 that die
-within a few microseconds, far below a sensible step. Their response xi(t) = xi_1 E + xi_2 E^2 is known in closed form to leading
-orders in tau, from xi'' + D xi' + K/m xi = A E:   xi_1 = tau^2 (A + tau D A - tau^2 K A / m),   xi_2 likewise with tau / 2.
-Substituting x = y + xi is exact, whatever xi is; y'' = a(y + xi, y' + xi', t) - xi'' is smooth, and y is what is integrated."""
+Between two switches of a channel V_i - V_c = b + s t + e E with E = exp(-t / tau), so the comb forces hold terms in E
+and E^2 that die within a few microseconds, far below a sensible step. Their response
+xi(t) = xi_1 E + xi_2 E^2 is known in closed form to leading orders in tau, from xi'' + D xi' + K/m xi = A E:
+
+    xi_1 = tau^2 (A + tau D A - tau^2 K A / m),   xi_2 likewise with tau / 2.
+
+Substituting x = y + xi is exact, whatever xi is; y'' = a(y + xi, y' + xi', t) - xi'' is smooth, and y is what is
+integrated. What stays rough is the turn of the Jacobian while a transient lasts."""
 
 import math
 
@@ -12,20 +16,21 @@ from numba import njit
 from scipy.integrate import DOP853
 
 from sim.amplifier import pass_time
-from sim.mechanics import acceleration, stiffness
+from sim.mechanics import acceleration, comb_acceleration, stiffness
 
 A = np.ascontiguousarray(DOP853.A[:12, :12])
 B = np.ascontiguousarray(DOP853.B)
 C = np.ascontiguousarray(DOP853.C[:12])
 
-LONGEST_S = 105e-6
-"""Longest step. One order-8 step of 105 us is a 15th of the fastest rigid mode's period."""
+LONGEST_S = 205e-6
+"""Longest step: a sixth of the fastest rigid mode's period, at which the order-8 method is exact to 1e-14 m in a
+scan."""
 CONTACT_S = 4e-6
 """Step while a stop or a snapped comb touches."""
 
 
 @njit(cache=True, error_model="numpy")
-def _tabulate_decay(p, s, h):
+def _tabulate_decay(p: np.void, s: np.void, h: float) -> None:
     """E at the stages and at the end of a step of h s, kept until h changes."""
     if s["decay_h_s"] == h:
         return
@@ -37,30 +42,32 @@ def _tabulate_decay(p, s, h):
 
 
 @njit(cache=True, error_model="numpy")
-def _fast_response(p, s):
-    """Set xi_1 and xi_2, s["fast_1"] and s["fast_2"], m, at the pose where the step starts. False if no channel is in transient."""
+def _fast_response(p: np.void, s: np.void) -> None:
+    """Set xi_1 and xi_2, s["fast_1"] and s["fast_2"], m, at the pose where the step starts; zero if no channel is in
+    transient."""
+    one, two, volt2 = s["fast_1"], s["fast_2"], s["volt2"]
     if s["error_v"][0] == 0.0 and s["error_v"][1] == 0.0 and s["error_v"][2] == 0.0:
-        return False
-    m = s["motion"]
-    volt2 = s["volt2"]
-    volt2[0], volt2[1], volt2[2] = 0.0, 0.0, 0.0
-    rest = acceleration(p, s, volt2, m[0], m[1], m[2], 0.0, 0.0, 0.0)
+        for j in range(3):
+            one[j], two[j] = 0.0, 0.0
+        return
+    x, y, z = s["motion"][0], s["motion"][1], s["motion"][2]
+    k = stiffness(p, x, y, z)
+    tau = p["amplifier_s"]
     for i in range(3):
         volt2[i] = 2.0 * (s["base_v"][i] - s["charge_v"][i]) * s["error_v"][i]
-    one = acceleration(p, s, volt2, m[0], m[1], m[2], 0.0, 0.0, 0.0)
+    _respond(p, k, tau, comb_acceleration(p, volt2, x, y, z), one)
     for i in range(3):
         volt2[i] = s["error_v"][i] ** 2
-    two = acceleration(p, s, volt2, m[0], m[1], m[2], 0.0, 0.0, 0.0)
-    k = stiffness(p, m[0], m[1], m[2])
-    tau = p["amplifier_s"]
-    _respond(p, k, tau, one[0] - rest[0], one[1] - rest[1], one[2] - rest[2], s["fast_1"])
-    _respond(p, k, 0.5 * tau, two[0] - rest[0], two[1] - rest[1], two[2] - rest[2], s["fast_2"])
-    return True
+    _respond(p, k, 0.5 * tau, comb_acceleration(p, volt2, x, y, z), two)
 
 
 @njit(cache=True, error_model="numpy")
-def _respond(p, k, tau, ax, ay, az, out):
-    """Displacement amplitude (3,) to an acceleration (ax, ay, az) exp(-t/tau)."""
+def _respond(
+    p: np.void, k: tuple[float, ...], tau: float, amplitude: tuple[float, float, float], out: np.ndarray
+) -> None:
+    """Displacement amplitude ``out`` (3,), m, under an acceleration ``amplitude`` (3 floats, m/s^2) times exp(-t /
+    tau)."""
+    ax, ay, az = amplitude
     d = p["damping_per_s"]
     stiff = tau * tau / p["mass_kg"]
     t2 = tau * tau
@@ -73,59 +80,62 @@ def _respond(p, k, tau, ax, ay, az, out):
 
 
 @njit(cache=True, error_model="numpy")
-def _step(p, s, h):
-    """Integrate motion and voltages over h s, without a look at stops."""
-    _tabulate_decay(p, s, h)
-    fast = _fast_response(p, s)
-    motion, slope, y = s["motion"], s["slope"], s["trial"]
-    xi1, xi2, volt2 = s["fast_1"], s["fast_2"], s["volt2"]
-    per_tau = 1.0 / p["amplifier_s"] if fast else 0.0
-    if fast:
-        for j in range(3):
-            motion[j] -= xi1[j] + xi2[j]
-            motion[3 + j] += (xi1[j] + 2.0 * xi2[j]) * per_tau
-    for i in range(12):
-        for j in range(6):
-            y[j] = 0.0
-        for r in range(i):
-            weight = A[i, r]
-            if weight != 0.0:
-                for j in range(6):
-                    y[j] += weight * slope[r, j]
-        for j in range(6):
-            y[j] = motion[j] + h * y[j]
-        e1 = s["decay"][i]
-        for c in range(3):
-            volt = s["base_v"][c] - s["charge_v"][c] + s["slope_v_per_s"][c] * (C[i] * h) + s["error_v"][c] * e1
-            volt2[c] = volt * volt
-        slope[i, 0], slope[i, 1], slope[i, 2] = y[3], y[4], y[5]
-        if fast:
-            e2 = e1 * e1
-            for j in range(3):
-                y[j] += xi1[j] * e1 + xi2[j] * e2
-                y[3 + j] -= (xi1[j] * e1 + 2.0 * xi2[j] * e2) * per_tau
-        a = acceleration(p, s, volt2, y[0], y[1], y[2], y[3], y[4], y[5])
-        slope[i, 3], slope[i, 4], slope[i, 5] = a[0], a[1], a[2]
-        if fast:
-            for j in range(3):
-                slope[i, 3 + j] -= (xi1[j] * e1 + 4.0 * xi2[j] * e2) * per_tau * per_tau
-    for r in range(12):
-        weight = B[r] * h
-        if weight != 0.0:
-            for j in range(6):
-                motion[j] += weight * slope[r, j]
-    if fast:
-        e1 = s["decay"][12]
-        e2 = e1 * e1
-        for j in range(3):
-            motion[j] += xi1[j] * e1 + xi2[j] * e2
-            motion[3 + j] -= (xi1[j] * e1 + 2.0 * xi2[j] * e2) * per_tau
-    pass_time(s, h, s["decay"][12])
+def _weighted(slope: np.ndarray, weights: np.ndarray, n: int) -> tuple[float, float, float, float, float, float]:
+    """Sum of the first n rows of ``slope`` (12, 6), each times its weight."""
+    d0, d1, d2, d3, d4, d5 = 0.0, 0.0, 0.0, 0.0, 0.0, 0.0
+    for r in range(n):
+        w = weights[r]
+        d0 += w * slope[r, 0]
+        d1 += w * slope[r, 1]
+        d2 += w * slope[r, 2]
+        d3 += w * slope[r, 3]
+        d4 += w * slope[r, 4]
+        d5 += w * slope[r, 5]
+    return d0, d1, d2, d3, d4, d5
 
 
 @njit(cache=True, error_model="numpy")
-def step(p, s, h):
-    """Integrate motion and voltages over h s, at most LONGEST_S. If any stage met a stop, the step is done again in short ones."""
+def _step(p: np.void, s: np.void, h: float) -> None:
+    """Integrate motion and voltages over h s, without a look at stops."""
+    _tabulate_decay(p, s, h)
+    _fast_response(p, s)
+    motion, slope, volt2, decay = s["motion"], s["slope"], s["volt2"], s["decay"]
+    k = 1.0 / p["amplifier_s"] if p["amplifier_s"] > 0.0 else 0.0
+    x1, y1, z1 = s["fast_1"][0], s["fast_1"][1], s["fast_1"][2]
+    x2, y2, z2 = s["fast_2"][0], s["fast_2"][1], s["fast_2"][2]
+    x, y, z = motion[0] - x1 - x2, motion[1] - y1 - y2, motion[2] - z1 - z2
+    vx, vy, vz = motion[3] + k * (x1 + 2.0 * x2), motion[4] + k * (y1 + 2.0 * y2), motion[5] + k * (z1 + 2.0 * z2)
+    for i in range(12):
+        d0, d1, d2, d3, d4, d5 = _weighted(slope, A[i], i)
+        d3, d4, d5 = vx + h * d3, vy + h * d4, vz + h * d5
+        slope[i, 0], slope[i, 1], slope[i, 2] = d3, d4, d5
+        t, e1 = C[i] * h, decay[i]
+        for c in range(3):
+            volt = s["base_v"][c] - s["charge_v"][c] + s["slope_v_per_s"][c] * t + s["error_v"][c] * e1
+            volt2[c] = volt * volt
+        e2 = e1 * e1
+        g1, g2 = k * e1, 2.0 * k * e2
+        ax, ay, az = acceleration(
+            p, s, volt2,
+            x + h * d0 + x1 * e1 + x2 * e2, y + h * d1 + y1 * e1 + y2 * e2, z + h * d2 + z1 * e1 + z2 * e2,
+            d3 - x1 * g1 - x2 * g2, d4 - y1 * g1 - y2 * g2, d5 - z1 * g1 - z2 * g2,
+        )  # fmt: skip
+        g1, g2 = k * g1, 2.0 * k * g2
+        slope[i, 3], slope[i, 4], slope[i, 5] = ax - x1 * g1 - x2 * g2, ay - y1 * g1 - y2 * g2, az - z1 * g1 - z2 * g2
+    d0, d1, d2, d3, d4, d5 = _weighted(slope, B, 12)
+    e1 = decay[12]
+    e2 = e1 * e1
+    g1, g2 = k * e1, 2.0 * k * e2
+    motion[0], motion[3] = x + h * d0 + x1 * e1 + x2 * e2, vx + h * d3 - x1 * g1 - x2 * g2
+    motion[1], motion[4] = y + h * d1 + y1 * e1 + y2 * e2, vy + h * d4 - y1 * g1 - y2 * g2
+    motion[2], motion[5] = z + h * d2 + z1 * e1 + z2 * e2, vz + h * d5 - z1 * g1 - z2 * g2
+    pass_time(s, h, e1)
+
+
+@njit(cache=True, error_model="numpy")
+def step(p: np.void, s: np.void, h: float) -> None:
+    """Integrate motion and voltages over h s, at most LONGEST_S. If any stage met a stop, the step is done again in
+    short ones."""
     start = s["start"]
     for j in range(6):
         start[j] = s["motion"][j]
@@ -141,6 +151,6 @@ def step(p, s, h):
     s["error_v"][0], s["error_v"][1], s["error_v"][2] = error0, error1, error2
     for i in range(3):
         s["touched"][i] = 0
-    n = int(math.ceil(h / CONTACT_S))
+    n = math.ceil(h / CONTACT_S)
     for _ in range(n):
         _step(p, s, h / n)

@@ -4,6 +4,7 @@ The same arithmetic whether called from Python (``sim.plant.Plant``) or from ano
 
 import math
 
+import numpy as np
 from numba import njit
 
 from sim.amplifier import charge, drive, plan, snapped
@@ -20,7 +21,7 @@ REACH_M = 300e-6
 
 
 @njit(cache=True)
-def note(s, kind, chain):
+def note(s: np.void, kind: int, chain: int) -> None:
     """Add an event at the present time."""
     n = s["event_count"]
     if n < EVENTS:
@@ -31,7 +32,7 @@ def note(s, kind, chain):
 
 
 @njit(cache=True, error_model="numpy")
-def _constant_forces(p, s, dt_s):
+def _constant_forces(p: np.void, s: np.void, dt_s: float) -> None:
     """External, weight, drift and thermal force of the coming step, held over it."""
     for j in range(3):
         s["force_n"][j] = s["external_n"][j] + p["weight_n"][j]
@@ -48,16 +49,13 @@ def _constant_forces(p, s, dt_s):
 
 
 @njit(cache=True)
-def _whole(motion):
+def _whole(motion: np.ndarray) -> bool:
     """False if the table is out of reach or not a number."""
-    for j in range(3):
-        if not abs(motion[j]) < REACH_M:
-            return False
-    return True
+    return bool(abs(motion[0]) < REACH_M and abs(motion[1]) < REACH_M and abs(motion[2]) < REACH_M)
 
 
 @njit(cache=True)
-def _note_contacts(s):
+def _note_contacts(s: np.void) -> None:
     """An event where a slider that did not touch its stop in the last step does now."""
     for i in range(3):
         if s["touched"][i] != s["touching"][i]:
@@ -67,12 +65,12 @@ def _note_contacts(s):
 
 
 @njit(cache=True, error_model="numpy")
-def _move(p, s, total_s):
+def _move(p: np.void, s: np.void, total_s: float) -> None:
     """Rigid motion, parasitic mode and voltages over total_s, from switch to switch of the amplifier."""
     remaining = total_s
     while remaining > 0.0:
         duration = plan(p, s, remaining)
-        n = int(math.ceil(duration / LONGEST_S))
+        n = math.ceil(duration / LONGEST_S)
         h = duration / n
         for _ in range(n):
             if p["parasitic_on"] != 0:
@@ -91,7 +89,7 @@ def _move(p, s, total_s):
 
 
 @njit(cache=True)
-def _break(s):
+def _break(s: np.void) -> None:
     """The stage stays where this step began; its combs are dead."""
     if s["broken"] == 0:
         s["broken"] = 1
@@ -105,7 +103,7 @@ def _break(s):
 
 
 @njit(cache=True, error_model="numpy")
-def advance(params, state, dt_us):
+def advance(params: np.ndarray, state: np.ndarray, dt_us: int) -> None:
     """Integrate over dt_us microseconds with what the converters hold now; nothing for dt_us <= 0."""
     if dt_us <= 0:
         return

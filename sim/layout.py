@@ -1,7 +1,7 @@
-"""Memory of the plant: one record of parameters, one of state, as aligned structured types that compiled and plain code share.
+"""Memory of the plant: one record of parameters, one of state, which compiled and plain code share.
 
-Suffixes are units; chains and axes have three entries. What a kernel may scribble on is in the state as well, so that no kernel
-allocates."""
+Suffixes are units; chains and axes have three entries. What a kernel may scribble on is in the state as well, so that
+no kernel allocates."""
 
 import numpy as np
 
@@ -24,7 +24,8 @@ PARAMS = np.dtype(
         # mechanism
         ("crank_m", "f8"), ("link_m", "f8"), ("projection_rest_m", "f8"), ("height_rest_m", "f8"),
         ("leaf_n_per_m", "f8", 3), ("crank_hinge_nm", "f8", 3), ("link_hinge_nm", "f8"),
-        ("mass_kg", "f8"), ("damping_per_s", "f8", (3, 3)), ("weight_n", "f8", 3),
+        ("mass_kg", "f8"), ("per_kg", "f8"), ("per_crank", "f8"), ("per_link2", "f8"),
+        ("damping_per_s", "f8", (3, 3)), ("weight_n", "f8", 3),
         # stops
         ("stop_low_m", "f8"), ("stop_high_m", "f8"), ("stop_n_per_m", "f8"), ("stop_damping_s_per_m", "f8"),
         # drive combs
@@ -35,15 +36,15 @@ PARAMS = np.dtype(
         ("amplifier_s", "f8"), ("slew_v_per_s", "f8"), ("current_a", "f8"), ("stray_f", "f8"),
         ("volt_per_count", "f8", 3), ("amplifier_offset_v", "f8", 3), ("dac_step", "i8"),
         # parasitic mode
-        ("parasitic_on", "i8"), ("parasitic_rad_per_s", "f8"), ("parasitic_damping_per_s", "f8"), ("parasitic_per_kg", "f8"),
-        ("parasitic_comb", "f8", 3), ("parasitic_table", "f8", 3),
+        ("parasitic_on", "i8"), ("parasitic_rad_per_s", "f8"), ("parasitic_damping_per_s", "f8"), ("parasitic_per_kg",
+        "f8"), ("parasitic_comb", "f8", 3), ("parasitic_table", "f8", 3),
         # slow and random forces
         ("drift_on", "i8"), ("drift_n", "f8", 3), ("drift_s", "f8"), ("drift_walk_n_per_rt_s", "f8"),
         ("brownian_n_rt_s", "f8", 3),
         # sense chain
-        ("sense_f_per_m", "f8", 3), ("sense_curvature_per_m", "f8"), ("sense_rest_f", "f8"), ("sense_offset_f", "f8", 3),
-        ("sense_noise_f", "f8"), ("sense_filter_s", "f8"), ("sense_delay_us", "f8"), ("sense_walk_f_per_rt_s", "f8"),
-        ("feedthrough_f_per_v", "f8"), ("count_f", "f8"), ("count_zero_f", "f8"), ("adc_step", "i8"),
+        ("sense_f_per_m", "f8", 3), ("sense_curvature_per_m", "f8"), ("sense_rest_f", "f8"), ("sense_offset_f", "f8",
+        3), ("sense_noise_f", "f8"), ("sense_filter_s", "f8"), ("sense_delay_us", "f8"), ("sense_walk_f_per_rt_s",
+        "f8"), ("feedthrough_f_per_v", "f8"), ("count_f", "f8"), ("count_zero_f", "f8"), ("adc_step", "i8"),
     ],
     align=True,
 )  # fmt: skip
@@ -57,14 +58,14 @@ STATE = np.dtype(
         ("drift_walk_n", "f8", 3), ("sense_walk_f", "f8", 3),
         ("filtered_m", "f8", 3),
         ("held", "i8", 3), ("held_m", "f8", 3), ("touching", "i8", 3), ("broken", "i8"),
-        ("knot_t_us", "i8", KNOTS), ("knot_m", "f8", (KNOTS, 3)), ("knot_m_per_s", "f8", (KNOTS, 3)), ("knot_count", "i8"),
-        ("event_count", "i8"), ("event_t_us", "i8", EVENTS), ("event_kind", "i8", EVENTS), ("event_chain", "i8", EVENTS),
-        ("random", "u8", (STREAMS, 4)), ("spare", "f8", (STREAMS, 2)),
+        ("knot_t_us", "i8", KNOTS), ("knot_m", "f8", (KNOTS, 3)), ("knot_m_per_s", "f8", (KNOTS, 3)), ("knot_count",
+        "i8"), ("event_count", "i8"), ("event_t_us", "i8", EVENTS), ("event_kind", "i8", EVENTS), ("event_chain",
+        "i8", EVENTS), ("random", "u8", (STREAMS, 4)), ("spare", "f8", (STREAMS, 2)),
         # scratch of one step
         ("force_n", "f8", 3),
         ("base_v", "f8", 3), ("slope_v_per_s", "f8", 3), ("error_v", "f8", 3), ("volt2", "f8", 3),
         ("fast_1", "f8", 3), ("fast_2", "f8", 3),
-        ("slope", "f8", (12, 6)), ("trial", "f8", 6), ("start", "f8", 6),
+        ("slope", "f8", (12, 6)), ("start", "f8", 6),
         ("decay_h_s", "f8"), ("decay", "f8", 13), ("contact", "i8"), ("touched", "i8", 3),
         ("before_m", "f8", 3), ("before_m_per_s", "f8", 3), ("strokes_m", "f8", 3), ("rates_m_per_s", "f8", 3),
     ],

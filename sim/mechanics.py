@@ -1,19 +1,23 @@
 """Elastic energy, its gradient and Hessian, and the acceleration of the table.
 
-    V = sum_i (2 K1_i q_i^2 + 2 K2_i theta_i^2) + 2 c K3 (alpha - alpha_0)^2,     sin(theta_i) = w_i / L1,  sin(alpha) = z / L2
-    m x'' = -grad V + J^T F + F_levitation + F_stops + F_external - m D x',        F_i = k_i (1 + phi q_i) (V_i - V_charge,i)^2
+    V = sum_i (2 K1_i q_i^2 + 2 K2_i theta_i^2) + 2 c K3 (alpha - alpha_0)^2
+        with sin(theta_i) = w_i / L1 and sin(alpha) = z / L2
+    m x'' = -grad V + J^T F + F_levitation + F_stops + F_external - m D x'
+        with F_i = k_i (1 + phi q_i) (V_i - V_charge,i)^2
 
-The record keeps leaf = 4 K1, crank_hinge = 4 K2 and link_hinge = 4 c K3, so each energy is half of that times the square."""
+The record keeps leaf = 4 K1, crank_hinge = 4 K2 and link_hinge = 4 c K3, so each energy is half of that times the
+square."""
 
 import math
 
+import numpy as np
 from numba import njit
 
 from sim.geometry import E_X, E_Y, N_X, N_Y, leg, lift
 
 
 @njit(cache=True)
-def arcsine(y):
+def arcsine(y: float) -> float:
     """asin(y); near zero by its series, which is exact to rounding below 0.1 and cheaper than the library."""
     if abs(y) > 0.1:
         return math.asin(max(-1.0, min(1.0, y)))
@@ -23,39 +27,44 @@ def arcsine(y):
 
 
 @njit(cache=True, error_model="numpy")
-def elevation_change(p, height_m, projection_m):
+def elevation_change(p: np.void, height_m: float, projection_m: float) -> float:
     """alpha - alpha_0, rad: the sine of the difference from the two legs now and at rest."""
     cross = height_m * p["projection_rest_m"] - projection_m * p["height_rest_m"]
-    return arcsine(cross / (p["link_m"] * p["link_m"]))
+    return float(arcsine(cross * p["per_link2"]))
 
 
 @njit(cache=True, error_model="numpy")
-def energy(p, motion):
+def energy(p: np.void, motion: np.ndarray) -> float:
     """Elastic energy of the pose motion[:3], J."""
     height_m, projection_m, drawn_m = lift(p, motion[2])
     total = 0.5 * p["link_hinge_nm"] * elevation_change(p, height_m, projection_m) ** 2
     for i in range(3):
         u = E_X[i] * motion[0] + E_Y[i] * motion[1]
         w = N_X[i] * motion[0] + N_Y[i] * motion[1]
-        q = u + drawn_m + w * w / (p["crank_m"] + leg(p["crank_m"], w))
+        q = u + drawn_m + p["crank_m"] - leg(p["crank_m"], w)
         total += 0.5 * p["leaf_n_per_m"][i] * q * q + 0.5 * p["crank_hinge_nm"][i] * arcsine(w / p["crank_m"]) ** 2
-    return total
+    return float(total)
 
 
 @njit(cache=True, error_model="numpy")
-def acceleration(p, s, volt2, x, y, z, vx, vy, vz):
-    """Acceleration (ax, ay, az) in m/s^2 at a pose and velocity, with squared comb voltages ``volt2`` (3,) in V^2 and the constant
-    force s["force_n"]. Sets s["contact"] and s["touched"] where a slider meets a stop or is held by snapped fingers."""
+def acceleration(
+    p: np.void, s: np.void, volt2: np.ndarray, x: float, y: float, z: float, vx: float, vy: float, vz: float
+) -> tuple[float, float, float]:
+    """Acceleration (ax, ay, az) in m/s^2 at a pose and velocity, with squared comb voltages ``volt2`` (3,) in V^2 and
+    the constant force s["force_n"]. Sets s["contact"] and s["touched"] where a slider meets a stop or is held by
+    snapped fingers."""
     height_m, projection_m, drawn_m = lift(p, z)
     crank_m = p["crank_m"]
     fringe = p["fringe_per_m"]
-    steep = height_m / projection_m
+    per_projection = 1.0 / projection_m
+    steep = height_m * per_projection
+    per_crank = p["per_crank"]
     fx, fy, pulls, combs = s["force_n"][0], s["force_n"][1], 0.0, 0.0
     for i in range(3):
         w = N_X[i] * x + N_Y[i] * y
         c = leg(crank_m, w)
         inverse_c = 1.0 / c
-        q = E_X[i] * x + E_Y[i] * y + drawn_m + w * w / (crank_m + c)
+        q = E_X[i] * x + E_Y[i] * y + drawn_m + (crank_m - c)
         tangent = w * inverse_c
         comb = p["force_gain_n_per_v2"][i] * (1.0 + fringe * q) * volt2[i]
         pull = comb - p["leaf_n_per_m"][i] * q
@@ -66,14 +75,14 @@ def acceleration(p, s, volt2, x, y, z, vx, vy, vz):
                 comb = 0.0
             pull += _stop_force(p, s, i, q, rate)
             s["contact"] = 1
-        turn = pull * tangent - p["crank_hinge_nm"][i] * arcsine(w / crank_m) * inverse_c
+        turn = pull * tangent - p["crank_hinge_nm"][i] * arcsine(w * per_crank) * inverse_c
         fx += pull * E_X[i] + turn * N_X[i]
         fy += pull * E_Y[i] + turn * N_Y[i]
         pulls += pull
         combs += comb
-    hinge = p["link_hinge_nm"] * elevation_change(p, height_m, projection_m) / projection_m
+    hinge = p["link_hinge_nm"] * elevation_change(p, height_m, projection_m) * per_projection
     fz = s["force_n"][2] + pulls * steep - hinge + p["levitation"] * combs
-    per_kg = 1.0 / p["mass_kg"]
+    per_kg = p["per_kg"]
     d = p["damping_per_s"]
     ax = fx * per_kg - (d[0, 0] * vx + d[0, 1] * vy + d[0, 2] * vz)
     ay = fy * per_kg - (d[1, 0] * vx + d[1, 1] * vy + d[1, 2] * vz)
@@ -81,10 +90,27 @@ def acceleration(p, s, volt2, x, y, z, vx, vy, vz):
     return ax, ay, az
 
 
+@njit(cache=True, error_model="numpy")
+def comb_acceleration(p: np.void, volt2: np.ndarray, x: float, y: float, z: float) -> tuple[float, float, float]:
+    """The combs' own part of ``acceleration``, which is linear in ``volt2``."""
+    height_m, projection_m, drawn_m = lift(p, z)
+    fx, fy, combs = 0.0, 0.0, 0.0
+    for i in range(3):
+        w = N_X[i] * x + N_Y[i] * y
+        c = leg(p["crank_m"], w)
+        q = E_X[i] * x + E_Y[i] * y + drawn_m + (p["crank_m"] - c)
+        comb = p["force_gain_n_per_v2"][i] * (1.0 + p["fringe_per_m"] * q) * volt2[i]
+        fx += comb * (E_X[i] + N_X[i] * w / c)
+        fy += comb * (E_Y[i] + N_Y[i] * w / c)
+        combs += comb
+    per_kg = p["per_kg"]
+    return fx * per_kg, fy * per_kg, combs * (height_m / projection_m + p["levitation"]) * per_kg
+
+
 @njit(cache=True)
-def _stop_force(p, s, i, q, rate):
-    """Force of stops on slider i, N, positive inward: Hunt-Crossley k d (1 + c d'), which never pulls. Snapped fingers hold the
-    slider with the same stiffness, both ways, near critically damped."""
+def _stop_force(p: np.void, s: np.void, i: int, q: float, rate: float) -> float:
+    """Force of stops on slider i, N, positive inward: Hunt-Crossley k d (1 + c d'), which never pulls. Snapped
+    fingers hold the slider with the same stiffness, both ways, near critically damped."""
     force = 0.0
     if s["held"][i] != 0:
         k = p["stop_n_per_m"]
@@ -99,7 +125,7 @@ def _stop_force(p, s, i, q, rate):
 
 
 @njit(cache=True, error_model="numpy")
-def stiffness(p, x, y, z):
+def stiffness(p: np.void, x: float, y: float, z: float) -> tuple[float, float, float, float, float, float]:
     """Hessian of the elastic energy at a pose, N/m: (k_xx, k_xy, k_xz, k_yy, k_yz, k_zz)."""
     height_m, projection_m, drawn_m = lift(p, z)
     crank_m = p["crank_m"]
@@ -111,7 +137,7 @@ def stiffness(p, x, y, z):
     for i in range(3):
         w = N_X[i] * x + N_Y[i] * y
         c = leg(crank_m, w)
-        q = E_X[i] * x + E_Y[i] * y + drawn_m + w * w / (crank_m + c)
+        q = E_X[i] * x + E_Y[i] * y + drawn_m + (crank_m - c)
         k1, k2 = p["leaf_n_per_m"][i], p["crank_hinge_nm"][i]
         jx = E_X[i] + N_X[i] * w / c
         jy = E_Y[i] + N_Y[i] * w / c

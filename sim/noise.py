@@ -1,6 +1,7 @@
 """Random numbers inside compiled code: one small generator per source, its whole memory in the plant's state.
 
-SFC64 (Doty-Humphrey, PractRand), the same stream as ``numpy.random.SFC64``, and normal deviates by Marsaglia's polar method."""
+SFC64 (Doty-Humphrey, PractRand), the same stream as ``numpy.random.SFC64``, and normal deviates by Marsaglia's polar
+method."""
 
 import math
 
@@ -23,13 +24,14 @@ def stream(seed: int, source: int, offset: int) -> np.ndarray:
 
 
 @njit(cache=True)
-def _add(a, b):
+def _add(a: np.uint64, b: np.uint64) -> np.uint64:
     """a + b modulo 2^64, without a carry out of 64 bits: interpreted NumPy scalars would warn of it."""
-    return ((a & LOW_63) + (b & LOW_63)) ^ ((a ^ b) & TOP_BIT)
+    total: np.uint64 = ((a & LOW_63) + (b & LOW_63)) ^ ((a ^ b) & TOP_BIT)
+    return total
 
 
 @njit(cache=True)
-def next_u64(words):
+def next_u64(words: np.ndarray) -> np.uint64:
     """Next 64 random bits; ``words`` (4,) uint64 is the generator's memory."""
     a, b, c, counter = words[0], words[1], words[2], words[3]
     out = _add(_add(a, b), counter)
@@ -41,17 +43,18 @@ def next_u64(words):
 
 
 @njit(cache=True)
-def _uniform(words):
+def _uniform(words: np.ndarray) -> float:
     """Uniform on (-1, 1), 53 bits."""
-    return np.int64(next_u64(words) >> ELEVEN) * 2.0**-52 - 1.0
+    return float(np.int64(next_u64(words) >> ELEVEN) * 2.0**-52 - 1.0)
 
 
 @njit(cache=True, error_model="numpy")
-def normal(words, spare):
-    """Standard normal deviate. Each accepted pair yields two: the second waits in ``spare`` (2,): [is there one, its value]."""
+def normal(words: np.ndarray, spare: np.ndarray) -> float:
+    """Standard normal deviate. Each accepted pair yields two: the second waits in ``spare`` (2,): [is there one, its
+    value]."""
     if spare[0] != 0.0:
         spare[0] = 0.0
-        return spare[1]
+        return float(spare[1])
     u = _uniform(words)
     v = _uniform(words)
     r2 = u * u + v * v

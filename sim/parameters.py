@@ -43,7 +43,8 @@ def _mechanism(p: np.void, config: PlantConfig, device: Device) -> None:
     p["crank_m"] = device.geometry.crank_length_m
     p["link_m"] = math.hypot(projection_m, height_m)
     p["projection_rest_m"], p["height_rest_m"] = projection_m, height_m
-    # one folded spring is two clamped beams in series; a beam of length l gives E h t^3 / l^3 (paper Eq. 26: four of these)
+    # one folded spring is two clamped beams in series; a beam of length l gives E h t^3 / l^3 (paper Eq. 26: four of
+    # these)
     leaf = (
         4
         * f.youngs_modulus_pa
@@ -61,6 +62,7 @@ def _mechanism(p: np.void, config: PlantConfig, device: Device) -> None:
     p["crank_hinge_nm"] = 4 * crank * (1 + crank_error)
     p["link_hinge_nm"] = 4 * f.out_of_plane_chains * link * (1 + np.mean(link_error))
     p["mass_kg"] = device.dynamics.mass_kg * (1 + (config.mass_error.relative if config.mass_error.on else 0.0))
+    p["per_kg"], p["per_crank"], p["per_link2"] = 1 / p["mass_kg"], 1 / p["crank_m"], 1 / p["link_m"] ** 2
     p["damping_per_s"] = _damping(p, config, device)
     p["weight_n"] = _weight(config, float(p["mass_kg"]))
     stops = config.stops
@@ -110,7 +112,8 @@ def _drive_combs(p: np.void, config: PlantConfig, device: Device) -> None:
     p["fringe_per_m"] = config.fringe.relative_per_25um / STROKE_SCALE_M if config.fringe.on else 0.0
     p["levitation"] = config.levitation.ratio if config.levitation.on else 0.0
     p["overlap_rest_m"] = comb.overlap_rest_m
-    # lateral stiffness of a slider: its four folded springs across the motion, each two leaves in series along their length
+    # lateral stiffness of a slider: its four folded springs across the motion, each two leaves in series along their
+    # length
     lateral = (
         16
         * f.youngs_modulus_pa

@@ -2,18 +2,19 @@
 
     r'' + d r' + w^2 r = (sum_i u_i F_i) / m_p;   stroke_i += u_i r,   table += t r
 
-One way: the mode does not act back on the rigid motion. With each comb's gain frozen at the start of a step the right side is
-a0 + a1 t + a2 t^2 + b1 E + b2 E^2, E = exp(-t / tau), whose response is known exactly for any step."""
+One way: the mode does not act back on the rigid motion. With each comb's gain frozen at the start of a step the right
+side is a0 + a1 t + a2 t^2 + b1 E + b2 E^2, E = exp(-t / tau), whose response is known exactly for any step."""
 
 import math
 
+import numpy as np
 from numba import njit
 
 from sim.geometry import strokes
 
 
 @njit(cache=True, error_model="numpy")
-def parasitic_step(p, s, h):
+def parasitic_step(p: np.void, s: np.void, h: float) -> None:
     """Move the mode on by h s under the channels' base, slope and error; call before the rigid step."""
     strokes(p, s["motion"], s["strokes_m"])
     a0, a1, a2, b1, b2 = 0.0, 0.0, 0.0, 0.0, 0.0
@@ -47,7 +48,7 @@ def parasitic_step(p, s, h):
     )
 
 
-def rest(p, volt2) -> float:
+def rest(p: np.void, volt2: np.ndarray) -> float:
     """Static deflection r under squared voltages (3,)."""
     gain = p["force_gain_n_per_v2"] * p["parasitic_comb"] * p["parasitic_per_kg"]
     return float((gain * volt2).sum() / p["parasitic_rad_per_s"] ** 2)

@@ -14,7 +14,8 @@ KINDS = {layout.STOP: "stop", layout.PULLED_IN: "pulled_in", layout.BROKEN: "bro
 
 
 class Event(NamedTuple):
-    """Something that happened to the stage. ``kind`` is stop, pulled_in or broken; ``chain`` 1, 2, 3, or 0 for the whole stage."""
+    """Something that happened to the stage. ``kind`` is stop, pulled_in or broken; ``chain`` 1, 2, 3, or 0 for the
+    whole stage."""
 
     t_us: int
     kind: str
@@ -22,7 +23,8 @@ class Event(NamedTuple):
 
 
 class Plant:
-    """Stage, amplifier and sense electronics. Starts in static equilibrium with zero counts on the converters, at t_us = 0.
+    """Stage, amplifier and sense electronics. Starts in static equilibrium with zero counts on the converters, at
+    t_us = 0.
 
     Args:
         config: effects with their sizes.
@@ -32,8 +34,8 @@ class Plant:
         drive_scale_v_per_count: volts at the converter per drive count.
         sense_scale_f_per_count, sense_offset_f: a sense count of n shows sense_offset_f + n * sense_scale_f_per_count.
 
-    ``params`` and ``state`` are the one-element records which ``sim.kernels`` works on; calling the kernels on them and calling
-    the methods here is one and the same.
+    ``params`` and ``state`` are the one-element records which ``sim.kernels`` works on; calling the kernels on them
+    and calling the methods here is one and the same.
     """
 
     def __init__(
@@ -90,13 +92,13 @@ class Plant:
     def position_m(self) -> np.ndarray:
         """True position of the table (3,), relative to the rest pose, with the parasitic mode's part."""
         p, s = self.params[0], self.state[0]
-        return s["motion"][:3] + p["parasitic_table"] * s["parasitic"][0]
+        return np.asarray(s["motion"][:3] + p["parasitic_table"] * s["parasitic"][0])
 
     @property
     def velocity_m_per_s(self) -> np.ndarray:
         """True velocity of the table (3,), with the parasitic mode's part."""
         p, s = self.params[0], self.state[0]
-        return s["motion"][3:] + p["parasitic_table"] * s["parasitic"][1]
+        return np.asarray(s["motion"][3:] + p["parasitic_table"] * s["parasitic"][1])
 
     @property
     def stroke_m(self) -> np.ndarray:
@@ -104,17 +106,17 @@ class Plant:
         p, s = self.params[0], self.state[0]
         out = np.empty(3)
         strokes(p, s["motion"], out)
-        return out + p["parasitic_comb"] * s["parasitic"][0]
+        return np.asarray(out + p["parasitic_comb"] * s["parasitic"][0])
 
     @property
     def voltage_v(self) -> np.ndarray:
         """Voltages at the drive combs (3,)."""
-        return self.state["voltage_v"][0].copy()
+        return np.array(self.state["voltage_v"][0])
 
     @property
     def external_force_n(self) -> np.ndarray:
         """Force from outside on the table (3,), N; stays until it is set anew."""
-        return self.state["external_n"][0].copy()
+        return np.array(self.state["external_n"][0])
 
     @external_force_n.setter
     def external_force_n(self, force_n: Sequence[float] | np.ndarray) -> None:

@@ -1,12 +1,14 @@
 """From strokes to sense counts.
 
-    C_i = C_rest + g_i (q_i + c q_i^2 / 2) + offset_i + walk_i + feedthrough V_i + noise;   counts = round((C_i - zero) / scale), int16
+    C_i = C_rest + g_i (q_i + c q_i^2 / 2) + offset_i + walk_i + feedthrough V_i + noise
+    counts = round((C_i - zero) / scale), saturated to int16
 
-q_i is the slider's stroke with the parasitic mode's part, after a first-order filter and a delay where these are on. Filter and
-delay see the strokes as a cubic through value and rate at both ends of each step."""
+q_i is the slider's stroke with the parasitic mode's part, after a first-order filter and a delay where these are on.
+Filter and delay see the strokes as a cubic through value and rate at both ends of each step."""
 
 import math
 
+import numpy as np
 from numba import njit
 
 from sim.geometry import stroke_rates, strokes
@@ -15,7 +17,7 @@ from sim.noise import normal
 
 
 @njit(cache=True, error_model="numpy")
-def seen(p, s, out_m, out_m_per_s):
+def seen(p: np.void, s: np.void, out_m: np.ndarray, out_m_per_s: np.ndarray) -> None:
     """Strokes and rates (3,) as the sense combs move, parasitic mode included."""
     strokes(p, s["motion"], out_m)
     stroke_rates(p, s["motion"], out_m_per_s)
@@ -26,7 +28,7 @@ def seen(p, s, out_m, out_m_per_s):
 
 
 @njit(cache=True, error_model="numpy")
-def _filtered(tau, h, q0, v0, q1, v1, f0):
+def _filtered(tau: float, h: float, q0: float, v0: float, q1: float, v1: float, f0: float) -> float:
     """End value of f' = (q - f) / tau over h s, for the cubic q(t) with these values and rates at its ends, from f0."""
     a3 = (2.0 * (q0 - q1) / h + v0 + v1) / (h * h)
     a2 = (3.0 * (q1 - q0) / h - 2.0 * v0 - v1) / h
@@ -38,7 +40,7 @@ def _filtered(tau, h, q0, v0, q1, v1, f0):
 
 
 @njit(cache=True, error_model="numpy")
-def follow(p, s, h):
+def follow(p: np.void, s: np.void, h: float) -> None:
     """Move filter and memory of the sense chain on over the step of h s that just ended at s["t_us"]. s["before_m"] and
     s["before_m_per_s"] are the strokes and rates at its start."""
     q, v = s["strokes_m"], s["rates_m_per_s"]
@@ -59,9 +61,9 @@ def follow(p, s, h):
 
 
 @njit(cache=True, error_model="numpy")
-def _remembered(p, s, out_m):
-    """Filtered strokes (3,) at the delay before now, by the cubic between the knots around that time; at most as old as the
-    oldest knot."""
+def _remembered(p: np.void, s: np.void, out_m: np.ndarray) -> None:
+    """Filtered strokes (3,) at the delay before now, by the cubic between the knots around that time; at most as old
+    as the oldest knot."""
     wanted_us = s["t_us"] - p["sense_delay_us"]
     newest = s["knot_count"] - 1
     oldest = max(0, s["knot_count"] - KNOTS)
@@ -82,7 +84,7 @@ def _remembered(p, s, out_m):
 
 
 @njit(cache=True, error_model="numpy")
-def walk(p, s, dt_s):
+def walk(p: np.void, s: np.void, dt_s: float) -> None:
     """Random walk of the channels' offsets over dt_s."""
     size = p["sense_walk_f_per_rt_s"] * math.sqrt(dt_s)
     for i in range(3):
@@ -90,7 +92,7 @@ def walk(p, s, dt_s):
 
 
 @njit(cache=True, error_model="numpy")
-def sample(params, state, counts):
+def sample(params: np.ndarray, state: np.ndarray, counts: np.ndarray) -> None:
     """Sample the three channels now into ``counts`` (3,) integers; draws their noise."""
     p = params[0]
     s = state[0]
