@@ -83,7 +83,7 @@ class AmplifierNode:
         self._consumers = [
             HeartbeatConsumer(clock, self._controller_lost, self._controller_found) for _ in range(od[0x1016, 0])
         ]
-        self._drive = DriveReceiver(od, self._drive_pdo, self._drive_errors)
+        self._drive = DriveReceiver(od, self._drive_pdo, self._drive_errors, lambda: self.outputs)
         self._sense = SenseTransmitter(
             od, self._sense_pdo, clock, plant, self._transmit, self._heartbeat, turnaround_us
         )

@@ -1,6 +1,7 @@
 """Reception of the drive PDO: no count reaches the amplifier that has not passed here."""
 
 import struct
+from collections.abc import Callable
 
 from hil.node_crc import crc8h2f, word_tables
 from hil.node_emergency import ErrorCode, FrameErrors
@@ -21,11 +22,13 @@ class DriveReceiver:
     refused, and the sequence goes on. The first frame after `start` may carry any.
     """
 
-    def __init__(self, od: ObjectDictionary, parameters: PdoParameters, errors: FrameErrors) -> None:
-        self._od = od
+    def __init__(
+        self, od: ObjectDictionary, parameters: PdoParameters, errors: FrameErrors, outputs: Callable[[], Counts]
+    ) -> None:
         self._parameters = parameters
         self._errors = errors
-        self._limit = od.entry(_OUTPUT, 1).high or 0
+        self._outputs = outputs
+        self._od = od
         self.pending: Counts | None = None
         self.counter: int | None = None  # of the last frame with a correct CRC
         self.crc = 0
@@ -33,6 +36,7 @@ class DriveReceiver:
 
     def configure(self) -> None:
         """Take over COB-ID and mapping from the dictionary."""
+        self._limit = self._od.entry(_OUTPUT, 1).high or 0
         self._cob_bytes = self._parameters.cob_id.to_bytes(2, "little")
         self._layout: Layout = self._parameters.layout()
         self.receive = self._receive_mapped
@@ -83,7 +87,7 @@ class DriveReceiver:
             if last is not None and (last + 1) & 0xFF != self.counter:
                 self._errors.bad(ErrorCode.DRIVE_COUNTER, t_us, bytes((last, values[layout.counter])))
                 return
-        words = list(self.pending or (self._od[_OUTPUT, subindex] for subindex in (1, 2, 3)))
+        words = list(self.pending or self._outputs())
         for (index, subindex), value in zip(layout.fields, values, strict=True):
             if index == _OUTPUT:
                 words[subindex - 1] = value & 0xFFFF

@@ -9,7 +9,7 @@ from hil.object_dictionary import Abort, Entry, ObjectDictionary, SdoAbortError
 class NodeObjects:
     """Stands between the SDO server and the dictionary.
 
-    ``refresh(index)`` is called before a value is read, ``changed(index)`` after one was written; ``may_drive()`` tells
+    ``refresh(index)`` is called before a value is touched, ``changed(index)`` after one was written; ``may_drive()`` tells
     whether a drive count other than 0 may be set by SDO.
     """
 
@@ -51,6 +51,7 @@ class NodeObjects:
         value = entry.decode(data)
         if isinstance(value, int):
             self._check(entry, value)
+        self._refresh(index)  # of an array only one element is written
         entry.value = value
         self._changed(index)
 

@@ -56,7 +56,7 @@ class SenseTransmitter:
         self._cycle_us = 0  # between the last two SYNCs
         self._due_us: int | None = None  # of the frame in the turn-around
         self.counts = (0, 0, 0)  # last sample
-        self.counter = 0  # alive counter of the next frame
+        self.counter = 0  # alive counter of the last frame
         self.crc = 0
         self.configure()
 
@@ -132,21 +132,18 @@ class SenseTransmitter:
         self._event.set(now_us + self._event_us)
 
     def _transmit(self) -> None:
-        counter = self.counter
-        self.counter = (counter + 1) & 0xFF
+        self.counter = counter = (self.counter + 1) & 0xFF
         if self._is_default:
             a, b, c = self._sent = self.counts
             self.crc = crc = self._w0[a] ^ self._w1[b] ^ self._w2[c] ^ self._w3[counter]
             self._send(self._cob_id, _pack_protected(a, b, c, counter, crc))
         else:
-            self._send(self._cob_id, self._encode_mapped(counter))
+            self._send(self._cob_id, self._encode_mapped())
 
-    def _encode_mapped(self, counter: int) -> bytes:
+    def _encode_mapped(self) -> bytes:
         self._sent = self.counts
         od, layout = self._od, self._layout
         self.publish()
-        od[_PROTECTION, 1] = counter
-        od[_PROTECTION, 2] = 0
         data = layout.codec.pack(*(od[field] for field in layout.fields))
         if layout.crc is not None:
             self.crc = od[_PROTECTION, 2] = crc8h2f(self._cob_bytes + data[:-1])
@@ -157,5 +154,5 @@ class SenseTransmitter:
         """Bring the process values to where SDO reads them."""
         for subindex in (1, 2, 3):
             self._od[_INPUT, subindex] = self.counts[subindex - 1]
-        self._od[_PROTECTION, 1] = (self.counter - 1) & 0xFF
+        self._od[_PROTECTION, 1] = self.counter
         self._od[_PROTECTION, 2] = self.crc

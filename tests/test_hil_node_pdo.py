@@ -1,0 +1,387 @@
+"""Process data of the amplifier node: what is applied when, what is sent when, and what is refused."""
+
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from node_rig import DRIVE, EMCY, SENSE, SYNC, TURNAROUND_US, Crc8H2F, Rig, protected, sample_at
+
+from hil.node import NmtState
+from hil.node_crc import crc8h2f, word_tables
+from pkxyz_ctrl.can.codec import ProcessCodec
+
+COUNTS = st.tuples(*[st.integers(0, 32767)] * 3)
+ZERO = (0, 0, 0)
+CRC, COUNTER, VALUE, MISSING, SHORT, LONG = 0xFF10, 0xFF11, 0xFF12, 0x8250, 0x8210, 0x8220
+GOOD = protected(DRIVE, (1, 2, 3), 0)
+
+
+def emergencies(rig: Rig) -> list[int]:
+    return [int.from_bytes(data[:2], "little") for data in rig.of(EMCY)]
+
+
+def operational(**options: bool) -> Rig:
+    rig = Rig(**options)
+    rig.start()
+    rig.forget()
+    return rig
+
+
+# -- CRC -------------------------------------------------------------------------------------------------------------
+
+
+def test_crc_check_value() -> None:
+    assert crc8h2f(b"123456789") == 0xDF  # AUTOSAR SWS CRC Library
+
+
+@given(st.binary(max_size=20))
+def test_crc_against_crccheck(data: bytes) -> None:
+    assert crc8h2f(data) == Crc8H2F.calc(data)
+
+
+@given(st.integers(0, 0x7FF), st.tuples(*[st.integers(-32768, 32767)] * 3), st.integers(0, 255))
+@settings(max_examples=50, deadline=None)
+def test_word_tables_against_crccheck(cob_id: int, words: tuple[int, int, int], counter: int) -> None:
+    w0, w1, w2, w3 = word_tables(cob_id)
+    a, b, c = words
+    assert w0[a] ^ w1[b] ^ w2[c] ^ w3[counter] == protected(cob_id, words, counter)[7]
+
+
+# -- timing ----------------------------------------------------------------------------------------------------------
+
+
+@given(st.lists(COUNTS, min_size=1, max_size=20), st.integers(20, 2000))
+@settings(max_examples=30, deadline=None)
+def test_one_period_from_drive_pdo_to_comb(trajectory: list[tuple[int, int, int]], period_us: int) -> None:
+    rig = operational()
+    sync_us = []
+    for counts in trajectory:
+        sync_us.append(rig.now_us)
+        rig.cycle(counts, period_us)
+    sync_us.append(rig.now_us)
+    rig.cycle(None, period_us)
+    assert rig.plant.driven == list(zip(sync_us[1:], trajectory, strict=True))
+    assert rig.plant.sampled_us == sync_us
+    assert rig.times(SENSE) == [t_us + TURNAROUND_US for t_us in sync_us]
+    assert rig.of(SENSE) == [protected(SENSE, sample_at(t_us), (k + 1) % 256) for k, t_us in enumerate(sync_us)]
+    assert rig.sent[-1][1].can_id == SENSE
+
+
+def test_the_controllers_codec_reads_the_sense_pdo() -> None:
+    rig = operational()
+    codec = ProcessCodec(SENSE, True)
+    for k in range(600):
+        t_us = rig.now_us
+        rig.cycle()
+        assert codec.decode(rig.sent[-1][1].data) == (*sample_at(t_us), (k + 1) % 256, True)
+
+
+def test_drive_is_applied_before_the_sample_and_at_the_same_instant() -> None:
+    rig = operational()
+    order = []
+    rig.plant.advance_to = lambda t_us: order.append(("advance", t_us))  # type: ignore[method-assign]
+    rig.plant.drive = lambda counts: order.append(("drive", counts))  # type: ignore[method-assign]
+    rig.plant.sample = lambda: order.append(("sample",)) or ZERO  # type: ignore[method-assign,func-returns-value]
+    rig.drive((7, 8, 9))
+    rig.sync()
+    assert order == [("advance", rig.now_us), ("drive", (7, 8, 9)), ("sample",)]
+
+
+def test_the_last_of_two_drive_pdos_counts() -> None:
+    rig = operational()
+    rig.drive((1, 1, 1))
+    rig.drive((2, 2, 2))
+    rig.sync()
+    assert rig.plant.driven == [(rig.now_us, (2, 2, 2))]
+
+
+# -- what is refused -------------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize(
+    ("data", "code"),
+    [
+        (b"", SHORT),
+        (GOOD[:7], SHORT),
+        (GOOD[:6], SHORT),
+        (GOOD + b"\0", LONG),
+        (GOOD + bytes(56), LONG),
+        (bytes(8), CRC),
+        (b"\xff" * 8, CRC),
+        (protected(SENSE, (1, 2, 3), 0), CRC),
+        (protected(DRIVE, (-1, 2, 3), 0), VALUE),
+        (protected(DRIVE, (1, 2, -32768), 0), VALUE),
+    ],
+)
+def test_a_bad_drive_pdo_is_not_applied_and_is_reported_once(data: bytes, code: int) -> None:
+    rig = operational()
+    for _ in range(50):
+        rig.give(DRIVE, data)
+        rig.run(100)
+        rig.sync()
+        rig.run(100)
+    assert rig.plant.driven == []
+    assert emergencies(rig)[0] == code
+    assert len(rig.of(EMCY)) <= 2  # a frame that repeats has a wrong counter as well
+    assert rig.node.state is NmtState.OPERATIONAL
+
+
+def test_every_single_bit_error_is_refused() -> None:
+    for bit in range(64):
+        rig = operational()
+        rig.give(DRIVE, (int.from_bytes(GOOD, "little") ^ 1 << bit).to_bytes(8, "little"))
+        rig.sync()
+        assert (rig.plant.driven, emergencies(rig)) == ([], [CRC])
+
+
+def test_limit_of_the_values() -> None:
+    rig = operational()
+    rig.drive((32767, 0, 32767))
+    rig.sync()
+    assert rig.node.outputs == (32767, 0, 32767)
+    low = Rig()
+    low.node.od.entry(0x6411, 1).high = 1000
+    low.nmt(129)
+    low.run(10_000)
+    low.start()
+    low.drive((1001, 0, 0))
+    low.sync()
+    assert (low.node.outputs, emergencies(low)) == (ZERO, [VALUE])
+
+
+@pytest.mark.parametrize("first", [0, 1, 254, 255])
+@pytest.mark.parametrize("step", range(256))
+def test_alive_counter(first: int, step: int) -> None:
+    rig = operational()
+    rig.give(DRIVE, protected(DRIVE, (1, 1, 1), first))
+    rig.sync()
+    assert rig.node.outputs == (1, 1, 1), "the first may carry any"
+    second = (first + step) % 256
+    rig.give(DRIVE, protected(DRIVE, (2, 2, 2), second))
+    rig.sync()
+    assert rig.node.outputs == ((2, 2, 2) if step == 1 else (1, 1, 1))
+    assert emergencies(rig) == ([] if step == 1 else [COUNTER])
+    rig.give(DRIVE, protected(DRIVE, (3, 3, 3), (second + 1) % 256))
+    rig.sync()
+    assert rig.node.outputs == (3, 3, 3), "in step again"
+
+
+def test_errors_end_after_a_quiet_while() -> None:
+    rig = operational()
+    rig.cycle((1, 1, 1))
+    rig.give(DRIVE, bytes(8))
+    t_us = rig.now_us
+    while rig.now_us < t_us + 150_000:
+        rig.cycle((1, 1, 1))
+    assert emergencies(rig) == [CRC, 0]
+    assert 100_000 <= rig.times(EMCY)[1] - t_us <= 100_400
+    assert rig.node.od[0x1001, 0] == 0
+
+
+@pytest.mark.parametrize("syncs", [0, 1, 5, 255])
+def test_combs_are_released_when_no_drive_pdo_comes(syncs: int) -> None:
+    rig = Rig()
+    rig.write(0x2010, 0, syncs, 1)
+    rig.start()
+    rig.forget()
+    rig.cycle((4, 5, 6))
+    applied_us = rig.now_us
+    for _ in range(600):
+        rig.cycle()
+    if syncs == 0:
+        assert rig.plant.driven == [(applied_us, (4, 5, 6))]
+        return
+    assert rig.plant.driven == [(applied_us, (4, 5, 6)), (applied_us + 200 * syncs, ZERO)]
+    assert emergencies(rig) == [MISSING]
+    rig.cycle((7, 7, 7))
+    rig.sync()
+    assert rig.node.outputs == (7, 7, 7)
+
+
+def test_nothing_is_missed_at_zero_volts() -> None:
+    rig = operational()
+    for _ in range(50):
+        rig.cycle()
+    assert (rig.plant.driven, rig.of(EMCY)) == ([], [])
+
+
+def test_error_mode_and_value_of_each_comb() -> None:
+    rig = Rig()
+    assert rig.write(0x6443, 2, 0, 1) == rig.write(0x6444, 3, 55, 4) == 0
+    rig.energise((100, 200, 300))
+    rig.nmt(128)
+    assert rig.plant.driven[-1] == (rig.now_us, (0, 200, 55))
+    assert [rig.read(0x6411, i) for i in (1, 2, 3)] == [0, 200, 55]
+
+
+# -- SYNC ------------------------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("data", [b"", b"\x00", b"\xf1", b"\xff", b"\x01\x02", bytes(8)])
+def test_a_sync_that_is_none_is_not_one(data: bytes) -> None:
+    rig = operational()
+    rig.drive((1, 2, 3))
+    rig.give(SYNC, data)
+    rig.run(100)
+    assert (rig.plant.driven, rig.of(SENSE), emergencies(rig)) == ([], [], [0x8240])
+    rig.sync()
+    assert rig.node.outputs == (1, 2, 3)
+
+
+@pytest.mark.parametrize("jump", [0, 2, 100])
+def test_a_sync_out_of_step_is_a_sync_all_the_same(jump: int) -> None:
+    rig = operational()
+    rig.cycle((1, 2, 3))
+    rig.give(SYNC, bytes((1 + jump,)))
+    rig.run(100)
+    assert (rig.node.outputs, len(rig.of(SENSE)), emergencies(rig)) == ((1, 2, 3), 2, [0x8240])
+
+
+@pytest.mark.parametrize("last", [2, 10, 240])
+def test_sync_counter_wraps_where_configured(last: int) -> None:
+    rig = Rig()
+    assert rig.write(0x1019, 0, last, 1) == 0
+    rig.start()
+    for k in range(3 * last):
+        rig.give(SYNC, bytes((k % last + 1,)))
+        rig.run(100)
+    assert (len(rig.of(SENSE)), rig.of(EMCY)) == (3 * last, [])
+    rig.give(SYNC, bytes((last + 1,)))
+    assert emergencies(rig) == [0x8240]
+
+
+def test_sync_without_counter_and_with_another_identifier() -> None:
+    rig = Rig()
+    assert rig.write(0x1019, 0, 0, 1) == rig.write(0x1005, 0, 0x90, 4) == 0
+    rig.start()
+    rig.forget()
+    rig.drive((1, 2, 3))
+    rig.give(0x80, b"")
+    assert rig.plant.driven == []
+    rig.give(0x90, b"")
+    rig.run(100)
+    assert (rig.node.outputs, len(rig.of(SENSE)), rig.of(EMCY)) == ((1, 2, 3), 1, [])
+    rig.give(0x90, b"\x01")
+    assert emergencies(rig) == [0x8240]
+
+
+# -- transmission types and mappings -----------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("every", [1, 2, 3, 7, 240])
+def test_sense_every_nth_sync(every: int) -> None:
+    rig = Rig()
+    assert rig.write(0x1801, 2, every, 1) == 0
+    rig.start()
+    rig.forget()
+    t_us = rig.now_us
+    for _ in range(500):
+        rig.cycle()
+    assert rig.times(SENSE) == [t_us + 200 * k + TURNAROUND_US for k in range(every - 1, 500, every)]
+
+
+def test_sense_on_change_only() -> None:
+    rig = Rig()
+    rig.write(0x1801, 2, 0, 1)
+    rig.start()
+    rig.forget()
+    values = [(1, 1, 1)] * 3 + [(1, 1, 2)] * 2 + [(1, 1, 1)]
+    remaining = iter(values)
+    rig.plant.sample = lambda: next(remaining)  # type: ignore[method-assign]
+    for _ in values:
+        rig.cycle()
+    assert [ProcessCodec(SENSE, True).decode(data)[:3] for data in rig.of(SENSE)] == [(1, 1, 1), (1, 1, 2), (1, 1, 1)]
+
+
+def test_sync_start_value() -> None:
+    rig = Rig()
+    assert rig.write(0x1801, 1, 0xC000028A, 4) == rig.write(0x1801, 6, 5, 1) == rig.write(0x1801, 2, 2, 1) == 0
+    assert rig.write(0x1801, 1, 0x4000028A, 4) == 0
+    rig.start()
+    rig.forget()
+    t_us = rig.now_us
+    for _ in range(9):
+        rig.cycle()
+    assert rig.times(SENSE) == [t_us + 200 * k + TURNAROUND_US for k in (4, 6, 8)]
+
+
+@pytest.mark.parametrize("kind", [254, 255])
+def test_event_driven_pdos(kind: int) -> None:
+    rig = Rig()
+    assert rig.write(0x1401, 2, kind, 1) == rig.write(0x1801, 2, kind, 1) == rig.write(0x1801, 5, 3, 2) == 0
+    rig.start()
+    rig.forget()
+    t_us = rig.now_us
+    rig.run(50)
+    rig.drive((3, 2, 1))
+    assert rig.plant.driven == [(t_us + 50, (3, 2, 1))]
+    rig.run(9_950)
+    assert rig.times(SENSE) == [t_us + 3000 * k for k in (1, 2, 3)]
+    rig.nmt(2)
+    rig.run(10_000)
+    assert len(rig.times(SENSE)) == 3
+
+
+def remap(rig: Rig, communication: int, cob_id: int, entries: list[int]) -> None:
+    assert rig.write(communication, 1, 0x80000000 | cob_id, 4) == 0
+    assert rig.write(communication + 0x200, 0, 0, 1) == 0
+    for subindex, entry in enumerate(entries, 1):
+        assert rig.write(communication + 0x200, subindex, entry, 4) == 0
+    assert rig.write(communication + 0x200, 0, len(entries), 1) == 0
+    assert rig.write(communication, 1, cob_id, 4) == 0
+
+
+def test_another_mapping_and_identifier() -> None:
+    rig = Rig()
+    remap(rig, 0x1401, 0x201, [0x64110310, 0x20000108, 0x64110110, 0x20000208])
+    remap(rig, 0x1801, 0x40000181, [0x10010008, 0x64010210, 0x20010108, 0x20010208])
+    rig.start()
+    rig.forget()
+
+    def drive(third: int, first: int, counter: int) -> bytes:
+        payload = third.to_bytes(2, "little") + bytes((counter,)) + first.to_bytes(2, "little")
+        return payload + bytes((Crc8H2F.calc(b"\x01\x02" + payload),))
+
+    rig.give(0x201, drive(33, 11, 5))
+    t_us = rig.now_us
+    rig.cycle()
+    assert rig.plant.driven == [(t_us, (11, 0, 33))]
+    rig.give(0x201, drive(34, 12, 5))
+    rig.give(DRIVE, GOOD)
+    rig.sync()
+    assert (rig.node.outputs, emergencies(rig)) == ((11, 0, 33), [COUNTER])
+    sense = rig.of(0x181)[0]
+    assert sense[:4] == b"\0" + sample_at(t_us)[1].to_bytes(2, "little", signed=True) + b"\x01"
+    assert sense[4] == Crc8H2F.calc(b"\x81\x01" + sense[:4])
+    rig.give(0x201, drive(0x8000, 12, 6))
+    rig.give(0x201, drive(1, 12, 7)[:5])
+    assert emergencies(rig)[0] == COUNTER
+    assert set(rig.node.emergency.active) == {COUNTER, VALUE, SHORT}
+
+
+def test_a_plain_module_without_protection() -> None:
+    rig = operational(protection=False)
+    t_us = rig.now_us
+    rig.give(DRIVE, bytes.fromhex("010002000300"))
+    rig.cycle()
+    assert rig.plant.driven == [(t_us, (1, 2, 3))]
+    assert rig.of(SENSE)[0] == protected(SENSE, sample_at(t_us), 0)[:6]
+    rig.give(DRIVE, bytes.fromhex("0100020003ff"))
+    rig.give(DRIVE, GOOD)
+    assert rig.node.emergency.active == (VALUE, LONG)
+    assert rig.write(0x6411, 2, 9, 2) == 0
+    assert rig.plant.driven[-1] == (rig.now_us, (1, 9, 3))
+    rig.nmt(128)
+    assert rig.write(0x6411, 2, 9, 2) == 0x08000021
+
+
+def test_a_pdo_out_of_use_is_deaf_and_dumb() -> None:
+    rig = Rig()
+    assert rig.write(0x1401, 1, 0x8000030A, 4) == rig.write(0x1801, 1, 0xC000028A, 4) == 0
+    rig.start()
+    rig.forget()
+    rig.cycle((1, 2, 3))
+    rig.cycle((1, 2, 3))
+    assert (rig.plant.driven, rig.sent) == ([], [])
+    assert rig.write(0x1801, 1, 0x4000028A, 4) == 0
+    rig.cycle()
+    assert len(rig.of(SENSE)) == 1
