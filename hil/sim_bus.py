@@ -196,6 +196,7 @@ class LockstepCyclicTask(LimitedDurationCyclicSendTaskABC, ModifiableCyclicTaskA
         self._bus = bus
         self._period_us = max(1, round(period * 1e6))
         self._modify = modifier_callback
+        self._running = False
         self._round = 0  # outdates the events of an earlier start
         self._sent = 0
         self._end_us: int | None = None
@@ -203,6 +204,9 @@ class LockstepCyclicTask(LimitedDurationCyclicSendTaskABC, ModifiableCyclicTaskA
             self.start()
 
     def start(self) -> None:
+        if self._running:
+            return
+        self._running = True
         self._round += 1
         self._sent = 0
         now_us = self._bus.wire.clock.now_us
@@ -210,17 +214,18 @@ class LockstepCyclicTask(LimitedDurationCyclicSendTaskABC, ModifiableCyclicTaskA
         self._send(self._round, now_us)
 
     def stop(self) -> None:
-        self._round += 1
+        self._running = False
 
     def _send(self, start_round: int, t_us: int) -> None:
-        if start_round != self._round or (self._end_us is not None and t_us >= self._end_us):
+        if not self._running or start_round != self._round:
+            return
+        if self._bus._is_shutdown or (self._end_us is not None and t_us >= self._end_us):
+            self._running = False
             return
         message = self.messages[self._sent % len(self.messages)]
         self._sent += 1
         if self._modify is not None:
             self._modify(message)
-        if self._bus._is_shutdown:
-            return
         self._bus.endpoint.send(to_frame(message))
         next_us = t_us + self._period_us
         self._bus.wire.clock.call_at(next_us, lambda: self._send(start_round, next_us))
