@@ -52,7 +52,7 @@ def holding(counts: tuple[int, int, int], config: GateConfig = CONFIG) -> Transm
     steps = max(-(-count // config.count_slew_max) for count in counts)
     for k in range(steps + 1):
         t_us = (k - steps) * config.period_us
-        partial = [min(count, k * config.count_slew_max) for count in counts]
-        assert gate.check(drive(*partial, 255 - steps + k), Mode.TRACKING, t_us) is None
+        a, b, c = (min(count, k * config.count_slew_max) for count in counts)
+        assert gate.check(drive(a, b, c, 255 - steps + k), Mode.TRACKING, t_us) is None
         assert gate.check(sync(), Mode.TRACKING, t_us) is None
     return gate

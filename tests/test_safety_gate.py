@@ -128,8 +128,13 @@ def test_frame_made_for_another_node_is_blocked() -> None:
 
 
 @settings(max_examples=100, deadline=None)
-@given(st.tuples(*[st.integers(0, 32767)] * 3), st.integers(0, 255), st.integers(0, 255), st.integers(1, 127))
-def test_crc_by_tables_is_the_crc_by_bits(counts: tuple[int, ...], counter: int, wrong: int, node: int) -> None:
+@given(
+    st.tuples(st.integers(0, 32767), st.integers(0, 32767), st.integers(0, 32767)),
+    st.integers(0, 255),
+    st.integers(0, 255),
+    st.integers(1, 127),
+)
+def test_crc_by_tables_is_the_crc_by_bits(counts: tuple[int, int, int], counter: int, wrong: int, node: int) -> None:
     config = GateConfig(
         count_max=32767, count_slew_max=32767, period_us=T, node_id=node, controller_node_id=node % 127 + 1
     )
@@ -156,7 +161,7 @@ def test_without_protection_six_bytes_and_nothing_else() -> None:
     assert passes(gate, sync(), T)
     assert passes(gate, plain(1000, 0, 0), T)
     assert passes(gate, sync(), 2 * T)
-    for frame in (plain(1000, 1001, 0), plain(-1, 0, 0), drive(1000, 0, 0, 0)):
+    for frame in (plain(1000, 1001, 0), plain(-1, 0, 0), plain(0, -1, 0), plain(0, 0, -1), drive(1000, 0, 0, 0)):
         assert not passes(gate, frame, 2 * T)
         gate.clear()
     assert passes(gate, plain(2000, 1000, 0), 2 * T)
@@ -252,7 +257,7 @@ def test_sdo_writes_over_the_whole_dictionary() -> None:
     gate = TransmitGate(CONFIG)
     passed = set()
     for index in range(0x10000):
-        if 0x1600 <= index < 0x1800 or 0x1A00 <= index < 0x1C00 or (index % 7 and index >= 0x7000):
+        if 0x1600 <= index < 0x1800 or 0x1A00 <= index < 0x1C00 or (index % 31 and index >= 0x7000):
             continue  # mappings, which are open; and most of what no profile of ours defines
         for subindex in (0, 1, 3):
             frame = sdo_write(index, subindex, 1, 1)
@@ -346,14 +351,14 @@ def clamp16(value: int) -> int:
     return max(-32768, min(32767, value))
 
 
-@settings(max_examples=250, deadline=None)
+@settings(max_examples=150, deadline=None)
 @given(traffic())
 def test_random_traffic_never_moves_the_combs_beyond_limits(
     actions: list[tuple[str, int, int, tuple[int, ...]]],
 ) -> None:
     """Whatever is asked: at the combs no step beyond slew (but to 0 V), no voltage beyond range or in a wrong mode."""
     gate, combs = TransmitGate(CONFIG), Combs()
-    t_us, counter, wanted = 0, 0, (0, 0, 0)
+    t_us, counter = 0, 0
     passed = 0
 
     def send(frame: Frame, mode: int) -> None:
@@ -377,9 +382,8 @@ def test_random_traffic_never_moves_the_combs_beyond_limits(
             send(sync(), mode)
         if action in ("tick", "voltage", "bad crc", "jump"):
             near = tuple(clamp16(count + change) for count, change in zip(combs.counts, step, strict=True))
-            wanted = near if MAY_ENERGISE[mode] or action == "voltage" else (0, 0, 0)
+            a, b, c = near if MAY_ENERGISE[mode] or action == "voltage" else (0, 0, 0)
             counter += 2 if action == "jump" else 1
-            a, b, c = wanted
             frame = drive(a, b, c, counter)
             send(spoilt_by((63,), frame) if action == "bad crc" else frame, mode)
         elif action == "zero":

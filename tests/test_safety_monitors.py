@@ -7,6 +7,7 @@ import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
+from numpy.typing import NDArray
 
 from pkxyz_ctrl.safety.modes import LOOP_CLOSED, NODE_EXPECTED, Mode
 from pkxyz_ctrl.safety.monitors import (
@@ -27,7 +28,7 @@ COUNTS = [name for name in LIMITS.names or () if name.endswith("_count")]
 class Bench:
     """A memory, its limits, and healthy ticks in which a test changes single fields."""
 
-    def __init__(self, mode: Mode = Mode.TRACKING, limits: np.ndarray | None = None) -> None:
+    def __init__(self, mode: Mode = Mode.TRACKING, limits: NDArray[np.void] | None = None) -> None:
         self.limits = default_limits() if limits is None else limits
         self.memory = np.zeros(1, MONITOR_MEMORY)
         self.mode = mode
@@ -49,7 +50,7 @@ class Bench:
         return Trip(check(self.limits[0], self.memory[0], obs[0]))
 
 
-def only(count_name: str, count: int) -> np.ndarray:
+def only(count_name: str, count: int) -> NDArray[np.void]:
     """Limits with one monitor on."""
     limits = default_limits()
     for name in COUNTS:

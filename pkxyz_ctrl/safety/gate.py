@@ -238,7 +238,6 @@ class TransmitGate:
             if not (0 <= a <= maximum and 0 <= b <= maximum and 0 <= c <= maximum):
                 return f"drive counts {a}, {b}, {c} are not all in 0..{maximum}"
             if not self._known or self._syncs >= self._drive_timeout_syncs:
-                self._known = False
                 return "what the combs hold is unknown (start, NMT command or pause): a frame with 0 V must come first"
             if self._syncs == 0:
                 return "a second drive PDO in one tick: no SYNC went out since the one before"
