@@ -26,19 +26,25 @@ def crc8h2f(data: bytes) -> int:
     return register ^ 0xFF
 
 
-def word_tables(cob_id: int) -> tuple[bytes, bytes, bytes, bytes]:
-    """Tables whose XOR is the CRC of a payload of three 16-bit words and one byte, sent under ``cob_id``.
-
-    The CRC is affine over GF(2), so each word contributes by itself: ``w0[a] ^ w1[b] ^ w2[c] ^ w3[n]``. The first three
-    have 65536 entries, so a negative count, used as a Python index from the end, finds its two's complement. The last
-    (256 entries) holds the constant part: initial value, COB-ID, final XOR.
-    """
-    constant = crc8h2f(cob_id.to_bytes(2, "little") + bytes(7))
+def _word_tables() -> tuple[bytes, bytes, bytes]:
     step = np.frombuffer(STEP, np.uint8)
     after = [step]  # after[k][byte]: what is left of a byte, k bytes further on
     for _ in range(6):
         after.append(step[after[-1]])
     word = np.arange(65536)
-    words = (after[6 - 2 * i][word & 0xFF] ^ after[5 - 2 * i][word >> 8] for i in range(3))
-    w0, w1, w2 = (table.tobytes() for table in words)
-    return w0, w1, w2, (step ^ np.uint8(constant)).tobytes()
+    w0, w1, w2 = (after[6 - 2 * i][word & 0xFF] ^ after[5 - 2 * i][word >> 8] for i in range(3))
+    return w0.tobytes(), w1.tobytes(), w2.tobytes()
+
+
+WORDS = _word_tables()
+
+
+def last_byte_table(cob_id: int) -> bytes:
+    """Table w3 such that ``w0[a] ^ w1[b] ^ w2[c] ^ w3[n]`` with w0, w1, w2 = `WORDS` is the CRC of (a, b, c, n).
+
+    The payload is three 16-bit words and one byte, sent under ``cob_id``. The CRC is affine over GF(2), so each word
+    contributes by itself; w3 also holds the constant part: initial value, COB-ID, final XOR. The tables of `WORDS` have
+    65536 entries, so a negative count, used as a Python index from the end, finds its two's complement.
+    """
+    constant = crc8h2f(cob_id.to_bytes(2, "little") + bytes(7))
+    return bytes(step ^ constant for step in STEP)

@@ -3,7 +3,7 @@
 import struct
 from collections.abc import Callable
 
-from hil.node_crc import crc8h2f, word_tables
+from hil.node_crc import WORDS, crc8h2f, last_byte_table
 from hil.node_emergency import ErrorCode, FrameErrors
 from hil.node_pdo import Layout, PdoParameters
 from hil.object_dictionary import ObjectDictionary
@@ -27,6 +27,7 @@ class DriveReceiver:
     ) -> None:
         self._parameters = parameters
         self._errors = errors
+        self._w0, self._w1, self._w2 = WORDS
         self._outputs = outputs
         self._od = od
         self.pending: Counts | None = None
@@ -41,7 +42,7 @@ class DriveReceiver:
         self._layout: Layout = self._parameters.layout()
         self.receive = self._receive_mapped
         if self._layout.fields == self._parameters.protected_fields:
-            self._w0, self._w1, self._w2, self._w3 = word_tables(self._parameters.cob_id)
+            self._w3 = last_byte_table(self._parameters.cob_id)
             self.receive = self._receive_protected
 
     def start(self) -> None:

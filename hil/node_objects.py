@@ -9,8 +9,8 @@ from hil.object_dictionary import Abort, Entry, ObjectDictionary, SdoAbortError
 class NodeObjects:
     """Stands between the SDO server and the dictionary.
 
-    ``refresh(index)`` is called before a value is touched, ``changed(index)`` after one was written; ``may_drive()`` tells
-    whether a drive count other than 0 may be set by SDO.
+    ``refresh(index)`` is called before a value is touched, ``changed(index)`` after one was written; ``may_drive()``
+    tells whether a drive count other than 0 may be set by SDO.
     """
 
     def __init__(

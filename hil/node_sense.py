@@ -5,7 +5,7 @@ from collections.abc import Callable
 from typing import Protocol
 
 from hil.alarm import Alarm, Clock
-from hil.node_crc import crc8h2f, word_tables
+from hil.node_crc import WORDS, crc8h2f, last_byte_table
 from hil.node_heartbeat import HeartbeatProducer
 from hil.node_pdo import PdoParameters
 from hil.object_dictionary import ObjectDictionary
@@ -49,6 +49,7 @@ class SenseTransmitter:
         self._plant = plant
         self._send = send
         self._heartbeat = heartbeat
+        self._w0, self._w1, self._w2 = WORDS
         self._turnaround_us = turnaround_us
         self._event = Alarm(clock, self._on_event)
         self._running = False
@@ -68,7 +69,7 @@ class SenseTransmitter:
         self._layout = parameters.layout()
         self._is_default = self._layout.fields == parameters.protected_fields
         if self._is_default:
-            self._w0, self._w1, self._w2, self._w3 = word_tables(self._cob_id)
+            self._w3 = last_byte_table(self._cob_id)
         kind = parameters.transmission_type
         self._on_change = kind == 0
         self._every = max(1, kind) if parameters.in_use and kind <= 240 else 0

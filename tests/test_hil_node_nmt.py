@@ -1,6 +1,7 @@
 """NMT, boot-up, heartbeats both ways and emergencies of the amplifier node."""
 
 from collections.abc import Callable
+from itertools import pairwise
 
 import pytest
 from hypothesis import given, settings
@@ -212,11 +213,11 @@ def test_heartbeat_rides_behind_the_sense_pdo_and_is_never_late(period_us: int, 
     for _ in range(2 + 40_000 // period_us):
         rig.cycle(period_us=period_us)
     beats = rig.times(HEARTBEAT)
-    assert all(b - a <= 1000 * producer_ms for a, b in zip(beats, beats[1:], strict=False))
+    assert all(b - a <= 1000 * producer_ms for a, b in pairwise(beats))
     assert len(beats) >= 40 // producer_ms
     if period_us <= 1000 * producer_ms:
         assert set(beats) <= set(rig.times(SENSE))
-        assert min(b - a for a, b in zip(beats, beats[1:], strict=False)) >= 1000 * producer_ms - period_us
+        assert min(b - a for a, b in pairwise(beats)) >= 1000 * producer_ms - period_us
         order = [frame.can_id for t_us, frame in rig.sent if t_us == beats[0]]
         assert order == [SENSE, HEARTBEAT]
 
@@ -265,7 +266,7 @@ def test_controller_lost(behaviour: int, state: NmtState) -> None:
     rig.run(1000 * CONSUMER_MS - 1)
     assert (rig.sent, rig.plant.driven, rig.node.outputs) == ([], [], (100, 200, 300))
     rig.run(1)
-    assert {entry for entry in rig.plant.driven} == {(t_us + 1000 * CONSUMER_MS, (0, 0, 0))}
+    assert set(rig.plant.driven) == {(t_us + 1000 * CONSUMER_MS, (0, 0, 0))}
     assert rig.sent == [(rig.now_us, Frame(EMCY, bytes.fromhex("3081110000000000")))]
     assert rig.node.state is state
     rig.start()

@@ -93,7 +93,9 @@ def test_every_writable_object_takes_a_value_and_keeps_it() -> None:
     assert writable == set(NEW_VALUES) | set(PDO_OFF_VALUES)
     _, node = master(Rig())
     for (index, subindex), value in (NEW_VALUES | PDO_OFF_VALUES).items():
-        record = node.sdo[index] if isinstance(node.sdo[index], canopen.sdo.base.SdoVariable) else node.sdo[index][subindex]
+        record = (
+            node.sdo[index] if isinstance(node.sdo[index], canopen.sdo.base.SdoVariable) else node.sdo[index][subindex]
+        )
         record.raw = value
         assert record.raw == value, f"{index:04X} sub {subindex}"
 
