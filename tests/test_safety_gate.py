@@ -177,7 +177,16 @@ def test_voltage_needs_a_zero_first_at_the_start_and_after_nmt() -> None:
     assert passes(gate, nmt(0x81), T, Mode.BOOT)
     assert not passes(gate, drive(1, 1, 1, 0), 2 * T)
     gate.clear()
-    assert passes(gate, drive(0, 0, 0, 200), 3 * T)  # after a reset any counter may come
+
+
+@pytest.mark.parametrize("command", [0x81, 0x82])
+@pytest.mark.parametrize("counter", [0, 200, 255])
+def test_after_a_reset_any_counter_may_come(command: int, counter: int) -> None:
+    gate = holding((900, 900, 900))
+    assert passes(gate, nmt(command), T, Mode.BOOT)
+    assert passes(gate, drive(0, 0, 0, counter), T)
+    assert passes(gate, sync(), 2 * T)
+    assert passes(gate, drive(1, 1, 1, counter + 1), 2 * T)
 
 
 @pytest.mark.parametrize("syncs", range(1, 9))

@@ -94,10 +94,9 @@ class GateSweep:
         for can_id, name in {*self.permitted, *ALWAYS, *DRIVE}:
             payload = PAYLOADS[name]
             spoilt = [Frame(can_id, payload + b"\x00", True, True), Frame(can_id, payload[:-1])]
-            spoilt += [
-                Frame(can_id, payload)._replace(**{flag: True}) for flag in ("is_remote", "is_extended", "is_error")
-            ]
-            spoilt += [Frame(can_id, payload, False, True)]
+            plain = Frame(can_id, payload)
+            spoilt += [plain._replace(is_remote=True), plain._replace(is_extended=True), plain._replace(is_error=True)]
+            spoilt += [plain._replace(bitrate_switch=True)]  # which only FD frames have
             for frame in spoilt:
                 assert gate.check(frame, self.mode, 10_000) is not None, frame
                 self.forget(gate)

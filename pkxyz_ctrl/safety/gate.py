@@ -246,7 +246,7 @@ class TransmitGate:
                 return f"drive counts {a}, {b}, {c} after {was_a}, {was_b}, {was_c}: a step beyond {slew}"
             if t_us - self._time_us < self._spacing_us:
                 return self._too_soon(t_us)
-            if protected and counter != self._counter_next and self._counter >= 0:
+            if protected and counter != self._counter_next:
                 return f"drive PDO has alive counter {counter} instead of {self._counter_next}"
             known = True
         if protected:
