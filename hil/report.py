@@ -1,0 +1,296 @@
+"""The picture of a run: where the stage was, how far from where it should be, and what that took."""
+
+from collections.abc import Iterable, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from matplotlib.axes import Axes
+from matplotlib.backends.backend_agg import FigureCanvasAgg
+from matplotlib.cm import ScalarMappable
+from matplotlib.colors import Normalize
+from matplotlib.figure import Figure
+from mpl_toolkits.mplot3d.art3d import Line3DCollection
+from numpy.typing import NDArray
+
+from hil.bus_trace import BusTrace, read_bus_trace
+from hil.recording import Recording
+
+Array = NDArray[np.float64]
+
+# Okabe and Ito's palette, told apart with any colour vision
+AXIS_COLOURS = ("#0072B2", "#D55E00", "#009E73")
+COMB_COLOURS = ("#56B4E9", "#E69F00", "#CC79A7")
+_INK, _FAINT, _WASH = "#2b2b2b", "#9a9a9a", "#eef1f4"
+_ENVELOPES = 2500  # more points than the picture has pixels across
+_PATH_POINTS = 6000
+_RC = {"size": 10, "family": "DejaVu Sans"}
+
+
+@dataclass
+class Signals:
+    """What is drawn: an envelope of each signal over time, and the path of the scan. n instants, each with its extremes."""
+
+    t_s: Array
+    """(n,)"""
+    low: dict[str, Array]
+    """by field of the recording, or ``error_nm``: (n, 3)"""
+    high: dict[str, Array]
+    path_um: Array
+    """(m, 3), true position while scanning"""
+    path_error_nm: Array
+    """(m,), distance from the reference"""
+
+
+def read_signals(recording: Recording) -> Signals:
+    """Envelopes of a recording of any length, block by block."""
+    fields = ("reference_m", "position_m", "comb_voltage_v")
+    every = max(1, -(-recording.ticks // _ENVELOPES))
+    count = -(-recording.ticks // every)
+    names = (*fields, "error_nm")
+    low = {name: np.full((count, 3), np.inf) for name in names}
+    high = {name: np.full((count, 3), -np.inf) for name in names}
+    windows = [s["scan_us"] for s in recording.metadata["segments"] if s.get("scan_us")]
+    period_us = recording.metadata["period_us"]
+    scan_ticks = sum(end - begin for begin, end in windows) // period_us
+    stride = max(1, scan_ticks // _PATH_POINTS)
+    path, path_error = [np.empty((0, 3))], [np.empty(0)]
+    first = 0
+    for block in recording.blocks((*fields, "reference_tick")):
+        block["error_nm"] = (block["position_m"] - block["reference_m"]) * 1e9
+        ticks = len(block["reference_tick"])
+        bins = (first + np.arange(ticks)) // every
+        starts = np.flatnonzero(np.diff(bins, prepend=-1))
+        for name in names:
+            at = bins[starts]
+            low[name][at] = np.minimum(low[name][at], np.minimum.reduceat(block[name], starts))
+            high[name][at] = np.maximum(high[name][at], np.maximum.reduceat(block[name], starts))
+        t_us = block["reference_tick"] * period_us
+        scanning = np.any([(t_us >= begin) & (t_us < end) for begin, end in windows] or [np.zeros(ticks, bool)], axis=0)
+        chosen = np.flatnonzero(scanning)[:: stride]
+        path.append(block["position_m"][chosen] * 1e6)
+        path_error.append(np.linalg.norm(block["error_nm"][chosen], axis=1))
+        first += ticks
+    t_s = np.arange(count) * every * period_us * 1e-6
+    return Signals(t_s, low, high, np.concatenate(path), np.concatenate(path_error))
+
+
+def draw_report(recording_path: str | Path, frame_log: str | Path | None, summary: dict[str, Any], out: str | Path) -> None:
+    """Draw the recording, the frame log if there is one and the summary's figures to a PNG of 1600 pixels across."""
+    recording = Recording.open(recording_path)
+    signals = read_signals(recording)
+    bus = _bus_trace(frame_log, recording.metadata)
+    figure = Figure(figsize=(16, 10.6), dpi=100, facecolor="white")
+    FigureCanvasAgg(figure)
+    grid = figure.add_gridspec(
+        6, 2, width_ratios=(1.62, 1), height_ratios=(1, 1, 1, 1.55, 1.15, 0.85),
+        left=0.055, right=0.965, top=0.885, bottom=0.055, hspace=0.16, wspace=0.1,
+    )  # fmt: skip
+    time_axes = [figure.add_subplot(grid[row, 0]) for row in range(6)]
+    begin_s = _tracking_begin_s(recording)
+    for axis, plot in enumerate(time_axes[:3]):
+        _draw_position(plot, signals, axis)
+    _draw_errors(time_axes[3], signals, _measured_windows(recording, begin_s), summary)
+    _draw_voltages(time_axes[4], signals)
+    _draw_bus(time_axes[5], bus, summary)
+    _dress_time_axes(time_axes, signals.t_s, recording, begin_s)
+    _draw_path(figure, grid[0:4, 1], signals)
+    _draw_figures(figure.add_subplot(grid[4:6, 1]), summary)
+    _draw_title(figure, summary)
+    figure.savefig(out)
+
+
+def _draw_position(plot: Axes, signals: Signals, axis: int) -> None:
+    for field, colour, width, label in (
+        ("reference_m", "#b8b8b8", 3.2, "reference"),
+        ("position_m", AXIS_COLOURS[axis], 1.0, "true position"),
+    ):
+        _plot_envelope(plot, signals.t_s, signals.low[field][:, axis] * 1e6, signals.high[field][:, axis] * 1e6, colour, width, label)
+    plot.set_ylabel(f"{'xyz'[axis]}  (µm)")
+    plot.margins(y=0.12)
+    if axis == 0:
+        plot.legend(loc="upper left", ncols=2, frameon=False, fontsize=9, handlelength=1.6)
+
+
+def _draw_errors(plot: Axes, signals: Signals, windows: Sequence[tuple[float, float]], summary: dict[str, Any]) -> None:
+    rms = summary.get("rms_error_nm") or {}
+    for axis, name in enumerate("xyz"):
+        label = f"{name}: {rms[name]:.2f} nm rms" if name in rms else name
+        low, high = signals.low["error_nm"][:, axis], signals.high["error_nm"][:, axis]
+        _plot_envelope(plot, signals.t_s, low, high, AXIS_COLOURS[axis], 0.6, label, alpha=0.85)
+    inside = np.any([(signals.t_s >= a) & (signals.t_s < b) for a, b in windows] or [np.ones(len(signals.t_s), bool)], axis=0)
+    extremes = np.abs(np.concatenate([signals.low["error_nm"][inside], signals.high["error_nm"][inside]]))
+    limit = 1.45 * (extremes.max() if extremes.size and np.isfinite(extremes).all() and extremes.max() > 0 else 1.0)
+    plot.set_ylim(-limit, limit)
+    plot.axhline(0, color=_INK, linewidth=0.6)
+    plot.set_ylabel("error  (nm)")
+    legend = plot.legend(loc="upper left", ncols=3, frameon=False, fontsize=9, handlelength=1.2)
+    for line in legend.get_lines():
+        line.set_linewidth(2.5)
+
+
+def _draw_voltages(plot: Axes, signals: Signals) -> None:
+    for comb in range(3):
+        low, high = signals.low["comb_voltage_v"][:, comb], signals.high["comb_voltage_v"][:, comb]
+        _plot_envelope(plot, signals.t_s, low, high, COMB_COLOURS[comb], 0.9, f"comb {comb + 1}")
+    plot.set_ylabel("combs  (V)")
+    plot.margins(y=0.12)
+    legend = plot.legend(loc="lower right", ncols=3, frameon=False, fontsize=9, handlelength=1.2)
+    for line in legend.get_lines():
+        line.set_linewidth(2.5)
+
+
+def _draw_bus(plot: Axes, bus: BusTrace | None, summary: dict[str, Any]) -> None:
+    plot.set_ylabel("bus load  (%)")
+    plot.set_ylim(0, 100)
+    plot.set_yticks([0, 50, 100])
+    if bus is None:
+        words = "no bus in this lane" if summary.get("bus_load") is None else f"{summary['bus_load']:.1%} on average"
+        plot.text(0.5, 0.5, words, transform=plot.transAxes, ha="center", va="center", color=_FAINT)
+        return
+    plot.fill_between(bus.t_s, 0, bus.load * 100, color="#c9d3dc", linewidth=0, step="mid")
+    plot.step(bus.t_s, bus.load * 100, where="mid", color="#51626f", linewidth=0.9)
+
+
+def _dress_time_axes(plots: Sequence[Axes], t_s: Array, recording: Recording, begin_s: float | None) -> None:
+    for plot in plots:
+        plot.set_xlim(float(t_s[0]), float(t_s[-1]) if len(t_s) > 1 else 1.0)
+        plot.tick_params(labelbottom=plot is plots[-1], labelsize=9, color=_FAINT)
+        plot.spines[["top", "right"]].set_visible(False)
+        plot.spines[["left", "bottom"]].set_color(_FAINT)
+        plot.grid(axis="y", color="#e4e4e4", linewidth=0.6)
+        plot.set_axisbelow(True)
+        plot.yaxis.set_label_coords(-0.062, 0.5)
+    plots[-1].set_xlabel("stage time  (s)")
+    if begin_s is None:
+        return
+    for segment in recording.metadata["segments"]:
+        window = segment.get("scan_us") or segment.get("still_us")
+        if window is None:
+            continue
+        a, b = (begin_s + t * 1e-6 for t in window)
+        for plot in plots:
+            plot.axvspan(a, b, color=_WASH, linewidth=0, zorder=0)
+        if (b - a) > 0.03 * float(t_s[-1]):
+            words = "scan" if segment.get("scan_us") else "hold noise"
+            plots[0].annotate(
+                words, ((a + b) / 2, 1.0), xycoords=("data", "axes fraction"), xytext=(0, 3),
+                textcoords="offset points", ha="center", fontsize=9, color="#6b7780",
+            )  # fmt: skip
+
+
+def _draw_path(figure: Figure, place: Any, signals: Signals) -> None:
+    plot = figure.add_subplot(place, projection="3d", computed_zorder=False)
+    points = signals.path_um
+    if len(points) < 2:
+        plot.set_axis_off()
+        plot.text2D(0.5, 0.5, "nothing was scanned", transform=plot.transAxes, ha="center", color=_FAINT)
+        return
+    top = float(np.percentile(signals.path_error_nm, 99.5)) or 1.0
+    scale = ScalarMappable(Normalize(0.0, top), "viridis")
+    steps = np.stack([points[:-1], points[1:]], axis=1)
+    plot.add_collection3d(Line3DCollection(steps, colors=scale.to_rgba(signals.path_error_nm[1:]), linewidths=1.3))
+    middle = (points.max(axis=0) + points.min(axis=0)) / 2
+    span = np.maximum(np.ptp(points, axis=0), 0.25 * np.ptp(points, axis=0).max())
+    for axis, name in enumerate("xyz"):
+        getattr(plot, f"set_{name}lim")(middle[axis] - 0.54 * span[axis], middle[axis] + 0.54 * span[axis])
+        getattr(plot, f"{name}axis").pane.set_facecolor("#fafafa")
+        getattr(plot, f"{name}axis").pane.set_edgecolor("#d9d9d9")
+        plot.tick_params(axis=name, labelsize=8, pad=1, color=_FAINT)
+        plot.locator_params(axis=name, nbins=5)
+    plot.grid(False)
+    plot.set_box_aspect(tuple(np.maximum(span / span.max(), 0.42)), zoom=0.98)
+    plot.view_init(elev=24, azim=-58)
+    plot.set_xlabel("x  (µm)", labelpad=4)
+    plot.set_ylabel("y  (µm)", labelpad=4)
+    plot.set_zlabel("z  (µm)", labelpad=3)
+    plot.set_title("true path of the scan", fontsize=11, color=_INK, y=0.985)
+    bar = figure.colorbar(scale, ax=plot, shrink=0.5, aspect=28, pad=0.09, extend="max")
+    bar.set_label("distance from the reference  (nm)", fontsize=9)
+    bar.ax.tick_params(labelsize=8, color=_FAINT)
+    bar.outline.set_visible(False)
+
+
+def _draw_figures(plot: Axes, summary: dict[str, Any]) -> None:
+    """The checks as a table: name, value, bound, verdict in words and colour."""
+    plot.set_axis_off()
+    checks = summary.get("checks") or []
+    plot.set_xlim(0, 1)
+    plot.set_ylim(-max(8.0, len(checks) + 1.6), 0.4)
+    columns = ((0.02, "left"), (0.54, "right"), (0.78, "right"), (0.98, "right"))
+    for (x, side), words in zip(columns, ("check", "value", "bound", ""), strict=True):
+        plot.text(x, 0, words, ha=side, va="center", fontsize=9, color="#6b7780")
+    plot.axhline(-0.55, xmin=0.01, xmax=0.99, color="#c8c8c8", linewidth=0.8)
+    for row, check in enumerate(checks, start=1):
+        ok = check["ok"]
+        words, colour = {True: ("holds", "#1b7f5c"), False: ("fails", "#b3371a"), None: ("no bus", _FAINT)}[ok]
+        value = "none" if check["value"] is None else f"{check['value']:.4g}"
+        for (x, side), text in zip(columns, (check["name"], value, bound_words(check), words), strict=True):
+            plot.text(
+                x, -row, text, ha=side, va="center", fontsize=10.5, color=colour if text is words else _INK,
+                fontweight="bold" if text is words and ok is False else "normal",
+            )  # fmt: skip
+
+
+def bound_words(check: dict[str, Any]) -> str:
+    """The bound of a check as people write it."""
+    low, high = check.get("min"), check.get("max")
+    if low is None:
+        return f"≤ {high:g}"
+    return f"≥ {low:g}" if high is None else f"{low:g} to {high:g}"
+
+
+def _draw_title(figure: Figure, summary: dict[str, Any]) -> None:
+    heading = f"{summary['scenario']}   ·   {summary['lane']} lane   ·   seed {summary['seed']}"
+    figure.text(0.055, 0.962, heading, fontsize=17, color=_INK, fontweight="bold", va="center")
+    rate = f"{1e6 / summary['period_us']:,.0f} ticks/s".replace(",", " ")
+    parts = [f"stage {summary['stage']}", f"plant {summary['plant']}", f"law {summary['controller']}", f"bus {summary['bus']}", rate]
+    for name, words in (("rms_error_nm", "rms error"), ("hold_noise_nm", "hold noise")):
+        if summary.get(name):
+            parts.append(f"{words} " + " / ".join(f"{v:.2f}" for v in summary[name].values()) + " nm")
+    if summary.get("bus_load") is not None:
+        parts.append(f"bus load {summary['bus_load']:.0%}")
+    figure.text(0.055, 0.927, "   ·   ".join(parts), fontsize=10.5, color="#55606a", va="center")
+    verdict, colour = ("all checks hold", "#1b7f5c") if summary["ok"] else ("checks fail", "#b3371a")
+    if summary.get("interrupted"):
+        verdict, colour = "interrupted", "#b3371a"
+    elif summary["faults"]:
+        verdict, colour = "fault", "#b3371a"
+    figure.text(0.965, 0.962, verdict, fontsize=13, color=colour, ha="right", va="center", fontweight="bold")
+
+
+def _plot_envelope(
+    plot: Axes, t_s: Array, low: Array, high: Array, colour: str, width: float, label: str, alpha: float = 1.0
+) -> None:
+    """Low and high of each instant as one line; where they are equal it is the plain signal."""
+    if np.array_equal(low, high):
+        plot.plot(t_s, low, color=colour, linewidth=width, label=label, alpha=alpha)
+    else:
+        plot.plot(np.repeat(t_s, 2), np.column_stack([low, high]).ravel(), color=colour, linewidth=width, label=label, alpha=alpha)
+
+
+def _tracking_begin_s(recording: Recording) -> float | None:
+    """Stage time at which the reference starts."""
+    first = 0
+    for block in recording.blocks(("reference_tick",)):
+        tracking = np.flatnonzero(block["reference_tick"] >= 0)
+        if len(tracking):
+            at = int(tracking[0])
+            return (first + at - int(block["reference_tick"][at])) * recording.metadata["period_us"] * 1e-6
+        first += len(block["reference_tick"])
+    return None
+
+
+def _measured_windows(recording: Recording, begin_s: float | None) -> list[tuple[float, float]]:
+    if begin_s is None:
+        return []
+    windows: Iterable[Any] = (s.get(key) for s in recording.metadata["segments"] for key in ("scan_us", "still_us"))
+    return [(begin_s + w[0] * 1e-6, begin_s + w[1] * 1e-6) for w in windows if w]
+
+
+def _bus_trace(frame_log: str | Path | None, metadata: dict[str, Any]) -> BusTrace | None:
+    can = metadata["config"]["bus"].get("can")
+    if frame_log is None or can is None or not Path(frame_log).is_file():
+        return None
+    return read_bus_trace(frame_log, can)

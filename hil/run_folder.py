@@ -1,0 +1,113 @@
+"""The folder that a run leaves: recording, frame log, configuration, summary and picture."""
+
+import importlib.metadata
+import json
+import platform
+import sys
+from pathlib import Path
+from typing import Any
+
+from hil.metrics import evaluate
+from hil.scenario import Scenario, resolve
+from pkxyz_ctrl.config import ConfigError, write_toml
+
+RECORDING, FRAMES, CONFIG, SUMMARY, PICTURE = "recording.parquet", "frames.log", "config.toml", "summary.json", "report.png"
+_OURS = {RECORDING, FRAMES, CONFIG, SUMMARY, PICTURE, RECORDING + ".journal", RECORDING + ".part"}
+
+
+class RunFolder:
+    """A folder of one run, made anew: an earlier run in it is replaced, anything else is left alone and refused."""
+
+    def __init__(self, path: Path) -> None:
+        """Raises ``ConfigError`` if the folder can't be had or holds what is not a run."""
+        self.path = path
+        try:
+            path.mkdir(parents=True, exist_ok=True)
+            present = {item.name for item in path.iterdir()}
+        except OSError as error:
+            raise ConfigError(f"--out: {path}: {(error.strerror or str(error)).lower()}; give a folder that can be written") from None
+        if present - _OURS or (present and CONFIG not in present):
+            raise ConfigError(f"--out: {path}: holds files that are not a run's; give an empty or a new folder")
+        try:
+            for name in present:
+                (path / name).unlink()
+        except OSError as error:
+            raise ConfigError(f"--out: {path}: {(error.strerror or str(error)).lower()}; give another folder") from None
+        self.recording = path / RECORDING
+        self.frames = path / FRAMES
+        self.config = path / CONFIG
+        self.summary = path / SUMMARY
+        self.picture = path / PICTURE
+
+    def write_config(self, scenario: Scenario) -> dict[str, Any]:
+        """Write everything that decides about the run, and return it; the file alone repeats the run."""
+        resolved = resolve(scenario)
+        try:
+            write_toml(resolved, self.config)
+        except OSError as error:
+            raise ConfigError(f"{self.config}: {(error.strerror or str(error)).lower()}; give another --out") from None
+        return resolved
+
+    def write_summary(self, summary: dict[str, Any]) -> None:
+        """Write the summary."""
+        self.summary.write_text(json.dumps(summary, indent=2, allow_nan=False) + "\n", encoding="utf-8")
+
+
+def next_free(runs: Path, scenario: str, lane: str) -> Path:
+    """``runs/<scenario>-<lane>-<n>`` with the lowest n above those that exist."""
+    stem = f"{scenario}-{lane}-"
+    taken = [int(p.name[len(stem) :]) for p in runs.glob(f"{stem}*") if p.name[len(stem) :].isdigit()]
+    return runs / f"{stem}{max(taken, default=0) + 1}"
+
+
+def metadata_of(scenario: Scenario, lane: str, resolved: dict[str, Any]) -> dict[str, Any]:
+    """What a recording carries with its rows."""
+    return {
+        "scenario": scenario.config.name,
+        "lane": lane,
+        "seed": scenario.config.seed,
+        "digest": resolved["digest"],
+        "period_us": scenario.bus.period_us,
+        "segments": [
+            {"kind": s.kind, "t_start_us": s.t_start_us, "t_end_us": s.t_end_us, "scan_us": s.scan_us, "still_us": s.still_us}
+            for s in scenario.trajectory.segments
+        ],
+        "versions": versions(),
+        "config": resolved,
+    }
+
+
+def summarise(
+    scenario: Scenario, lane: str, digest: str, figures: dict[str, Any], *, interrupted: bool, picture: bool
+) -> dict[str, Any]:
+    """The summary: who ran, the figures, the verdicts on the checks, and ``ok``, which is false for an interrupted run."""
+    summary: dict[str, Any] = {
+        "scenario": scenario.config.name,
+        "lane": lane,
+        "seed": scenario.config.seed,
+        "digest": digest,
+        "stage": scenario.stage.name,
+        "plant": scenario.plant.name,
+        "controller": scenario.controller.name,
+        "bus": scenario.bus.name,
+        "period_us": scenario.bus.period_us,
+        "duration_s": scenario.config.duration_s,
+        "interrupted": interrupted,
+        **figures,
+    }
+    checks = evaluate(scenario.config.checks, summary)
+    summary["checks"] = checks
+    summary["ok"] = not interrupted and all(check["ok"] is not False for check in checks)
+    summary["versions"] = versions()
+    return summary
+
+
+def versions() -> dict[str, str]:
+    """Versions of what computes the numbers of a run."""
+    found = {"python": platform.python_version(), "platform": sys.platform}
+    for package in ("pkxyz-ctrl", "numpy", "numba", "scipy"):
+        try:
+            found[package] = importlib.metadata.version(package)
+        except importlib.metadata.PackageNotFoundError:
+            found[package] = "not installed"
+    return found
