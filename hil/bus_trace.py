@@ -23,8 +23,9 @@ class BusTrace(NamedTuple):
 
 
 def read_bus_trace(frame_log: str | Path, can: dict[str, Any]) -> BusTrace | None:
-    """Load over the time of a candump log; None if it holds too few frames. ``can``: the plain ``CanConfig`` of the bus."""
-    rates = can["nominal_bitrate_bit_per_s"], can.get("data_bitrate_bit_per_s") or can["nominal_bitrate_bit_per_s"]
+    """Load over the time of a candump log; None if it holds too few frames. ``can``: the bus's plain ``CanConfig``."""
+    nominal = can["nominal_bitrate_bit_per_s"]
+    rates = nominal, can.get("data_bitrate_bit_per_s") or nominal
     size = Path(frame_log).stat().st_size
     step = math.ceil(size / _BINS)
     times, loads = [], []

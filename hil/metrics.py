@@ -121,8 +121,8 @@ class Metrics:
 def evaluate(checks: Mapping[str, _HasBounds], summary: Mapping[str, Any]) -> list[dict[str, Any]]:
     """The verdict on each check: name, value, min and max where bounded, ok.
 
-    The value of a metric of three axes is that of the worst one. Without a value a check is not met, save that of the bus
-    load where there is no bus: there ``ok`` is None.
+    The value of a metric of three axes is that of the worst one. Without a value a check is not met, save that of the
+    bus load where there is no bus: there ``ok`` is None.
     """
     verdicts = []
     for name, bound in checks.items():

@@ -1,9 +1,9 @@
 """The recording of a run: one row a tick, streamed to disk, Parquet in the end.
 
-While a run lasts its rows go to a journal beside the file (``recording.parquet.journal``, an Arrow stream): that costs the
-loop half a microsecond a tick, and whatever kills the program, every batch written before stays readable. ``close`` turns
-the journal into Parquet, which could not be read without the footer that comes last, and removes it. ``Recording.open``
-reads either, so a recording whose program was killed opens like any other.
+While a run lasts its rows go to a journal beside the file (``recording.parquet.journal``, an Arrow stream): that costs
+the loop half a microsecond a tick, and whatever kills the program, every batch written before stays readable. ``close``
+turns the journal into Parquet, which could not be read without the footer that comes last, and removes it.
+``Recording.open`` reads either, so a recording whose program was killed opens like any other.
 """
 
 import json
@@ -41,7 +41,7 @@ class RecordingWriter:
     """Writes blocks of ``ROW``; a context manager, which closes the file whatever ends the run."""
 
     def __init__(self, path: str | Path, metadata: dict[str, Any]) -> None:
-        """``metadata``: plain data that travels in the file. An existing recording is replaced. Raises ``RecordingError``."""
+        """``metadata``: plain data that goes along. Replaces an existing recording. Raises ``RecordingError``."""
         self.path = Path(path)
         self.ticks = 0
         self._schema = _schema(metadata)
@@ -109,11 +109,11 @@ class RecordingWriter:
 
 
 def recover(path: str | Path) -> None:
-    """Turn what the journal of ``path`` holds, complete or cut off anywhere, into Parquet. Raises ``RecordingError``."""
+    """Turn what the journal of ``path`` holds, whole or cut off anywhere, into Parquet. Raises ``RecordingError``."""
     path, journal = Path(path), journal_of(path)
     part = path.with_name(path.name + ".part")
     try:
-        with _journal_batches(journal) as (schema, batches), pq.ParquetWriter(
+        with _JournalBatches(journal) as (schema, batches), pq.ParquetWriter(
             part, schema, compression="zstd", compression_level=1, use_dictionary=False
         ) as writer:  # fmt: skip
             for group in _grouped(batches):
@@ -130,9 +130,7 @@ def recover(path: str | Path) -> None:
 class Recording:
     """A finished recording, or the journal of one that was cut off. Columns are read when asked for."""
 
-    def __init__(
-        self, path: Path, metadata: dict[str, Any], file: pq.ParquetFile | None, table: pa.Table | None
-    ) -> None:
+    def __init__(self, path: Path, metadata: dict[str, Any], file: pq.ParquetFile | None, table: Any) -> None:
         self.path = path
         self.metadata = metadata
         self._file = file
@@ -147,7 +145,7 @@ class Recording:
             if path.is_file() or not journal_of(path).is_file():
                 file = pq.ParquetFile(path)
                 return cls(path, _metadata(file.schema_arrow, path), file, None)
-            with _journal_batches(journal_of(path)) as (schema, batches):
+            with _JournalBatches(journal_of(path)) as (schema, batches):
                 table = pa.Table.from_batches(list(batches), schema)
             return cls(path, _metadata(schema, path), None, table)
         except FileNotFoundError:
@@ -189,7 +187,7 @@ class Recording:
         return [table.column(name).to_numpy() for name in names]
 
 
-class _journal_batches:
+class _JournalBatches:
     """Opens a journal: its schema and its complete batches, up to where it was cut off."""
 
     def __init__(self, path: Path) -> None:

@@ -25,12 +25,11 @@ COMB_COLOURS = ("#56B4E9", "#E69F00", "#CC79A7")
 _INK, _FAINT, _WASH = "#2b2b2b", "#9a9a9a", "#eef1f4"
 _ENVELOPES = 2500  # more points than the picture has pixels across
 _PATH_POINTS = 6000
-_RC = {"size": 10, "family": "DejaVu Sans"}
 
 
 @dataclass
 class Signals:
-    """What is drawn: an envelope of each signal over time, and the path of the scan. n instants, each with its extremes."""
+    """What is drawn: the extremes of each signal at n instants, and the path of the scan."""
 
     t_s: Array
     """(n,)"""
@@ -68,7 +67,7 @@ def read_signals(recording: Recording) -> Signals:
             high[name][at] = np.maximum(high[name][at], np.maximum.reduceat(block[name], starts))
         t_us = block["reference_tick"] * period_us
         scanning = np.any([(t_us >= begin) & (t_us < end) for begin, end in windows] or [np.zeros(ticks, bool)], axis=0)
-        chosen = np.flatnonzero(scanning)[:: stride]
+        chosen = np.flatnonzero(scanning)[::stride]
         path.append(block["position_m"][chosen] * 1e6)
         path_error.append(np.linalg.norm(block["error_nm"][chosen], axis=1))
         first += ticks
@@ -76,58 +75,80 @@ def read_signals(recording: Recording) -> Signals:
     return Signals(t_s, low, high, np.concatenate(path), np.concatenate(path_error))
 
 
-def draw_report(recording_path: str | Path, frame_log: str | Path | None, summary: dict[str, Any], out: str | Path) -> None:
+def draw_report(
+    recording_path: str | Path, frame_log: str | Path | None, summary: dict[str, Any], out: str | Path
+) -> None:
     """Draw the recording, the frame log if there is one and the summary's figures to a PNG of 1600 pixels across."""
     recording = Recording.open(recording_path)
     signals = read_signals(recording)
     bus = _bus_trace(frame_log, recording.metadata)
-    figure = Figure(figsize=(16, 10.6), dpi=100, facecolor="white")
+    figure = Figure(figsize=(16, 11), dpi=100, facecolor="white")
     FigureCanvasAgg(figure)
     grid = figure.add_gridspec(
-        6, 2, width_ratios=(1.62, 1), height_ratios=(1, 1, 1, 1.55, 1.15, 0.85),
-        left=0.055, right=0.965, top=0.885, bottom=0.055, hspace=0.16, wspace=0.1,
+        8, 2, width_ratios=(1.5, 1), height_ratios=(1, 1, 1, 0.8, 0.8, 0.8, 1.1, 0.7),
+        left=0.058, right=0.97, top=0.888, bottom=0.052, hspace=0.18, wspace=0.07,
     )  # fmt: skip
-    time_axes = [figure.add_subplot(grid[row, 0]) for row in range(6)]
+    rows = [figure.add_subplot(grid[row, 0]) for row in range(8)]
     begin_s = _tracking_begin_s(recording)
-    for axis, plot in enumerate(time_axes[:3]):
-        _draw_position(plot, signals, axis)
-    _draw_errors(time_axes[3], signals, _measured_windows(recording, begin_s), summary)
-    _draw_voltages(time_axes[4], signals)
-    _draw_bus(time_axes[5], bus, summary)
-    _dress_time_axes(time_axes, signals.t_s, recording, begin_s)
-    _draw_path(figure, grid[0:4, 1], signals)
-    _draw_figures(figure.add_subplot(grid[4:6, 1]), summary)
+    error_limit_nm = _error_limit_nm(signals, _measured_windows(recording, begin_s))
+    for axis in range(3):
+        _draw_position(rows[axis], signals, axis)
+        _draw_error(rows[3 + axis], signals, axis, error_limit_nm, summary)
+    _draw_voltages(rows[6], signals)
+    _draw_bus(rows[7], bus, summary)
+    _dress_time_axes(rows, signals.t_s, recording, begin_s)
+    _draw_path(figure, signals)
+    _draw_figures(figure.add_subplot(grid[5:8, 1]), summary)
     _draw_title(figure, summary)
     figure.savefig(out)
 
 
 def _draw_position(plot: Axes, signals: Signals, axis: int) -> None:
     for field, colour, width, label in (
-        ("reference_m", "#b8b8b8", 3.2, "reference"),
+        ("reference_m", "#bdbdbd", 3.4, "reference"),
         ("position_m", AXIS_COLOURS[axis], 1.0, "true position"),
     ):
-        _plot_envelope(plot, signals.t_s, signals.low[field][:, axis] * 1e6, signals.high[field][:, axis] * 1e6, colour, width, label)
+        low, high = signals.low[field][:, axis] * 1e6, signals.high[field][:, axis] * 1e6
+        _plot_envelope(plot, signals.t_s, low, high, colour, width, label)
     plot.set_ylabel(f"{'xyz'[axis]}  (µm)")
-    plot.margins(y=0.12)
-    if axis == 0:
-        plot.legend(loc="upper left", ncols=2, frameon=False, fontsize=9, handlelength=1.6)
+    plot.margins(y=0.14)
+    if axis == 2:
+        plot.legend(loc="lower right", ncols=2, frameon=False, fontsize=9, handlelength=1.6)
 
 
-def _draw_errors(plot: Axes, signals: Signals, windows: Sequence[tuple[float, float]], summary: dict[str, Any]) -> None:
-    rms = summary.get("rms_error_nm") or {}
-    for axis, name in enumerate("xyz"):
-        label = f"{name}: {rms[name]:.2f} nm rms" if name in rms else name
-        low, high = signals.low["error_nm"][:, axis], signals.high["error_nm"][:, axis]
-        _plot_envelope(plot, signals.t_s, low, high, AXIS_COLOURS[axis], 0.6, label, alpha=0.85)
-    inside = np.any([(signals.t_s >= a) & (signals.t_s < b) for a, b in windows] or [np.ones(len(signals.t_s), bool)], axis=0)
+def _draw_error(plot: Axes, signals: Signals, axis: int, limit_nm: float, summary: dict[str, Any]) -> None:
+    low, high = signals.low["error_nm"][:, axis], signals.high["error_nm"][:, axis]
+    _plot_envelope(plot, signals.t_s, low, high, AXIS_COLOURS[axis], 0.6, "")
+    plot.set_ylim(-limit_nm, limit_nm)
+    plot.axhline(0, color=_INK, linewidth=0.5)
+    name = "xyz"[axis]
+    plot.set_ylabel(f"{name} error\n(nm)", linespacing=1.3)
+    words = [
+        f"{label} {summary[metric][name]:.2f} nm"
+        for metric, label in (("rms_error_nm", "scan rms"), ("max_error_nm", "max"), ("hold_noise_nm", "hold noise"))
+        if summary.get(metric)
+    ]
+    box = {"facecolor": "white", "alpha": 0.8, "edgecolor": "none", "pad": 1.5}
+    plot.text(
+        0.995,
+        0.97,
+        "   ".join(words),
+        transform=plot.transAxes,
+        ha="right",
+        va="top",
+        fontsize=8.5,
+        color=_INK,
+        bbox=box,
+    )
+
+
+def _error_limit_nm(signals: Signals, windows: Sequence[tuple[float, float]]) -> float:
+    """Half height of the error plots: what was measured fills two thirds; what came before may leave the picture."""
+    t_s = signals.t_s
+    inside = np.any([(t_s >= a) & (t_s < b) for a, b in windows], axis=0) if windows else np.ones(len(t_s), bool)
     extremes = np.abs(np.concatenate([signals.low["error_nm"][inside], signals.high["error_nm"][inside]]))
-    limit = 1.45 * (extremes.max() if extremes.size and np.isfinite(extremes).all() and extremes.max() > 0 else 1.0)
-    plot.set_ylim(-limit, limit)
-    plot.axhline(0, color=_INK, linewidth=0.6)
-    plot.set_ylabel("error  (nm)")
-    legend = plot.legend(loc="upper left", ncols=3, frameon=False, fontsize=9, handlelength=1.2)
-    for line in legend.get_lines():
-        line.set_linewidth(2.5)
+    largest = float(extremes.max()) if extremes.size else 0.0
+    return 1.5 * largest if np.isfinite(largest) and largest > 0 else 1.0
 
 
 def _draw_voltages(plot: Axes, signals: Signals) -> None:
@@ -161,7 +182,7 @@ def _dress_time_axes(plots: Sequence[Axes], t_s: Array, recording: Recording, be
         plot.spines[["left", "bottom"]].set_color(_FAINT)
         plot.grid(axis="y", color="#e4e4e4", linewidth=0.6)
         plot.set_axisbelow(True)
-        plot.yaxis.set_label_coords(-0.062, 0.5)
+        plot.yaxis.set_label_coords(-0.058, 0.5)
     plots[-1].set_xlabel("stage time  (s)")
     if begin_s is None:
         return
@@ -180,19 +201,19 @@ def _dress_time_axes(plots: Sequence[Axes], t_s: Array, recording: Recording, be
             )  # fmt: skip
 
 
-def _draw_path(figure: Figure, place: Any, signals: Signals) -> None:
-    plot = figure.add_subplot(place, projection="3d", computed_zorder=False)
+def _draw_path(figure: Figure, signals: Signals) -> None:
     points = signals.path_um
     if len(points) < 2:
-        plot.set_axis_off()
-        plot.text2D(0.5, 0.5, "nothing was scanned", transform=plot.transAxes, ha="center", color=_FAINT)
+        figure.text(0.8, 0.65, "nothing was scanned", ha="center", color=_FAINT)
         return
+    plot: Any = figure.add_axes((0.585, 0.40, 0.385, 0.5), projection="3d", computed_zorder=False)
     top = float(np.percentile(signals.path_error_nm, 99.5)) or 1.0
     scale = ScalarMappable(Normalize(0.0, top), "viridis")
     steps = np.stack([points[:-1], points[1:]], axis=1)
-    plot.add_collection3d(Line3DCollection(steps, colors=scale.to_rgba(signals.path_error_nm[1:]), linewidths=1.3))
+    plot.add_collection3d(Line3DCollection(steps, colors=scale.to_rgba(signals.path_error_nm[1:]), linewidths=1.4))
     middle = (points.max(axis=0) + points.min(axis=0)) / 2
-    span = np.maximum(np.ptp(points, axis=0), 0.25 * np.ptp(points, axis=0).max())
+    extent = np.ptp(points, axis=0)
+    span = np.maximum(extent, 0.25 * extent.max())
     for axis, name in enumerate("xyz"):
         getattr(plot, f"set_{name}lim")(middle[axis] - 0.54 * span[axis], middle[axis] + 0.54 * span[axis])
         getattr(plot, f"{name}axis").pane.set_facecolor("#fafafa")
@@ -200,13 +221,15 @@ def _draw_path(figure: Figure, place: Any, signals: Signals) -> None:
         plot.tick_params(axis=name, labelsize=8, pad=1, color=_FAINT)
         plot.locator_params(axis=name, nbins=5)
     plot.grid(False)
-    plot.set_box_aspect(tuple(np.maximum(span / span.max(), 0.42)), zoom=0.98)
+    plot.set_box_aspect(tuple(np.maximum(span / span.max(), 0.5)), zoom=0.92)
     plot.view_init(elev=24, azim=-58)
-    plot.set_xlabel("x  (µm)", labelpad=4)
-    plot.set_ylabel("y  (µm)", labelpad=4)
-    plot.set_zlabel("z  (µm)", labelpad=3)
-    plot.set_title("true path of the scan", fontsize=11, color=_INK, y=0.985)
-    bar = figure.colorbar(scale, ax=plot, shrink=0.5, aspect=28, pad=0.09, extend="max")
+    plot.set_xlabel("x  (µm)", labelpad=6)
+    plot.set_ylabel("y  (µm)", labelpad=6)
+    plot.set_zlabel("z  (µm)", labelpad=5)
+    figure.text(0.79, 0.893, "true path of the scan", fontsize=11, color=_INK, ha="center", va="center")
+    bar = figure.colorbar(
+        scale, cax=figure.add_axes((0.68, 0.405, 0.22, 0.011)), orientation="horizontal", extend="max"
+    )
     bar.set_label("distance from the reference  (nm)", fontsize=9)
     bar.ax.tick_params(labelsize=8, color=_FAINT)
     bar.outline.set_visible(False)
@@ -245,7 +268,13 @@ def _draw_title(figure: Figure, summary: dict[str, Any]) -> None:
     heading = f"{summary['scenario']}   ·   {summary['lane']} lane   ·   seed {summary['seed']}"
     figure.text(0.055, 0.962, heading, fontsize=17, color=_INK, fontweight="bold", va="center")
     rate = f"{1e6 / summary['period_us']:,.0f} ticks/s".replace(",", " ")
-    parts = [f"stage {summary['stage']}", f"plant {summary['plant']}", f"law {summary['controller']}", f"bus {summary['bus']}", rate]
+    parts = [
+        f"stage {summary['stage']}",
+        f"plant {summary['plant']}",
+        f"law {summary['controller']}",
+        f"bus {summary['bus']}",
+        rate,
+    ]
     for name, words in (("rms_error_nm", "rms error"), ("hold_noise_nm", "hold noise")):
         if summary.get(name):
             parts.append(f"{words} " + " / ".join(f"{v:.2f}" for v in summary[name].values()) + " nm")
@@ -267,7 +296,14 @@ def _plot_envelope(
     if np.array_equal(low, high):
         plot.plot(t_s, low, color=colour, linewidth=width, label=label, alpha=alpha)
     else:
-        plot.plot(np.repeat(t_s, 2), np.column_stack([low, high]).ravel(), color=colour, linewidth=width, label=label, alpha=alpha)
+        plot.plot(
+            np.repeat(t_s, 2),
+            np.column_stack([low, high]).ravel(),
+            color=colour,
+            linewidth=width,
+            label=label,
+            alpha=alpha,
+        )
 
 
 def _tracking_begin_s(recording: Recording) -> float | None:
@@ -277,7 +313,7 @@ def _tracking_begin_s(recording: Recording) -> float | None:
         tracking = np.flatnonzero(block["reference_tick"] >= 0)
         if len(tracking):
             at = int(tracking[0])
-            return (first + at - int(block["reference_tick"][at])) * recording.metadata["period_us"] * 1e-6
+            return float((first + at - int(block["reference_tick"][at])) * recording.metadata["period_us"]) * 1e-6
         first += len(block["reference_tick"])
     return None
 

@@ -11,7 +11,13 @@ from hil.metrics import evaluate
 from hil.scenario import Scenario, resolve
 from pkxyz_ctrl.config import ConfigError, write_toml
 
-RECORDING, FRAMES, CONFIG, SUMMARY, PICTURE = "recording.parquet", "frames.log", "config.toml", "summary.json", "report.png"
+RECORDING, FRAMES, CONFIG, SUMMARY, PICTURE = (
+    "recording.parquet",
+    "frames.log",
+    "config.toml",
+    "summary.json",
+    "report.png",
+)
 _OURS = {RECORDING, FRAMES, CONFIG, SUMMARY, PICTURE, RECORDING + ".journal", RECORDING + ".part"}
 
 
@@ -25,7 +31,9 @@ class RunFolder:
             path.mkdir(parents=True, exist_ok=True)
             present = {item.name for item in path.iterdir()}
         except OSError as error:
-            raise ConfigError(f"--out: {path}: {(error.strerror or str(error)).lower()}; give a folder that can be written") from None
+            raise ConfigError(
+                f"--out: {path}: {(error.strerror or str(error)).lower()}; give a folder that can be written"
+            ) from None
         if present - _OURS or (present and CONFIG not in present):
             raise ConfigError(f"--out: {path}: holds files that are not a run's; give an empty or a new folder")
         try:
@@ -40,7 +48,7 @@ class RunFolder:
         self.picture = path / PICTURE
 
     def write_config(self, scenario: Scenario) -> dict[str, Any]:
-        """Write everything that decides about the run, and return it; the file alone repeats the run."""
+        """Write everything that decides about the run, and return it."""
         resolved = resolve(scenario)
         try:
             write_toml(resolved, self.config)
@@ -69,7 +77,13 @@ def metadata_of(scenario: Scenario, lane: str, resolved: dict[str, Any]) -> dict
         "digest": resolved["digest"],
         "period_us": scenario.bus.period_us,
         "segments": [
-            {"kind": s.kind, "t_start_us": s.t_start_us, "t_end_us": s.t_end_us, "scan_us": s.scan_us, "still_us": s.still_us}
+            {
+                "kind": s.kind,
+                "t_start_us": s.t_start_us,
+                "t_end_us": s.t_end_us,
+                "scan_us": s.scan_us,
+                "still_us": s.still_us,
+            }
             for s in scenario.trajectory.segments
         ],
         "versions": versions(),
@@ -78,9 +92,9 @@ def metadata_of(scenario: Scenario, lane: str, resolved: dict[str, Any]) -> dict
 
 
 def summarise(
-    scenario: Scenario, lane: str, digest: str, figures: dict[str, Any], *, interrupted: bool, picture: bool
+    scenario: Scenario, lane: str, digest: str, figures: dict[str, Any], *, interrupted: bool
 ) -> dict[str, Any]:
-    """The summary: who ran, the figures, the verdicts on the checks, and ``ok``, which is false for an interrupted run."""
+    """The summary: who ran, figures, verdicts on the checks, and ``ok``, which is false for an interrupted run."""
     summary: dict[str, Any] = {
         "scenario": scenario.config.name,
         "lane": lane,
@@ -93,6 +107,10 @@ def summarise(
         "period_us": scenario.bus.period_us,
         "duration_s": scenario.config.duration_s,
         "interrupted": interrupted,
+        "missed_ticks": None,
+        "faults": [],
+        "bus_load": None,
+        "realtime_factor": None,
         **figures,
     }
     checks = evaluate(scenario.config.checks, summary)

@@ -56,7 +56,7 @@ class ScenarioConfig(FrozenModel):
     bus: Text
     reference: Annotated[tuple[Segment, ...], Field(min_length=1)]
     """starts when the controller starts to track"""
-    checks: dict[str, Bound] = {}
+    checks: dict[str, Bound] = Field(default_factory=dict)
 
     @field_validator("checks", mode="after")
     @classmethod
@@ -99,7 +99,7 @@ def load_scenario(
     controller: str | None = None,
     bus: str | None = None,
 ) -> Scenario:
-    """Read a scenario and all that it names, with what the caller wants otherwise (paths relative to the working folder).
+    """Read a scenario and all that it names, with what the caller wants otherwise (paths from the working folder).
 
     Raises ``ConfigError`` with one line for each thing that is wrong, over all the files; ``TrajectoryError``, which is
     one, for a reference that the stage can't follow.
@@ -109,15 +109,16 @@ def load_scenario(
     given = {key: value for key, value in wanted.items() if value is not None}
     scenario = config.parse({**config.read_toml(source), **given}, ScenarioConfig, str(source))
     parts: dict[str, Any] = {}
-    problems: list[str] = []
-    for key, (kind, name, model) in {
+    models: dict[str, tuple[str, str, type[BaseModel]]] = {
         "stage": ("stages", scenario.stage, StageConfig),
         "device": ("stages", scenario.stage, Device),
         "plant": ("plants", scenario.plant, PlantConfig),
         "controller": ("controllers", scenario.controller, ControllerConfig),
         "bus": ("buses", scenario.bus, BusConfig),
-    }.items():
-        folder = Path() if kind.startswith(tuple(given)) else source.parent
+    }
+    problems: list[str] = []
+    for key, (kind, name, model) in models.items():
+        folder = Path() if kind.startswith(tuple(given)) else source.parent  # kinds are plurals of keys
         try:
             parts[key] = _part(kind, name, model, folder)
         except ConfigError as error:

@@ -1,0 +1,67 @@
+"""One scenario run into one folder: lane, recording, figures, verdict, picture."""
+
+from collections.abc import Callable
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from hil import lanes
+from hil.metrics import Metrics
+from hil.recording import RecordingWriter
+from hil.run_folder import RunFolder, metadata_of, summarise
+from hil.scenario import Scenario
+from pkxyz_ctrl.config import ConfigError
+
+
+def run_into(
+    folder: RunFolder, scenario: Scenario, lane: str, on_progress: Callable[[int, int], None]
+) -> dict[str, Any]:
+    """Run ``scenario`` in ``lane`` and leave everything in ``folder``; returns the summary.
+
+    Interrupted by the keyboard, it keeps what was recorded and says so in the summary. Raises ``ConfigError`` for a
+    bus that the lane can't use and ``RecordingError`` when the disk fails.
+    """
+    require_bus(scenario, lane)
+    resolved = folder.write_config(scenario)
+    metrics = Metrics(scenario.trajectory, scenario.bus.period_us)
+    result: lanes.LaneResult | None = None
+    interrupted = False
+    with RecordingWriter(folder.recording, metadata_of(scenario, lane, resolved)) as recording:
+
+        def on_block(block: NDArray[np.void]) -> None:
+            recording.write(block)
+            metrics.update(block)
+
+        try:
+            setup = scenario.setup()
+            result = lanes.run(setup, lane, on_block=on_block, on_progress=on_progress, frame_log=folder.frames)
+        except KeyboardInterrupt:
+            interrupted = True
+    figures = metrics.figures()
+    if result is not None:
+        figures |= {
+            "missed_ticks": result.missed_ticks,
+            "faults": list(result.faults),
+            "bus_load": result.bus_load,
+            "realtime_factor": result.realtime_factor,
+        }
+    summary = summarise(scenario, lane, resolved["digest"], figures, interrupted=interrupted)
+    folder.write_summary(summary)
+    return summary
+
+
+def require_bus(scenario: Scenario, lane: str) -> None:
+    """Raise ``ConfigError`` if the lane needs frames and the bus config has none."""
+    if lane == "lockstep" and scenario.bus.can is None:
+        raise ConfigError(
+            f"bus {scenario.bus.name!r} has no [can] and carries no frames, which the lockstep lane needs; "
+            "use --lane fast or another --bus"
+        )
+
+
+def draw(folder: RunFolder, summary: dict[str, Any]) -> None:
+    """Draw the picture of a run that is already recorded."""
+    from hil.report import draw_report  # matplotlib takes as long to import as a run takes
+
+    draw_report(folder.recording, folder.frames, summary, folder.picture)
