@@ -126,9 +126,9 @@ def act(law, memory, now: Array, after: Array) -> bool:
     geometry, gains, drive, scratch = law["geometry"], law["feedback"], law["drive"], memory["scratch"]
     demand, force, count = memory["demand_n"], memory["force_n"], memory["count"]
     j, inverse, row, given = scratch["jacobian"], scratch["inverse"], scratch["row"], scratch["w_n"]
-    kinematics.jacobian(geometry, now[0:3], j)
-    inverse3(j, inverse)
     feedback.ahead(gains, now, after, row)
+    kinematics.jacobian(geometry, row[0:3], j)
+    inverse3(j, inverse)
     energy_gradient(geometry, law["elasticity"], row[0:3], demand)
     share = feedback.authority(gains, inverse, demand)
     feedback.add_motion(gains, row, demand)

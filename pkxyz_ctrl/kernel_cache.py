@@ -1,0 +1,58 @@
+"""Where compiled kernels are kept: a folder named after the source of all of them.
+
+numba asks only whether the file of a kernel has changed, not whether the kernels that it calls have; a kernel compiled
+against yesterday's callee would go on running. One digest over every file that holds a kernel makes that impossible.
+"""
+
+import hashlib
+import os
+import shutil
+import sys
+from pathlib import Path
+
+_PACKAGES = ("pkxyz_ctrl", "hil", "sim")
+_KEPT = 4
+
+
+def choose_kernel_cache() -> None:
+    """Set numba's cache folder for this process; an own NUMBA_CACHE_DIR is respected, an unwritable home left to numba."""
+    if "NUMBA_CACHE_DIR" in os.environ:
+        return
+    home = Path(os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache") / "pkxyz_ctrl"
+    folder = home / _digest_of_kernels()
+    try:
+        folder.mkdir(parents=True, exist_ok=True)
+        os.utime(folder)
+    except OSError:
+        return
+    os.environ["NUMBA_CACHE_DIR"] = str(folder)
+    if "numba" in sys.modules:
+        sys.modules["numba"].config.CACHE_DIR = str(folder)
+    _forget_old(home)
+
+
+def is_cold() -> bool:
+    """Whether nothing has been compiled yet from these sources: the first run takes longer and should say so."""
+    folder = os.environ.get("NUMBA_CACHE_DIR")
+    return folder is not None and not any(Path(folder).rglob("*.nbc"))
+
+
+def _digest_of_kernels() -> str:
+    digest = hashlib.sha256(sys.version.encode())
+    root = Path(__file__).parent.parent
+    for package in _PACKAGES:
+        for path in sorted((root / package).rglob("*.py")):
+            source = path.read_bytes()
+            if b"njit" in source:
+                digest.update(str(path).encode() + source)
+    return digest.hexdigest()[:16]
+
+
+def _forget_old(home: Path) -> None:
+    """Keep the folders used last; a developer makes a new one with every edit of a kernel."""
+    try:
+        by_use = sorted((p for p in home.iterdir() if p.is_dir()), key=lambda p: p.stat().st_mtime)
+    except OSError:
+        return
+    for folder in by_use[:-_KEPT]:
+        shutil.rmtree(folder, ignore_errors=True)
