@@ -261,6 +261,18 @@ def test_sdo_writes_value_by_value(
         gate.clear()
 
 
+@pytest.mark.parametrize("mode", list(Mode))
+def test_sdo_reads_have_empty_bytes_behind(mode: Mode) -> None:
+    gate = TransmitGate(CONFIG)
+    requests = [bytes([0x40, 0x18, 0x10, 1, 0, 0, 0, 0]), bytes([0x60, *[0] * 7]), bytes([0x70, *[0] * 7])]
+    for good in requests:
+        assert passes(gate, Frame(0x60A, good), T, mode)
+        for place in range(1 if good[0] != 0x40 else 4, 8):
+            bad = good[:place] + b"\x01" + good[place + 1 :]
+            assert not passes(gate, Frame(0x60A, bad), T, mode)
+            gate.clear()
+
+
 def test_sdo_writes_over_the_whole_dictionary() -> None:
     """One byte of value 1, to index after index: what is not listed never passes."""
     gate = TransmitGate(CONFIG)

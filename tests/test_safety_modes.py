@@ -102,12 +102,17 @@ def test_refusal_tells_where_it_would_be_possible() -> None:
 
 
 @settings(max_examples=200, deadline=None)
-@given(st.lists(st.sampled_from(Event), max_size=60))
-def test_loop_closes_only_after_homing_since_the_last_boot(events: list[Event]) -> None:
-    """Whoever asks through ``enable_event`` cannot close the loop on offsets of another life."""
+@given(st.lists(st.tuples(st.booleans(), st.integers(0, len(Event) - 1)), max_size=60))
+def test_loop_closes_only_after_homing_since_the_last_boot(choices: list[tuple[bool, int]]) -> None:
+    """Whoever asks through ``enable_event`` cannot close the loop on offsets of another life.
+
+    Half of the events are drawn from those that the mode accepts, else the walk would hardly ever leave BOOT.
+    """
     mode, homed = int(Mode.BOOT), False
     homed_since_boot = False
-    for event in events:
+    for fitting, number in choices:
+        accepted = [event for source, event in modes.TRANSITIONS if source == mode]
+        event = accepted[number % len(accepted)] if fitting else Event(number)
         asked = enable_event(homed) if event in (Event.ENABLE, Event.ENABLE_UNHOMED) else int(event)
         was = mode
         homed, mode = next_homed(homed, mode, asked), int(next_mode(mode, asked))
@@ -118,6 +123,15 @@ def test_loop_closes_only_after_homing_since_the_last_boot(events: list[Event]) 
         assert homed == homed_since_boot
         if modes.LOOP_CLOSED[mode]:
             assert homed_since_boot
+
+
+@pytest.mark.parametrize("way", [[Event.NODE_LOST], [Event.TRIP, Event.CLEAR], [Event.ENABLE, Event.TRIP, Event.CLEAR]])
+def test_offsets_are_forgotten_with_the_node_and_with_a_fault(way: list[Event]) -> None:
+    mode, homed = int(Mode.IDLE), True
+    for event in way:
+        assert homed
+        homed, mode = next_homed(homed, mode, int(event)), int(next_mode(mode, int(event)))
+    assert (mode, homed) == (Mode.BOOT, False)
 
 
 def test_the_way_to_tracking_and_back() -> None:

@@ -271,7 +271,7 @@ def check(limits: np.void, memory: np.void, obs: np.void) -> int:
     if mode < 0 or mode >= _MODE_COUNT or NODE_EXPECTED[mode] == 0:
         clear_memory(memory)
         return trips
-    trips |= (obs["node_events"] & _NODE_EVENTS) << _NODE_SHIFT
+    trips |= (int(obs["node_events"]) & _NODE_EVENTS) << _NODE_SHIFT
     leak = limits["overrun_leak_ticks"]
     memory["overrun_level"] = _bucket(memory["overrun_level"], obs["overrun"], leak)
     trips |= _filled(memory["overrun_level"], limits["overrun_count"], leak, _OVERRUN)
