@@ -1,4 +1,4 @@
-"""Memory of the plant: one record of parameters, one of state, which compiled and plain code share.
+"""Memory of the plant: one record of parameters, one of state, which njit kernels and plain code share.
 
 Suffixes are units; chains and axes have three entries. What a kernel may scribble on is in the state as well, so that
 no kernel allocates."""

@@ -26,15 +26,14 @@ def stream(seed: int, source: int, offset: int) -> np.ndarray:
 @njit(cache=True)
 def _add(a: np.uint64, b: np.uint64) -> np.uint64:
     """a + b modulo 2^64, without a carry out of 64 bits: interpreted NumPy scalars would warn of it."""
-    total: np.uint64 = ((a & LOW_63) + (b & LOW_63)) ^ ((a ^ b) & TOP_BIT)
-    return total
+    return ((a & LOW_63) + (b & LOW_63)) ^ ((a ^ b) & TOP_BIT)
 
 
 @njit(cache=True)
 def next_u64(words: np.ndarray) -> np.uint64:
     """Next 64 random bits; ``words`` (4,) uint64 is the generator's memory."""
     a, b, c, counter = words[0], words[1], words[2], words[3]
-    out = _add(_add(a, b), counter)
+    out: np.uint64 = _add(_add(a, b), counter)
     words[0] = b ^ (b >> ELEVEN)
     words[1] = _add(c, c << THREE)
     words[2] = _add((c << TWENTY_FOUR) | (c >> FORTY), out)
@@ -65,4 +64,4 @@ def normal(words: np.ndarray, spare: np.ndarray) -> float:
     scale = math.sqrt(-2.0 * math.log(r2) / r2)
     spare[0] = 1.0
     spare[1] = v * scale
-    return u * scale
+    return float(u * scale)
