@@ -7,6 +7,7 @@ turns the journal into Parquet, which could not be read without the footer that 
 """
 
 import json
+import os
 from collections.abc import Iterator, Sequence
 from pathlib import Path
 from types import TracebackType
@@ -82,7 +83,8 @@ class RecordingWriter:
             raise self._lost(error) from None
         finally:
             self._sink.close()
-        recover(self.path)
+        if not self._failed:
+            recover(self.path)
 
     def __enter__(self) -> Self:
         return self
@@ -249,6 +251,6 @@ def _batch(block: NDArray[np.void], schema: pa.Schema) -> pa.RecordBatch:
 
 def _reason(error: Exception) -> str:
     """The operating system's words where there are some, else the first line of the library's."""
-    if isinstance(error, OSError) and error.strerror:
-        return error.strerror.lower()
+    if isinstance(error, OSError) and error.errno:
+        return os.strerror(error.errno).lower()
     return (str(error).splitlines() or ["unknown error"])[0]

@@ -61,7 +61,9 @@ def require_bus(scenario: Scenario, lane: str) -> None:
 
 
 def draw(folder: RunFolder, summary: dict[str, Any]) -> None:
-    """Draw the picture of a run that is already recorded."""
+    """Draw the picture of a run that is already recorded; there is none of a run that never began."""
+    if summary["ticks"] == 0:
+        return
     from hil.report import draw_report  # matplotlib takes as long to import as a run takes
 
     draw_report(folder.recording, folder.frames, summary, folder.picture)
