@@ -249,6 +249,25 @@ def test_memory_is_cleared_where_nothing_is_expected() -> None:
     assert bench.memory.tobytes() == clean.tobytes()
 
 
+@pytest.mark.parametrize("mode", [-1, -2, 7, 99])
+def test_unknown_mode_owes_nothing(mode: int) -> None:
+    """The mode table makes FAULT of it; here it must only not read beyond a table."""
+    bench = Bench()
+    assert not any(bench.tick({**ALL_BAD, "mode": mode}) for _ in range(60))
+    assert bench.tick({"mode": mode, "finite": 0}) == Trip.NOT_FINITE
+
+
+def test_opening_the_loop_forgets_what_only_the_loop_can_do() -> None:
+    limits = only("innovation_count", 5)
+    limits["saturation_count"] = limits["solver_count"] = limits["slew_count"] = 5
+    bench = Bench(limits=limits)
+    bad = {"innovation_m": 1.0, "saturated": 1, "solver_ok": 0, "voltage_step_v": 99.0}
+    for mode in (Mode.TRACKING, Mode.IDLE, Mode.ENABLED):
+        bench.mode = mode
+        assert [bench.tick(bad) for _ in range(4)] == [Trip(0)] * 4
+    assert bench.tick(bad) == 0b111 * Trip.INNOVATION_X | Trip.SATURATION | Trip.SOLVER | Trip.SLEW
+
+
 def test_limits_that_were_never_filled_in_trip_at_once() -> None:
     trips = Bench(limits=np.zeros(1, LIMITS)).tick()
     assert {Trip.SENSE_STALE, Trip.SENSE_CRC, Trip.SATURATION, Trip.SLEW, Trip.OVERRUN, Trip.SOLVER} <= set(trips)

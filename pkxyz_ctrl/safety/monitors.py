@@ -230,8 +230,8 @@ def _check_channels(limits: np.void, memory: np.void, obs: np.void) -> int:
         # NaN fails both comparisons, hence is out of range.
         in_range = in_range and stroke_m >= limits["stroke_min_m"] and stroke_m <= limits["stroke_max_m"]
         memory["range"][i] = _consecutive(memory["range"][i], not in_range)
-        same = memory["frozen"][i] > 0 and count == memory["frozen_sense_count"][i]
-        memory["frozen"][i] = _consecutive(memory["frozen"][i], same) if same else 1
+        same = count == memory["frozen_sense_count"][i]
+        memory["frozen"][i] = _consecutive(memory["frozen"][i], same) if same else 1  # how often in a row, this one too
         memory["frozen_sense_count"][i] = count
         trips |= _reached(memory["range"][i], limits["range_count"], _SENSE_RANGE_1 << i)
         trips |= _reached(memory["frozen"][i], limits["frozen_count"], _SENSE_FROZEN_1 << i)
