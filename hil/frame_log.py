@@ -25,6 +25,7 @@ class FrameLog:
         self.channel = channel
         self.frames = 0
         self._rows: list[tuple[int, Frame]] = []
+        self._middles: dict[tuple[object, ...], str] = {}  # what stands between time and data, by all but the data
         self._endpoint: Endpoint | None = None
         self._file = self.path.open("w", encoding="ascii", newline="\n")
 
@@ -44,8 +45,7 @@ class FrameLog:
         if self._rows:
             rows, self._rows = self._rows, []
             self.frames += len(rows)
-            channel = self.channel
-            self._file.write("".join([_line(t_us, channel, frame) for t_us, frame in rows]))
+            self._file.write("".join([self._line(t_us, frame) for t_us, frame in rows]))
             self._file.flush()
 
     def close(self) -> None:
@@ -64,17 +64,22 @@ class FrameLog:
     def __exit__(self, kind: type[BaseException] | None, error: BaseException | None, tb: TracebackType | None) -> None:
         self.close()
 
+    def _line(self, t_us: int, frame: Frame) -> str:
+        data = frame[1]
+        key = (frame[0], frame[2:])
+        middle = self._middles.get(key)
+        if middle is None:
+            middle = self._middles[key] = f") {self.channel} {_identifier(frame)}"
+        payload = data.hex().upper() if not frame[4] else f"{len(data)}" if data else ""
+        return f"({t_us // 1_000_000}.{t_us % 1_000_000:06d}{middle}{payload}\n"
 
-def _line(t_us: int, channel: str, frame: Frame) -> str:
-    can_id, data, is_fd, bitrate_switch, is_remote, is_extended, is_error = frame
-    seconds, micros = divmod(t_us, 1_000_000)
-    if is_error:
+
+def _identifier(frame: Frame) -> str:
+    """The identifier, the mark of the kind of frame and, for FD, its flags."""
+    can_id = frame.can_id
+    if frame.is_error:
         can_id |= ERROR_FLAG | ERROR_BUS  # without this class python-can's reader takes it for a data frame
-    identifier = f"{can_id:08X}" if is_extended or is_error else f"{can_id:03X}"
-    if is_fd:
-        payload = ("#1" if bitrate_switch else "#0") + data.hex().upper()
-    elif is_remote:
-        payload = f"R{len(data)}" if data else "R"
-    else:
-        payload = data.hex().upper()
-    return f"({seconds}.{micros:06d}) {channel} {identifier}#{payload}\n"
+    identifier = f"{can_id:08X}" if frame.is_extended or frame.is_error else f"{can_id:03X}"
+    if frame.is_fd:
+        return f"{identifier}##{1 if frame.bitrate_switch else 0}"
+    return f"{identifier}#R" if frame.is_remote else f"{identifier}#"
