@@ -22,7 +22,7 @@ REACH_M = 300e-6
 
 @njit(cache=True)
 def note(s: np.void, kind: int, chain: int) -> None:
-    """Add an event at the present time."""
+    """Add an event, at the end of the step in which it happens."""
     n = s["event_count"]
     if n < EVENTS:
         s["event_t_us"][n] = s["t_us"]
@@ -80,9 +80,10 @@ def _move(p: np.void, s: np.void, total_s: float) -> None:
             if s["broken"] != 0 or not _whole(s["motion"]):
                 _break(s)
             chain = snapped(p, s)
-            if chain >= 0:
+            while chain >= 0:
                 note(s, PULLED_IN, chain)
                 s["base_v"][chain], s["error_v"][chain], s["slope_v_per_s"][chain] = 0.0, 0.0, 0.0
+                chain = snapped(p, s)
         remaining -= duration
         if remaining < 1e-15:
             remaining = 0.0
@@ -114,10 +115,10 @@ def advance(params: np.ndarray, state: np.ndarray, dt_us: int) -> None:
     if remembers:
         seen(p, s, s["before_m"], s["before_m_per_s"])
     _constant_forces(p, s, dt_s)
+    s["t_us"] += dt_us
     for i in range(3):
         s["touched"][i] = 0
     _move(p, s, dt_s)
-    s["t_us"] += dt_us
     _note_contacts(s)
     if p["charging_on"] != 0:
         charge(p, s, dt_s)

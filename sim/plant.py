@@ -14,8 +14,8 @@ KINDS = {layout.STOP: "stop", layout.PULLED_IN: "pulled_in", layout.BROKEN: "bro
 
 
 class Event(NamedTuple):
-    """Something that happened to the stage. ``kind`` is stop, pulled_in or broken; ``chain`` 1, 2, 3, or 0 for the
-    whole stage."""
+    """Something that happened to the stage in the step that ended at t_us. ``kind`` is stop, pulled_in or broken;
+    ``chain`` 1, 2, 3, or 0 for the whole stage."""
 
     t_us: int
     kind: str

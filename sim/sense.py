@@ -113,5 +113,5 @@ def sample(params: np.ndarray, state: np.ndarray, counts: np.ndarray) -> None:
         farad += p["sense_offset_f"][i] + s["sense_walk_f"][i] + p["feedthrough_f_per_v"] * s["voltage_v"][i]
         if p["sense_noise_f"] > 0.0:
             farad += p["sense_noise_f"] * normal(s["random"][SENSE_STREAM + i], s["spare"][SENSE_STREAM + i])
-        steps = (farad - p["count_zero_f"]) / (p["count_f"] * step)
-        counts[i] = int(max(-32768.0, min(32767.0, math.floor(steps + 0.5) * step)))
+        fine = max(-40000.0, min(40000.0, (farad - p["count_zero_f"]) / p["count_f"]))  # before floor: it makes an int
+        counts[i] = min(32767, max(-32768, math.floor(fine / step + 0.5) * step))

@@ -13,6 +13,7 @@ VOLT_PER_COUNT = 200 / 32767
 GRADIENT_F_PER_M = 2 * 360 * 8.8541878128e-12 * 100e-6 / 5e-6
 REST_F = GRADIENT_F_PER_M * 20e-6
 FARAD_PER_COUNT = 1e-16
+FINE_F = 1e-18
 ZERO_F = 4.0e-12
 
 BARE = {
@@ -31,15 +32,18 @@ def config(**effects: dict) -> PlantConfig:
     return PlantConfig.model_validate({"name": "test"} | BARE | {name: {"on": True} | e for name, e in effects.items()})
 
 
-def plant(cfg: PlantConfig, *, seed: int = 1, period_us: int = 200, device: Device = DEVICE, scale: float = FARAD_PER_COUNT) -> Plant:
+def plant(
+    cfg: PlantConfig, *, seed: int = 1, period_us: int = 200, device: Device = DEVICE, fine: bool = False
+) -> Plant:
+    """A plant with counts of 100 aF over the whole stroke or, ``fine``, of 1 aF within 0.25 um of rest."""
     return Plant(
         cfg,
         device,
         period_us=period_us,
         seed=seed,
         drive_scale_v_per_count=VOLT_PER_COUNT,
-        sense_scale_f_per_count=scale,
-        sense_offset_f=ZERO_F,
+        sense_scale_f_per_count=FINE_F if fine else FARAD_PER_COUNT,
+        sense_offset_f=REST_F if fine else ZERO_F,
     )
 
 

@@ -12,7 +12,7 @@ PM = 1e-12
 
 
 def reference(p: Plant, drives: np.ndarray, period_us: int) -> np.ndarray:
-    """Positions (n, 3) at the end of each period, from the same equations and an exponential amplifier without slew limit."""
+    """Positions (n, 3) at the end of each period: the same equations, an exponential amplifier without slew limit."""
     par, s = plant(config()).params[0], plant(config()).state[0]
     tau = float(p.params["amplifier_s"][0])
     h = period_us * 1e-6
@@ -37,7 +37,9 @@ def scan(n: int, period_us: int) -> np.ndarray:
     t = np.arange(n) * period_us * 1e-6
     ramp = np.clip(t / 20e-3, 0, 1)
     ramp = np.sqrt(ramp * ramp * (3 - 2 * ramp))
-    volts = [ramp * (130 + 6 * np.sin(2 * np.pi * 45 * t + k) + 2 * np.sin(2 * np.pi * 180 * t + 2 * k)) for k in (0, 2, 4)]
+    volts = [
+        ramp * (130 + 6 * np.sin(2 * np.pi * 45 * t + k) + 2 * np.sin(2 * np.pi * 180 * t + 2 * k)) for k in (0, 2, 4)
+    ]
     return np.array([counts(*row) for row in np.transpose(volts)])
 
 
@@ -58,7 +60,7 @@ def test_within_a_picometre_over_a_scan(period_us):
 
 
 def test_a_jump_costs_less_than_a_nanometre():
-    """0 to 130 V at once: the Jacobian turns by as much as the transient lasts, which the method leaves to the steps."""
+    """0 to 130 V at once: how the Jacobian turns while the transient lasts is what the method leaves to its steps."""
     p = plant(config(amplifier_bandwidth={"corner_hz": 30e3}))
     drives = np.repeat([counts(130, 120, 110)], 20, axis=0)
     truth = reference(p, drives, 200)
@@ -85,7 +87,9 @@ def test_cutting_a_period_changes_nothing_but_rounding():
 
 def test_slewing_against_small_steps():
     """Ramps end within a step and are split there: one step of 200 us equals two hundred of 1 us to 10 pm."""
-    coarse, fine = (plant(config(amplifier_bandwidth={"corner_hz": 30e3}, slew={"limit_v_per_s": 1e6})) for _ in range(2))
+    coarse, fine = (
+        plant(config(amplifier_bandwidth={"corner_hz": 30e3}, slew={"limit_v_per_s": 1e6})) for _ in range(2)
+    )
     for k in range(40):
         row = counts(100 + 50 * (k % 2), 90 + 40 * (k % 3), 100)
         coarse.drive(row)

@@ -17,7 +17,11 @@ from sim.parameters import rest_stiffness
 PLAIN = plant(config())
 UNEVEN = plant(
     config(
-        stiffness_mismatch={"leaf": (0.1, -0.08, 0.06), "crank_hinge": (0.1, 0.0, -0.1), "link_hinge": (0.1, 0.05, 0.0)},
+        stiffness_mismatch={
+            "leaf": (0.1, -0.08, 0.06),
+            "crank_hinge": (0.1, 0.0, -0.1),
+            "link_hinge": (0.1, 0.05, 0.0),
+        },
         comb_mismatch={"relative": (0.05, -0.05, 0.02)},
     )
 )
@@ -59,7 +63,9 @@ def test_strokes_are_zero_at_rest():
 @given(poses)
 def test_jacobian_is_the_slope_of_the_strokes(x):
     h = 1e-8
-    slopes = np.column_stack([(strokes_of(PLAIN, x + h * a) - strokes_of(PLAIN, x - h * a)) / (2 * h) for a in np.eye(3)])
+    slopes = np.column_stack(
+        [(strokes_of(PLAIN, x + h * a) - strokes_of(PLAIN, x - h * a)) / (2 * h) for a in np.eye(3)]
+    )
     np.testing.assert_allclose(jacobian(PLAIN.params[0], x), slopes, atol=1e-9)
 
 
@@ -81,7 +87,9 @@ def test_force_is_minus_the_slope_of_the_energy(p, x):
     slope = np.array([(v(x + h * a) - v(x - h * a)) / (2 * h) for a in np.eye(3)])
     s["force_n"] = 0.0
     force = par["mass_kg"] * np.array(acceleration(par, s, np.zeros(3), *x, 0.0, 0.0, 0.0))
-    np.testing.assert_allclose(force, -slope, atol=2e-10)  # of up to 4e-3 N; 1e-10 is the difference quotient's rounding
+    np.testing.assert_allclose(
+        force, -slope, atol=2e-10
+    )  # of up to 4e-3 N; 1e-10 is the difference quotient's rounding
 
 
 @settings(deadline=None, max_examples=40)
@@ -133,7 +141,9 @@ def test_the_stage_settles_where_the_energy_is_least(p, volts):
         x = np.array(u) * 1e-6
         return 1e9 * (energy(p.params[0], np.concatenate([x, np.zeros(3)])) - force @ strokes_of(p, x))
 
-    least = minimize(potential, np.zeros(3), method="Nelder-Mead", options={"xatol": 1e-6, "fatol": 1e-15, "maxiter": 4000})
+    least = minimize(
+        potential, np.zeros(3), method="Nelder-Mead", options={"xatol": 1e-6, "fatol": 1e-15, "maxiter": 4000}
+    )
     np.testing.assert_allclose(p.position_m * 1e6, least.x, atol=2e-5)
 
 
