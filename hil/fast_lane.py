@@ -5,7 +5,7 @@ No frames, no gate, no driver: on a fault-free scenario they change no bit, and 
 
 from numba import njit
 
-from hil.truth import append
+from hil.truth import observe
 from pkxyz_ctrl.cycle import cycle
 from sim import kernels
 
@@ -15,12 +15,13 @@ def run_block(law, memory, reference, plant_params, plant_state, sample_us, rows
     """Run ``count`` ticks and write their rows to ``rows[:count]``.
 
     ``sample_us`` (count,) int64: plant time of each sample. At a sample the drive counts of the last tick are applied, as
-    the amplifier does on SYNC.
+    the amplifier does on SYNC; the truth is taken just before them.
     """
-    seen, counts = memory[0]["input"], memory[0]["row"]["drive_count"]
+    seen, row = memory[0]["input"], memory[0]["row"]
     for i in range(count):
         kernels.advance(plant_params, plant_state, sample_us[i] - plant_state[0]["t_us"])
-        kernels.drive(plant_params, plant_state, counts)
+        observe(plant_params[0], plant_state[0], row)
+        kernels.drive(plant_params, plant_state, row["drive_count"])
         kernels.sample(plant_params, plant_state, seen["sense_count"])
         cycle(law, memory, reference)
-        append(memory, plant_params, plant_state, rows, i)
+        rows[i] = row

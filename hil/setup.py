@@ -8,7 +8,8 @@ from numpy.typing import NDArray
 
 from pkxyz_ctrl.bus_config import BusConfig
 from pkxyz_ctrl.controller_config import ControllerConfig
-from pkxyz_ctrl.design.law import design_law
+from pkxyz_ctrl.design.law import count_max, design_law, slew_counts
+from pkxyz_ctrl.safety.gate import GateConfig
 from pkxyz_ctrl.stage import Stage
 from pkxyz_ctrl.stage_config import StageConfig
 from pkxyz_ctrl.trajectory import Trajectory
@@ -39,6 +40,22 @@ class Setup:
     def law(self) -> NDArray[np.void]:
         """The numbers that the cycle runs on, designed and cross-checked."""
         return design_law(Stage(self.stage), self.controller, self.bus, autostart=True)
+
+    @property
+    def gate(self) -> GateConfig:
+        """What the transmit gate holds frames to: the same limits, handed over as numbers of counts."""
+        assert self.bus.can is not None
+        driver = self.bus.can.driver
+        return GateConfig(
+            count_max=count_max(Stage(self.stage), self.controller, self.bus),
+            count_slew_max=slew_counts(self.controller, self.bus),
+            period_us=self.bus.period_us,
+            node_id=driver.node_id,
+            controller_node_id=driver.controller_node_id,
+            protection=driver.protection,
+            fd=driver.fd,
+            drive_timeout_syncs=driver.drive_timeout_syncs,
+        )
 
     def new_plant(self) -> Plant:
         """A plant at rest, at its time 0."""

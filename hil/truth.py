@@ -1,4 +1,4 @@
-"""The truth beside the controller's record of a tick, compiled: one row complete."""
+"""The truth at a sample, compiled: what a recording sets beside the controller's own columns."""
 
 import numpy as np
 from numba import njit
@@ -7,17 +7,18 @@ from sim.geometry import strokes
 
 
 @njit(cache=True)
-def append(memory, plant_params, plant_state, rows, index) -> None:
-    """Complete the controller's row with the plant's state at the sample and copy it to ``rows[index]``.
+def observe(plant, state, out) -> None:
+    """Write ``position_m``, ``stroke_m`` and ``comb_voltage_v`` (3,) of a plant's records to those fields of the record ``out``.
 
-    To be called after the cycle and before the plant moves on. ``memory`` (1,) of ``cycle.MEMORY``, ``rows`` (n,) of ``ROW``.
+    As ``sim.plant.Plant`` defines them: the parasitic mode's part is in the position and in the strokes.
     """
-    row, p, s = memory[0]["row"], plant_params[0], plant_state[0]
-    stroke = np.empty(3)
-    strokes(p, s["motion"], stroke)
-    sway = s["parasitic"][0]
+    strokes(plant, state["motion"], out["stroke_m"])
+    sway = state["parasitic"][0]
     for i in range(3):
-        row["position_m"][i] = s["motion"][i] + p["parasitic_table"][i] * sway
-        row["stroke_m"][i] = stroke[i] + p["parasitic_comb"][i] * sway
-        row["comb_voltage_v"][i] = s["voltage_v"][i]
-    rows[index] = row
+        out["position_m"][i] = state["motion"][i] + plant["parasitic_table"][i] * sway
+        out["stroke_m"][i] += plant["parasitic_comb"][i] * sway
+        out["comb_voltage_v"][i] = state["voltage_v"][i]
+
+
+TRUTH_BYTES = 3 * 3 * np.dtype("f8").itemsize
+"""Length of the three fields, which end a ``ROW``."""

@@ -23,6 +23,10 @@ class CanConfig(FrozenModel):
     """From the end of the SYNC frame until the node's sense frame is ready to be sent."""
     compute_us: Annotated[int, Field(ge=0, le=1000)]
     """From the end of the sense frame until the controller's drive frame is ready to be sent; lockstep charges it."""
+    sense_deadline_us: Annotated[int, Field(gt=0)]
+    """After the start of a tick: when the controller computes without this tick's sense frame, so that its drive frame is in time."""
+    heartbeat_deadline_us: Annotated[int, Field(gt=0)]
+    """After the start of a tick: until when a drive frame and our heartbeat behind it end before the next SYNC."""
     driver: DriverConfig
 
     @model_validator(mode="after")
@@ -52,6 +56,13 @@ class BusConfig(FrozenModel):
     analog: AnalogConfig
     can: CanConfig | None = None
     """Absent: no bus at all, fast lane only."""
+
+    @model_validator(mode="after")
+    def _deadlines_within_the_period(self) -> Self:
+        can = self.can
+        if can is not None and max(can.sense_deadline_us + can.compute_us, can.heartbeat_deadline_us) >= self.period_us:
+            raise ValueError("can.sense_deadline_us + compute_us and can.heartbeat_deadline_us must lie within period_us")
+        return self
 
     @property
     def period_s(self) -> float:

@@ -20,6 +20,7 @@ INPUT = np.dtype(
         ("node_events", "i4"),
         ("overrun", "i4"),
         ("sense_count", "i4", (3,)),
+        ("trips", "i8"),  # Trip bits raised outside: a frame that the gate blocked, an operator's stop
         ("reference_base", "i8"),  # trajectory tick of row 0 of the reference handed in
     ],
     align=True,
@@ -101,6 +102,7 @@ def cycle(law_array, memory_array, reference) -> None:
         memory["reference_tick"] += 1
     memory["tick_index"] += 1
     seen["event"] = _NONE
+    seen["trips"] = 0
 
 
 @njit(cache=True)
@@ -180,7 +182,7 @@ def _monitor(law, memory, saturated: int) -> int:
         obs["stroke_m"][i] = state["stroke_m"][i]
         obs["innovation_m"][i] = state["estimate"]["innovation_m"][i]
         obs["voltage_step_v"][i] = law["tick"]["drive"]["volt_per_count"] * (state["count"][0, i] - state["count"][1, i])
-    trips = check(law["limits"], memory["monitors"], obs)
+    trips = check(law["limits"], memory["monitors"], obs) | seen["trips"]
     if trips != 0 and memory["mode"] != _FAULT:
         _handle(law, memory, _TRIP)
         tick.release(state)

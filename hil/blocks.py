@@ -1,0 +1,52 @@
+"""A run in blocks of ticks: so many rows of the reference handed out, so many rows of the record handed on."""
+
+from collections.abc import Callable
+
+import numpy as np
+from numpy.typing import NDArray
+
+from pkxyz_ctrl.row import ROW
+from pkxyz_ctrl.trajectory import Trajectory
+
+BLOCK_TICKS = 4096
+"""0.8 s at 5 kHz; bounds the memory of a run and what a killed one loses."""
+
+PREVIEW_ROWS = 4
+"""Rows of the reference that the law may look at past its own: two periods of delay, and an interval after them."""
+
+
+class Blocks:
+    """Hands a lane its reference and takes its rows. ``rows`` (BLOCK_TICKS,) of ``ROW`` is filled by the lane."""
+
+    def __init__(
+        self,
+        trajectory: Trajectory,
+        period_us: int,
+        ticks: int,
+        on_block: Callable[[NDArray[np.void]], None],
+        on_progress: Callable[[int, int], None],
+    ) -> None:
+        self.ticks = ticks
+        self.rows = np.zeros(BLOCK_TICKS, ROW)
+        self.done = 0
+        self._trajectory = trajectory
+        self._period_us = period_us
+        self._on_block = on_block
+        self._on_progress = on_progress
+
+    def next_count(self) -> int:
+        """Ticks of the next block, 0 at the end."""
+        return min(BLOCK_TICKS, self.ticks - self.done)
+
+    def reference(self, memory: NDArray[np.void]) -> NDArray[np.float64]:
+        """Rows (n, 9) of the trajectory that the next block may need; says in ``memory`` (1,) where they begin."""
+        first = int(memory["reference_tick"][0])
+        memory["input"]["reference_base"] = first
+        return self._trajectory.sample(first, BLOCK_TICKS + PREVIEW_ROWS, self._period_us)
+
+    def hand_on(self, count: int) -> None:
+        """The first ``count`` rows are complete."""
+        self.done += count
+        if count:
+            self._on_block(self.rows[:count])
+        self._on_progress(self.done, self.ticks)

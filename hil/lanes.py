@@ -1,0 +1,92 @@
+"""The two lanes in which a scenario runs: over the simulated bus in lockstep, or composed in one compiled loop."""
+
+import time
+from collections.abc import Callable
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+
+from hil.blocks import Blocks
+from hil.fast_lane import run_block
+from hil.frame_time import INTERFRAME_BITS, frame_duration_ns
+from hil.lockstep import LockstepRig
+from hil.setup import Setup
+from pkxyz_ctrl.can.frame import Frame
+from pkxyz_ctrl.cycle import new_memory
+from pkxyz_ctrl.safety.modes import Mode
+from pkxyz_ctrl.safety.trips import explain
+
+
+@dataclass(frozen=True)
+class LaneResult:
+    """What a lane knows of a run besides its rows."""
+
+    ticks: int
+    missed_ticks: int
+    """skipped, without a sense frame, or with a drive frame that was late on the wire"""
+    bus_load: float | None
+    """0..1 over the ticks; None without a bus"""
+    faults: tuple[str, ...]
+    realtime_factor: float
+    """stage time over the machine's time"""
+
+
+def run(
+    setup: Setup,
+    lane: str,
+    *,
+    on_block: Callable[[NDArray[np.void]], None],
+    on_progress: Callable[[int, int], None] = lambda done, total: None,
+    frame_log: Path | None = None,
+) -> LaneResult:
+    """Run a setup in the lane "lockstep" or "fast".
+
+    ``on_block`` gets the rows (n,) of ``ROW`` in order and must not keep them; ``on_progress`` the ticks done and in all.
+    What was run before an exception (Ctrl-C) has been handed on. Raises ``ConfigError`` for a bus that the lane can't use
+    and ``StartUpError`` where the amplifier doesn't start.
+    """
+    blocks = Blocks(setup.trajectory, setup.bus.period_us, setup.ticks, on_block, on_progress)
+    law = setup.law  # designed before the stopwatch runs
+    begin_s = time.perf_counter()
+    if lane == "fast":
+        missed, load, faults = 0, None, _run_fast(setup, law, blocks)
+    elif lane == "lockstep":
+        rig = LockstepRig(setup, frame_log)
+        missed, load = rig.run(blocks)
+        faults = rig.controller.faults
+    else:
+        raise ValueError(f"no lane is called {lane!r}; there are lockstep and fast")
+    factor = setup.ticks * setup.bus.period_s / (time.perf_counter() - begin_s)
+    return LaneResult(setup.ticks, missed, load, tuple(faults), factor)
+
+
+def _run_fast(setup: Setup, law: NDArray[np.void], blocks: Blocks) -> list[str]:
+    plant, memory = setup.new_plant(), new_memory(Mode.IDLE)
+    faults: list[str] = []
+    mode = int(Mode.IDLE)
+    while count := blocks.next_count():
+        reference = blocks.reference(memory)
+        run_block(law, memory, reference, plant.params, plant.state, _sample_us(setup, blocks.done, count), blocks.rows, count)
+        entered = np.flatnonzero((blocks.rows["mode"][:count] == Mode.FAULT) & (np.r_[mode, blocks.rows["mode"][: count - 1]] != Mode.FAULT))
+        for i in entered:
+            faults.append(f"at {blocks.rows['t_us'][i] * 1e-6:.4f} s: {explain(int(blocks.rows['trips'][i]))}")
+        mode = int(blocks.rows["mode"][count - 1])
+        blocks.hand_on(count)
+    return faults
+
+
+def _sample_us(setup: Setup, first: int, count: int) -> NDArray[np.int64]:
+    """Plant time of the samples: the end of each tick's SYNC, whose length depends on its counter, since the first one."""
+    start = np.arange(first, first + count, dtype=np.int64) * setup.bus.period_us
+    can = setup.bus.can
+    if can is None:
+        return start
+    nominal, data = can.nominal_bitrate_bit_per_s, can.data_bitrate_bit_per_s or can.nominal_bitrate_bit_per_s
+    end_us = np.empty(240, np.int64)
+    for n in range(240):
+        sync = Frame(0x080, bytes((n + 1,)), can.driver.fd, can.driver.fd)
+        end_ns = frame_duration_ns(sync, nominal, data) - INTERFRAME_BITS * 1_000_000_000 // nominal
+        end_us[n] = -(-end_ns // 1000)
+    return start + end_us[np.arange(first, first + count) % 240] - end_us[0]

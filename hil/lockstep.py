@@ -1,0 +1,148 @@
+"""The lockstep lane: controller, driver, gate, simulated bus, amplifier node and plant, with time owned by a scheduler.
+
+No threads, no machine clock: the same bits from run to run.
+"""
+
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+
+from hil.blocks import BLOCK_TICKS, Blocks
+from hil.clock import Lockstep
+from hil.endpoint import Endpoint
+from hil.frame_log import FrameLog
+from hil.node import AmplifierNode
+from hil.plant_on_bus import EXCHANGE, PlantOnBus
+from hil.setup import Setup
+from hil.truth import TRUTH_BYTES
+from hil.wire import Wire
+from pkxyz_ctrl.bus_config import CanConfig
+from pkxyz_ctrl.can.frame import Frame
+from pkxyz_ctrl.config import CONFIG_DIR, ConfigError
+from pkxyz_ctrl.controller import Controller
+from pkxyz_ctrl.row import ROW
+from pkxyz_ctrl.runtime import Port, run, start
+
+
+class SimulatedTime:
+    """``runtime.Clock`` of a simulation: waiting lets events happen, computing costs what the bus file says it costs."""
+
+    def __init__(self, clock: Lockstep) -> None:
+        self._clock = clock
+        self.wait_until = clock.run_until
+
+    @property
+    def now_us(self) -> int:
+        """Simulated time."""
+        return self._clock.now_us
+
+    def spend(self, compute_us: int) -> None:
+        """Let ``compute_us`` pass."""
+        self._clock.run_until(self._clock.now_us + compute_us)
+
+
+class WirePort:
+    """``runtime.Port`` on the simulated wire, without the cost of python-can's messages."""
+
+    def __init__(self, clock: Lockstep, endpoint: Endpoint) -> None:
+        self._clock = clock
+        self.send = endpoint.send
+        self._receive_nowait = endpoint.receive_nowait
+        self.unsent = endpoint.pending
+
+    def receive(self, deadline_us: int) -> Frame | None:
+        """The next frame; time passes until it is there, or until ``deadline_us``."""
+        clock = self._clock
+        while (received := self._receive_nowait()) is None:
+            next_us = clock.next_event_us()
+            if next_us is None or next_us > deadline_us:
+                if clock.now_us < deadline_us:
+                    clock.run_until(deadline_us)
+                return None
+            clock.run_until(next_us)
+        return received[0]
+
+
+class LockstepRig:
+    """Everything between controller and plant, wired up for one run."""
+
+    def __init__(self, setup: Setup, frame_log: Path | None = None) -> None:
+        if setup.bus.can is None:
+            raise ConfigError(f"bus {setup.bus.name!r} has no [can]: the lockstep lane is all about frames; use the fast lane")
+        can: CanConfig = setup.bus.can
+        self.setup = setup
+        self.clock = Lockstep()
+        self.wire = Wire(self.clock, can.nominal_bitrate_bit_per_s, can.data_bitrate_bit_per_s, setup.seed)
+        self.plant = PlantOnBus(setup.new_plant())
+        amplifier = self.wire.attach("amplifier")
+        self.node = AmplifierNode(
+            can.driver.node_id, self.clock, amplifier.send, self.plant, CONFIG_DIR / "comb_amplifier.eds",
+            turnaround_us=can.turnaround_us, fd=can.driver.fd, protection=can.driver.protection,
+        )  # fmt: skip
+        amplifier.on_frame = self.node.on_frame
+        self.port: Port = WirePort(self.clock, self.wire.attach("controller"))
+        self.controller = Controller(setup.law, setup.bus, setup.gate, self.port.send)
+        self.log = FrameLog(frame_log, can.channel) if frame_log is not None else None
+        if self.log is not None:
+            self.log.attach(self.wire)
+
+    def run(self, blocks: Blocks) -> tuple[int, float]:
+        """Start the amplifier and run all ticks; returns how many were missed, and the bus load since the first of them."""
+        time = SimulatedTime(self.clock)
+        self.node.power_on()
+        start(time, self.port, self.controller)
+        before = self.wire.statistics()
+        reference, record = _exchange_in_blocks(self, blocks)
+        try:
+            missed = run(time, self.port, self.controller, reference, blocks.ticks, record)
+        finally:
+            record.finish()
+            if self.log is not None:
+                self.log.close()
+        return missed + self.controller.missing_sense, self.wire.bus_load(before)
+
+
+class _Recorder:
+    """Puts the controller's row and the truth beside it into a block, a tick at a time: two copies of bytes."""
+
+    def __init__(self, rig: LockstepRig, blocks: Blocks) -> None:
+        self._blocks = blocks
+        self._rows = memoryview(blocks.rows.view(np.uint8))
+        self._row = rig.controller.row[: ROW.itemsize - TRUTH_BYTES]
+        self._truth = memoryview(rig.plant.exchange.view(np.uint8))[:TRUTH_BYTES]
+        self._used = 0
+
+    def __call__(self, tick: int) -> None:
+        at = self._used * ROW.itemsize
+        middle, end = at + ROW.itemsize - TRUTH_BYTES, at + ROW.itemsize
+        self._rows[at:middle] = self._row
+        self._rows[middle:end] = self._truth
+        self._used += 1
+        if self._used == BLOCK_TICKS:
+            self.finish()
+
+    def finish(self) -> None:
+        """Hand on the rows that wait."""
+        count, self._used = self._used, 0
+        self._blocks.hand_on(count)
+
+
+class _Reference:
+    """The rows of the trajectory for the present block."""
+
+    def __init__(self, rig: LockstepRig, blocks: Blocks) -> None:
+        self._memory = rig.controller.memory
+        self._blocks = blocks
+        self._rows: NDArray[np.float64] = np.empty((0, 9))
+
+    def __call__(self, tick: int) -> NDArray[np.float64]:
+        if tick % BLOCK_TICKS == 0:
+            self._rows = self._blocks.reference(self._memory)
+        return self._rows
+
+
+def _exchange_in_blocks(rig: LockstepRig, blocks: Blocks) -> tuple[_Reference, _Recorder]:
+    assert EXCHANGE.fields is not None and EXCHANGE.fields["position_m"][1] == 0  # the truth leads the exchange ...
+    assert ROW.fields is not None and ROW.fields["position_m"][1] == ROW.itemsize - TRUTH_BYTES  # ... and ends the row
+    return _Reference(rig, blocks), _Recorder(rig, blocks)

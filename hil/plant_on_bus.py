@@ -1,0 +1,91 @@
+"""The plant as the amplifier node sees it: driven and sampled in bus time, one compiled call a tick."""
+
+from collections.abc import Sequence
+
+import numpy as np
+from numba import njit
+
+from hil.truth import observe
+from pkxyz_ctrl.row import TRUTH_FIELDS
+from sim import kernels
+from sim.plant import Plant
+
+EXCHANGE = np.dtype(
+    [
+        *TRUTH_FIELDS,
+        ("advance_us", "i8"),
+        ("is_driven", "i4"),
+        ("drive_count", "i4", (3,)),
+        ("sense_count", "i4", (3,)),
+    ],
+    align=True,
+)
+
+
+@njit(cache=True)
+def _exchange(params, state, exchange) -> None:
+    """What a SYNC means to the plant: move on to now, take new voltages if there are any, be sampled."""
+    x = exchange[0]
+    kernels.advance(params, state, x["advance_us"])
+    observe(params[0], state[0], x)
+    if x["is_driven"] != 0:
+        kernels.drive(params, state, x["drive_count"])
+    kernels.sample(params, state, x["sense_count"])
+    x["is_driven"] = 0
+
+
+class PlantOnBus:
+    """A plant whose time 0 is the first sample: until then it stands in equilibrium at 0 V, however long the start-up takes.
+
+    ``advance_to`` and ``drive`` wait for what follows, so that the SYNC's three steps are one compiled call; whatever ends
+    otherwise (a fault that discharges the combs between two samples) is carried out as it comes.
+    """
+
+    def __init__(self, plant: Plant) -> None:
+        self.plant = plant
+        self.exchange = np.zeros(1, EXCHANGE)
+        self._advance_us = self.exchange["advance_us"]
+        self._is_driven = self.exchange["is_driven"]
+        self._drive_count = self.exchange["drive_count"][0]
+        self._sense_count = self.exchange["sense_count"][0]
+        self._origin_us: int | None = None
+        self._plant_us = plant.t_us
+        self._now_us = 0
+        self._waiting = False
+
+    def advance_to(self, t_us: int) -> None:
+        """It is ``t_us`` on the bus."""
+        if self._waiting:
+            self.settle()
+        self._now_us = t_us
+
+    def drive(self, counts: Sequence[int]) -> None:
+        """The converters take new counts (3,) now."""
+        if self._waiting:
+            self.settle()
+        self._drive_count[:] = counts
+        self._is_driven[0] = 1
+        self._waiting = True
+
+    def sample(self) -> tuple[int, int, int]:
+        """Sample the sense combs now."""
+        if self._origin_us is None:
+            self._origin_us = self._now_us
+        target_us = self._now_us - self._origin_us
+        self._advance_us[0] = target_us - self._plant_us
+        _exchange(self.plant.params, self.plant.state, self.exchange)
+        self._plant_us = target_us
+        self._waiting = False
+        a, b, c = self._sense_count.tolist()
+        return a, b, c
+
+    def settle(self) -> None:
+        """Carry out what waits: move the plant to now, and apply the counts that came without a sample after them."""
+        if self._origin_us is not None:
+            target_us = self._now_us - self._origin_us
+            self.plant.advance_to(target_us)
+            self._plant_us = target_us
+        if self._is_driven[0]:
+            kernels.drive(self.plant.params, self.plant.state, self._drive_count)
+            self._is_driven[0] = 0
+        self._waiting = False

@@ -1,0 +1,161 @@
+"""The controller of one stage: driver, cycle and gate around one law. Frames in, frames out; time is handed in.
+
+It owns no clock and no bus. ``runtime`` drives it, whoever owns the time.
+"""
+
+import struct
+from collections.abc import Callable
+
+import numpy as np
+from numpy.typing import NDArray
+
+from pkxyz_ctrl import cycle as cycling
+from pkxyz_ctrl.bus_config import BusConfig, CanConfig
+from pkxyz_ctrl.can.driver import AmplifierDriver, DriverState
+from pkxyz_ctrl.can.frame import Frame
+from pkxyz_ctrl.row import ROW
+from pkxyz_ctrl.safety.gate import GateConfig, TransmitGate
+from pkxyz_ctrl.safety.modes import Event, Mode
+from pkxyz_ctrl.safety.trips import Trip, explain
+
+Array = NDArray[np.float64]
+Send = Callable[[Frame], object]
+
+_SEEN = struct.Struct("<7i")  # event, sense_status, node_events, overrun, sense_count: the first fields of cycle.INPUT
+_COUNTS = struct.Struct("<3i")
+_MODE = struct.Struct("<i")
+
+
+class StartUpError(RuntimeError):
+    """The amplifier could not be brought to operation; the message says what was expected, what came and what to do."""
+
+
+class Controller:
+    """One stage under control.
+
+    ``send`` takes every frame that may go out. ``faults`` collects a sentence for each fault decision. ``memory`` is the
+    (1,) array of ``cycle.MEMORY`` that the cycle works on, ``row`` the bytes of its latest record.
+    """
+
+    def __init__(self, law: NDArray[np.void], bus: BusConfig, gate: GateConfig, send: Send) -> None:
+        if bus.can is None:
+            raise ValueError(f"bus {bus.name!r} has no [can]: nothing to control over")
+        self.can: CanConfig = bus.can
+        self.driver = AmplifierDriver(bus.can.driver)
+        self.gate = TransmitGate(gate)
+        self.faults: list[str] = []
+        self.missing_sense = 0
+        self.law = law
+        self.memory = cycling.new_memory(Mode.BOOT)
+        self._send = send
+        self._bytes = memoryview(self.memory).cast("B")
+        fields = cycling.MEMORY.fields
+        assert fields is not None
+        self._input_at, self._row_at, self._mode_at = (fields[name][1] for name in ("input", "row", "mode"))
+        self._drive_at = self._row_at + ROW.fields["drive_count"][1]
+        self.row = self._bytes[self._row_at : self._row_at + ROW.itemsize]
+        self.mode = int(Mode.BOOT)
+        self.period_us = bus.period_us
+        self._event = int(Event.NONE)
+        self._blocked = 0
+        self._take_sense = self.driver.take_sense
+
+    # -- start and stop ---------------------------------------------------------------------------------------------
+
+    def start(self, t_us: int) -> None:
+        """Begin the start-up dialogue with the amplifier."""
+        for frame in self.driver.start(t_us):
+            self.send(frame, t_us)
+
+    def dialogue(self, frame: Frame | None, t_us: int) -> bool:
+        """One step of the start-up: a frame that came, or None if none came for a while. True once the node is operational.
+
+        Raises ``StartUpError``.
+        """
+        driver = self.driver
+        for reply in driver.poll(t_us) if frame is None else driver.receive(frame, t_us):
+            self.send(reply, t_us)
+        if driver.state is DriverState.FAILED:
+            raise StartUpError(driver.failure)
+        if driver.state is DriverState.CONFIGURING and self.mode == Mode.BOOT:
+            self._apply(Event.NODE_FOUND)
+        if driver.state is not DriverState.OPERATIONAL:
+            return False
+        self._apply(Event.NODE_READY)
+        return True
+
+    def stop(self, t_us: int) -> None:
+        """0 V and pre-operational, whatever the mode."""
+        for frame in self.driver.stop(t_us):
+            self.send(frame, t_us)
+
+    def request(self, event: Event) -> None:
+        """Ask for an event at the next tick: HOME, ENABLE, TRACK, HOLD, DISABLE, CLEAR."""
+        self._event = int(event)
+
+    # -- one tick ---------------------------------------------------------------------------------------------------
+
+    def begin(self, t_us: int) -> None:
+        """The tick begins: SYNC, on which the amplifier applies the last voltages and samples."""
+        self.send(self.driver.sync(t_us), t_us)
+
+    def receive(self, frame: Frame, t_us: int) -> bool:
+        """Take a frame from the bus; True once this tick's sense values are there."""
+        driver = self.driver
+        for reply in driver.receive(frame, t_us):
+            self.send(reply, t_us)
+        return driver.sense_fresh
+
+    def compute(self, reference: Array, overrun: int) -> None:
+        """Run the cycle on what has come since the SYNC. ``reference`` (n, 9), ``overrun`` ticks skipped before this one."""
+        c1, c2, c3, status = self._take_sense()
+        if status & 1:
+            self.missing_sense += 1
+        memory = self._bytes
+        _SEEN.pack_into(memory, self._input_at, self._event, status, self.driver.node_events, overrun, c1, c2, c3)
+        if self._blocked:
+            self.memory["input"]["trips"] = self._blocked
+            self._blocked = 0
+        self._event = 0
+        cycling.cycle(self.law, self.memory, reference)
+        mode = _MODE.unpack_from(memory, self._mode_at)[0]
+        if mode != self.mode:
+            self._enter(mode)
+
+    def finish(self, t_us: int, heartbeat_until_us: int) -> None:
+        """Send the voltages of this tick, and our heartbeat behind them if it is due and still fits before the next SYNC."""
+        driver = self.driver
+        self.send(driver.drive(_COUNTS.unpack_from(self._bytes, self._drive_at), t_us), t_us)
+        heartbeat = driver.heartbeat_due(t_us)
+        if heartbeat is not None and t_us <= heartbeat_until_us:
+            self.send(heartbeat, t_us)
+            driver.heartbeat_sent(t_us)
+
+    def send(self, frame: Frame, t_us: int) -> None:
+        """Send a frame, if the gate lets it pass; a voltage that it blocks becomes 0 V, and the next tick a fault."""
+        reason = self.gate.check(frame, self.mode, t_us)
+        if reason is None:
+            self._send(frame)
+            return
+        self.faults.append(reason)
+        self._blocked = int(Trip.GATE_BLOCKED)
+        if frame.can_id == 0x300 + self.can.driver.node_id:
+            discharged = self.driver.drive((0, 0, 0), t_us)
+            if self.gate.check(discharged, self.mode, t_us) is None:
+                self._send(discharged)
+
+    # -- modes ------------------------------------------------------------------------------------------------------
+
+    def _apply(self, event: Event) -> None:
+        """Let an event of the start-up act on the mode, before there are ticks."""
+        self.mode = int(cycling.next_mode(self.mode, int(event)))
+        self.memory["mode"] = self.mode
+
+    def _enter(self, mode: int) -> None:
+        self.mode = mode
+        if mode == Mode.FAULT:
+            row = self.memory["row"][0]
+            reason = explain(int(row["trips"]))
+            emergencies = "".join(f"; {e}" for e in self.driver.emergencies)
+            detail = f" [{self.driver.failure}]" if self.driver.failure else ""
+            self.faults.append(f"at {row['t_us'] * 1e-6:.4f} s: {reason}{detail}{emergencies}")

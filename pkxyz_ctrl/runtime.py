@@ -1,0 +1,79 @@
+"""The fixed-rate loop: wait, exchange, compute, record. Whoever owns the time and the bus is handed in.
+
+The same loop runs in lockstep, at wall-clock rate and against hardware; only ``Clock`` and ``Port`` differ.
+"""
+
+from collections.abc import Callable
+from typing import Protocol
+
+import numpy as np
+from numpy.typing import NDArray
+
+from pkxyz_ctrl.can.frame import Frame
+from pkxyz_ctrl.controller import Controller
+
+_POLL_US = 1000
+
+Reference = Callable[[int], NDArray[np.float64]]
+"""Rows of the trajectory for the tick of an index; it sets ``reference_base`` when it hands out another block."""
+
+
+class Clock(Protocol):
+    """Who owns the time. Integer microseconds."""
+
+    @property
+    def now_us(self) -> int: ...
+
+    def wait_until(self, t_us: int) -> None:
+        """Return at ``t_us``, or at once if that is past."""
+
+    def spend(self, compute_us: int) -> None:
+        """Account for the time that computing takes; on a clock that runs by itself there is nothing to do."""
+
+
+class Port(Protocol):
+    """One connection to a bus."""
+
+    def send(self, frame: Frame) -> object: ...
+
+    def receive(self, deadline_us: int) -> Frame | None:
+        """The next frame, or None once it is ``deadline_us``."""
+
+    def unsent(self) -> int:
+        """Frames that still wait to go out, as far as the port can tell."""
+
+
+def start(clock: Clock, port: Port, controller: Controller) -> None:
+    """Bring the amplifier to operation. Raises ``StartUpError``."""
+    controller.start(clock.now_us)
+    while not controller.dialogue(port.receive(clock.now_us + _POLL_US), clock.now_us):
+        pass
+
+
+def run(
+    clock: Clock, port: Port, controller: Controller, reference: Reference, ticks: int, record: Callable[[int], object]
+) -> int:
+    """Run ``ticks`` periods from the next instant of ``clock``; returns how many were missed: skipped, or late on the wire.
+
+    Deadlines are absolute: a tick that begins late shifts no other, and ticks that are past are skipped whole.
+    """
+    period_us, compute_us = controller.period_us, controller.can.compute_us
+    answer_us, heartbeat_us = controller.can.sense_deadline_us, controller.can.heartbeat_deadline_us
+    begin, receive, compute, finish = controller.begin, controller.receive, controller.compute, controller.finish
+    wait_until, spend, receive_frame, unsent = clock.wait_until, clock.spend, port.receive, port.unsent
+    missed, t_us = 0, clock.now_us + period_us
+    for tick in range(ticks):
+        wait_until(t_us)
+        overrun = (clock.now_us - t_us) // period_us
+        late = overrun + (1 if unsent() else 0)
+        t_us += overrun * period_us
+        begin(t_us)
+        while (frame := receive_frame(t_us + answer_us)) is not None and not receive(frame, clock.now_us):
+            pass
+        compute(reference(tick), overrun)
+        spend(compute_us)
+        finish(clock.now_us, t_us + heartbeat_us)
+        record(tick)
+        missed += late
+        t_us += period_us
+    return missed
