@@ -62,25 +62,27 @@ class Plant:
             sense_zero_f=sense_offset_f,
         )
         self.state = state_at_rest(self.params, config, seed)
+        self._time_us = self.state["t_us"]  # a view
         self._counts_in = np.zeros(3, np.int32)
         self._counts_out = np.zeros(3, np.int32)
 
     @property
     def t_us(self) -> int:
         """Time that the plant has been integrated to."""
-        return int(self.state["t_us"][0])
+        return int(self._time_us.item())
 
     def advance_to(self, t_us: int) -> None:
         """Integrate up to t_us with what the converters hold. Raises ValueError for a time that has passed."""
-        dt_us = t_us - int(self.state["t_us"][0])
+        dt_us = t_us - self._time_us.item()
         if dt_us < 0:
             raise ValueError(f"the plant is at {self.t_us} us already and cannot go back to {t_us} us")
         kernels.advance(self.params, self.state, dt_us)
 
     def drive(self, counts: Sequence[int] | np.ndarray) -> None:
         """Put three INTEGER16 drive counts on the converters now."""
-        self._counts_in[:] = counts
-        kernels.drive(self.params, self.state, self._counts_in)
+        row = self._counts_in
+        row[0], row[1], row[2] = counts
+        kernels.drive(self.params, self.state, row)
 
     def sample(self) -> tuple[int, int, int]:
         """Sample the three sense channels now; their noise is drawn. INTEGER16 counts, saturated."""

@@ -87,7 +87,7 @@ def test_a_switch_acts_where_it_should_and_nowhere_else(name):
 
 
 def test_weight_and_tilt():
-    """Level: m g / K_zz = 417 nm down. If that is the rest pose, a tilt about x pushes along y: m g sin(tilt) / K_xx."""
+    """Level: m g / K_zz = 417 nm. If that is the rest pose, a tilt about x pushes along y: m g sin(tilt) / K_xx."""
     sag = plant(config(gravity={"level_is_rest": False})).position_m
     assert sag[2] == pytest.approx(-4.833e-6 * 9.80665 / 113.64, rel=3e-3)
     assert abs(sag[0]) < 1e-15
