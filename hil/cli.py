@@ -38,19 +38,17 @@ class Lane(StrEnum):
 def main() -> NoReturn:
     """Entry point: runs the command line and turns what can go wrong into one line each and an exit code."""
     try:
-        app(standalone_mode=False)
+        code = app(standalone_mode=False)  # what typer.Exit said, or the command's None
     except ConfigError as error:
         _fail(str(error))
     except KeyboardInterrupt:
         _notes.print("interrupted")
         sys.exit(130)
     except Exception as error:
-        if (code := getattr(error, "exit_code", None)) is None:
+        if (message := getattr(error, "format_message", None)) is None:
             raise
-        if message := getattr(error, "format_message", lambda: "")():  # wrong usage, in the words of the parser
-            _fail(f"{message.replace('Value error, ', '')} (see --help)")
-        sys.exit(code)
-    sys.exit(0)
+        _fail(f"{message().replace('Value error, ', '')} (see --help)")  # wrong usage, in the words of the parser
+    sys.exit(code)
 
 
 def _fail(message: str) -> NoReturn:
@@ -90,21 +88,22 @@ def sil(
     as_json: Annotated[bool, typer.Option("--json", help="Print the summary as JSON, and nothing else.")] = False,
 ) -> None:
     """Close the loop on a scenario; exit code 0 if its checks hold, 1 if not, 2 for bad input, 130 if interrupted."""
-    from hil.recording import RecordingError
-
     _say_if_compiling(quiet=as_json)
     from hil.scenario import load_scenario
 
     loaded = load_scenario(scenario, seed=seed, stage=stage, plant=plant, controller=controller, bus=bus)
+    from hil.recording import RecordingError
     from hil.run_folder import RunFolder, next_free
     from hil.sil import draw, require_bus
+    from pkxyz_ctrl.controller import StartUpError
+    from pkxyz_ctrl.design.estimator_gain import DesignError
 
     require_bus(loaded, lane.value)
     folder = RunFolder(out if out is not None else next_free(Path("runs"), loaded.config.name, lane.value))
     try:
         summary = _run_with_progress(folder, loaded, lane.value, quiet=as_json)
         draw(folder, summary)
-    except RecordingError as error:
+    except (RecordingError, StartUpError, DesignError) as error:
         print(f"pkxyz: {error}", file=sys.stderr)
         raise typer.Exit(1) from None
     if as_json:

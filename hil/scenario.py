@@ -7,12 +7,11 @@
 import difflib
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Annotated, Any, Self
+from typing import TYPE_CHECKING, Annotated, Any, Self
 
 from pydantic import BaseModel, Field, field_validator, model_validator
 
 from hil.metrics import METRICS
-from hil.setup import Setup
 from pkxyz_ctrl import config
 from pkxyz_ctrl.bus_config import BusConfig
 from pkxyz_ctrl.config import ConfigError, FrozenModel
@@ -22,6 +21,9 @@ from pkxyz_ctrl.stage_config import StageConfig
 from pkxyz_ctrl.trajectory import Segment, Trajectory, TrajectoryError
 from pkxyz_ctrl.trajectory.check import check_against
 from sim.config import Device, PlantConfig
+
+if TYPE_CHECKING:
+    from hil.setup import Setup
 
 Text = Annotated[str, Field(min_length=1)]
 
@@ -82,8 +84,10 @@ class Scenario:
     bus: BusConfig
     trajectory: Trajectory
 
-    def setup(self) -> Setup:
+    def setup(self) -> "Setup":
         """What the lanes are handed."""
+        from hil.setup import Setup  # brings the design tools, which a mistake in a file need not wait for
+
         return Setup(
             self.stage, self.device, self.plant, self.controller, self.bus, self.trajectory,
             self.config.duration_s, self.config.seed,

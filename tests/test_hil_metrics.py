@@ -115,4 +115,4 @@ def test_bus_load_is_not_judged_where_there_is_no_bus():
 
 def test_every_figure_can_be_bounded_and_everything_that_can_be_bounded_is_described():
     assert set(figures_of(tracking_rows())) <= set(METRICS)
-    assert all(words and words[0].islower() or words.startswith("RMS") for words in METRICS.values())
+    assert all((words and words[0].islower()) or words.startswith("RMS") for words in METRICS.values())
