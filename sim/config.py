@@ -1,6 +1,7 @@
 """A plant file: every effect with its own switch and size. SI units.
 
-With ``on = false`` an effect's sizes change nothing. Random effects have ``seed_offset``, which moves that stream alone."""
+With ``on = false`` an effect's sizes change nothing. Random effects have ``seed_offset``, which moves that stream
+alone."""
 
 import tomllib
 from pathlib import Path

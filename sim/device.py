@@ -1,4 +1,4 @@
-"""The device as a stage file gives it, read on its own: that file is shared with the controller as data, no code is. SI."""
+"""The device as a stage file gives it, read on its own: the file is shared with the controller, code is not. SI."""
 
 import math
 import tomllib
