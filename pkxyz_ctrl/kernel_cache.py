@@ -6,11 +6,13 @@ against yesterday's callee would go on running. One digest over every file that 
 
 import hashlib
 import os
+import re
 import shutil
 import sys
 from pathlib import Path
 
 _PACKAGES = ("pkxyz_ctrl", "hil", "sim")
+_IMPORT = re.compile(r"^from ((?:pkxyz_ctrl|hil|sim)[\w.]*) import (.*)", re.MULTILINE)
 _KEPT = 4
 
 
@@ -38,13 +40,21 @@ def is_cold() -> bool:
 
 
 def _digest_of_kernels() -> str:
-    digest = hashlib.sha256(sys.version.encode())
+    """Over every file that holds a kernel and all of ours that these import: a kernel freezes the constants that it uses."""
     root = Path(__file__).parent.parent
-    for package in _PACKAGES:
-        for path in sorted((root / package).rglob("*.py")):
-            source = path.read_bytes()
-            if b"njit" in source:
-                digest.update(str(path).encode() + source)
+    sources = {path: path.read_bytes() for package in _PACKAGES for path in sorted((root / package).rglob("*.py"))}
+    relevant: set[Path] = set()
+    waiting = [path for path, source in sources.items() if b"njit" in source]
+    while waiting:
+        path = waiting.pop()
+        if path not in relevant and path in sources:
+            relevant.add(path)
+            for module, names in _IMPORT.findall(sources[path].decode()):
+                folder = root / module.replace(".", "/")
+                waiting += [folder.with_suffix(".py"), *(folder / f"{name}.py" for name in re.findall(r"\w+", names))]
+    digest = hashlib.sha256(sys.version.encode())
+    for path in sorted(relevant):
+        digest.update(str(path).encode() + sources[path])
     return digest.hexdigest()[:16]
 
 

@@ -5,8 +5,8 @@ and approached through the amplifier's pole::
 
     s+ = Phi s + Gamma w + Gamma_lag (w_old - w),   w = J(x)^T F - grad V(x) + K_0 (x - x_0)
 
-so the linear part carries the resonance and the input w the exact energy gradient and Jacobian at the estimate: the filter
-follows the stage over the whole workspace with one gain. The commanded forces of the last tick act from the sample of this
+so the linear part carries the resonance and the input w the exact energy gradient and Jacobian, taken where the estimate
+will be in mid-period: the filter follows the stage over the whole workspace with one gain. The commanded forces of the last tick act from the sample of this
 one, hence the loop's period of delay is in the bookkeeping of w, not in extra states. A sample shows x - tau v, tau being
 the sense chain's delay.
 """
@@ -29,6 +29,7 @@ ESTIMATOR = np.dtype(
         ("stiffness_n_per_m", "f8", (3, 3)),  # K_0
         ("operating_point_m", "f8", (3,)),  # x_0
         ("sense_delay_s", "f8"),  # tau
+        ("half_period_s", "f8"),  # T/2
     ],
     align=True,
 )
@@ -53,6 +54,14 @@ def update(estimator, estimate, measured_m: Array, has_measurement: bool) -> Non
         innovation[i] = measured_m[i] - origin[i] - (predicted[i] - tau * predicted[3 + i]) if has_measurement else 0.0
     for i in range(9):
         filtered[i] = predicted[i] + gain[i, 0] * innovation[0] + gain[i, 1] * innovation[1] + gain[i, 2] * innovation[2]
+
+
+@njit(cache=True)
+def midway(estimator, s: Array, position_m: Array) -> None:
+    """Position (3,) half a period after the state ``s`` (9,), where ``net_input`` is to be evaluated: at the start of the period
+    it would lag behind a moving stage, and the disturbance would have to make up for it."""
+    for i in range(3):
+        position_m[i] = estimator["operating_point_m"][i] + s[i] + estimator["half_period_s"] * s[3 + i]
 
 
 @njit(cache=True)

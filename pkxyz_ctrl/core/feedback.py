@@ -2,7 +2,7 @@
 
     w = grad V(r_f) + C v_f + m a_f  -  g [ K_x (x - r) + K_v (v - r') + d ]
 
-r, r' are the reference at the instant the force begins to act (one period after the sample), x, v, d the estimate predicted
+r, r' are the reference (as ``sampled_target`` sees it) at the instant the force begins to act (one period after the sample), x, v, d the estimate predicted
 for it; r_f, v_f, a_f are the reference at the middle of the interval in which it acts, as the amplifier lets it act. Combs
 only pull, so at rest there is no force to take away: the feedback's authority g rises from 0 to 1 with the least of the
 forces that hold r.
@@ -51,6 +51,21 @@ def add_motion(feedback, row: Array, out: Array) -> None:
         out[i] += mass * row[6 + i]
         for k in range(3):
             out[i] += damping[i, k] * row[3 + k]
+
+
+@njit(cache=True)
+def sampled_target(feedback, now: Array, feedforward_n: Array, feedforward_last_n: Array, out: Array) -> None:
+    """The row (9,) that the sampled state has to meet: ``now``, with the velocity that held forces really give at a sample.
+
+    A force that is held for a period T in place of one that grows by f' in the time makes the velocity ripple about its mean;
+    at the samples the ripple is -f' T^2 / (12 m), which at 631 Hz and 5 kHz is 5 % of the velocity. Without this term the
+    feedback takes the ripple for an error and pushes the stage ahead of its reference.
+    """
+    share = feedback["period_s"] / (12.0 * feedback["mass_kg"])
+    for i in range(3):
+        out[i] = now[i]
+        out[3 + i] = now[3 + i] - share * (feedforward_n[i] - feedforward_last_n[i])
+        out[6 + i] = now[6 + i]
 
 
 @njit(cache=True)

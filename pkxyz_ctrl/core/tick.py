@@ -74,6 +74,8 @@ MEMORY = np.dtype(
         ("demand_n", "f8", (3,)),
         ("slack_n", "f8", (3,)),
         ("force_n", "f8", (3,)),
+        ("feedforward_n", "f8", (3,)),  # of the last tick, if the loop was closed then
+        ("feedforward_known", "i4"),
         ("active_set_steps", "i4"),
         ("scratch", SCRATCH),
     ],
@@ -101,15 +103,14 @@ def estimate(law, memory, has_measurement: bool) -> None:
     filtering.update(estimator, state, memory["measurement_m"], has_measurement)
     position, w, w_change = scratch["position_m"], scratch["w_n"], scratch["w_change_n"]
     acting, acted, start = scratch["acting_n"], scratch["acted_n"], scratch["state"]
-    origin, ahead = estimator["operating_point_m"], state["ahead"]
+    ahead = state["ahead"]
     start[:] = state["filtered"]
     delay = law["delay_periods"]
     for step in range(delay):
         age = delay - 1 - step
         voltage.forces_of_counts(drive, memory["count"][age], acting)
         voltage.forces_of_counts(drive, memory["count"][age + 1], acted)
-        for i in range(3):
-            position[i] = origin[i] + start[i]
+        filtering.midway(estimator, start, position)
         filtering.net_input(law["geometry"], law["elasticity"], estimator, position, acting, acted, w, w_change)
         filtering.predict(estimator, start, w, w_change, ahead)
         if step == 0:
@@ -132,7 +133,11 @@ def act(law, memory, now: Array, after: Array) -> bool:
     energy_gradient(geometry, law["elasticity"], row[0:3], demand)
     share = feedback.authority(gains, inverse, demand)
     feedback.add_motion(gains, row, demand)
-    feedback.add_feedback(gains, law["estimator"]["operating_point_m"], memory["estimate"]["ahead"], now, share, demand)
+    last = memory["feedforward_n"] if memory["feedforward_known"] != 0 else demand
+    feedback.sampled_target(gains, now, demand, last, row)
+    memory["feedforward_n"][:] = demand
+    memory["feedforward_known"] = 1
+    feedback.add_feedback(gains, law["estimator"]["operating_point_m"], memory["estimate"]["ahead"], row, share, demand)
     _push(memory)
     voltage.force_limits(drive, count[1], scratch["lower_n"], scratch["upper_n"])
     memory["active_set_steps"] = allocation.allocate(j, inverse, demand, scratch["lower_n"], scratch["upper_n"], force)
@@ -160,6 +165,7 @@ def release(memory) -> None:
         memory["slack_n"][i] = 0.0
         memory["force_n"][i] = 0.0
     memory["active_set_steps"] = 0
+    memory["feedforward_known"] = 0
 
 
 @njit(cache=True)

@@ -83,6 +83,7 @@ def _fill_estimator(
     law["stiffness_n_per_m"] = model.stiffness_n_per_m
     law["operating_point_m"] = model.position_m
     law["sense_delay_s"] = stage.config.sense.delay_s
+    law["half_period_s"] = 0.5 * bus.period_s
 
 
 def _fill_feedback(
