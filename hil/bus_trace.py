@@ -8,6 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from hil.frame_time import frame_duration_ns
+from pkxyz_ctrl.can.cob_id import SYNC
 from pkxyz_ctrl.can.frame import Frame
 
 _BINS = 110
@@ -15,7 +16,7 @@ _BIN_BYTES = 32_768  # a bin is judged by at most this much of the log, about 0.
 
 
 class BusTrace(NamedTuple):
-    """Load at the middle of each sampled stretch of time."""
+    """Load at the middle of each sampled stretch of time since the first SYNC, which begins tick 0."""
 
     t_s: NDArray[np.float64]
     load: NDArray[np.float64]
@@ -29,18 +30,23 @@ def read_bus_trace(frame_log: str | Path, can: dict[str, Any]) -> BusTrace | Non
     size = Path(frame_log).stat().st_size
     step = math.ceil(size / _BINS)
     times, loads = [], []
+    first_sync_s: float | None = None
     with Path(frame_log).open("rb") as file:
         for number in range(_BINS):
             file.seek(number * step)
             lines = file.read(min(step, _BIN_BYTES)).split(b"\n")
             frames = [parsed for line in lines[1 if number else 0 : -1] if (parsed := _parse(line)) is not None]
+            if first_sync_s is None:
+                first_sync_s = next(
+                    (s - frame_duration_ns(f, *rates) * 1e-9 for s, f in frames if f.can_id == SYNC), None
+                )
             if len(frames) < 2 or frames[-1][0] <= frames[0][0]:
                 continue
             busy_ns = sum(frame_duration_ns(frame, *rates) for _, frame in frames[1:])
             begin_s, end_s = frames[0][0], frames[-1][0]  # a time stamp is the end of its frame
             times.append((begin_s + end_s) / 2)
             loads.append(busy_ns * 1e-9 / (end_s - begin_s))
-    return BusTrace(np.array(times), np.array(loads)) if len(times) > 1 else None
+    return BusTrace(np.array(times) - (first_sync_s or 0.0), np.array(loads)) if len(times) > 1 else None
 
 
 def _parse(line: bytes) -> tuple[float, Frame] | None:

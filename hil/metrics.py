@@ -51,10 +51,11 @@ class _Sums:
 
     def add(self, values: NDArray[np.float64]) -> None:
         if len(values):
+            rows = np.ascontiguousarray(values.T)  # reductions along long rows are several times faster
             self.count += len(values)
-            self.total += values.sum(axis=0)
-            self.squares += (values * values).sum(axis=0)
-            self.largest = np.maximum(self.largest, np.abs(values).max(axis=0))
+            self.total += rows.sum(axis=1)
+            self.squares += np.einsum("ij,ij->i", rows, rows)
+            self.largest = np.maximum(self.largest, np.maximum(rows.max(axis=1), -rows.min(axis=1)))
 
     def rms(self) -> NDArray[np.float64]:
         return np.sqrt(self.squares / self.count)
@@ -86,15 +87,18 @@ class Metrics:
         self.fault_ticks += int(np.count_nonzero(block["mode"] == Mode.FAULT))
         tick = block["reference_tick"]
         t_us = np.where((tick >= 0) & (block["mode"] == Mode.TRACKING), tick * self._period_us, -1)
+        if len(t_us) == 0:
+            return
+        span = int(t_us.min()), int(t_us.max())
         for window in self._scans:
-            inside = (t_us >= window[0]) & (t_us < window[1])
-            if inside.any():
+            inside = _inside(t_us, span, window)
+            if inside is not None:
                 truth = block["position_m"][inside]
                 self._error.add(truth - block["reference_m"][inside])
                 self._estimate.add(block["estimate_m"][inside] - truth)
         for window, noise in zip(self._stills, self._noise, strict=True):
-            inside = (t_us >= window[0]) & (t_us < window[1])
-            if inside.any():  # less the reference, which is constant here: keeps digits
+            inside = _inside(t_us, span, window)
+            if inside is not None:  # less the reference, which is constant here: keeps digits
                 noise.add(block["position_m"][inside] - block["reference_m"][inside])
 
     def figures(self) -> dict[str, Any]:
@@ -116,6 +120,17 @@ class Metrics:
             return None
         squares = np.sum([h.squared_deviations() for h in holds], axis=0)
         return _by_axis(np.sqrt(squares / sum(h.count - 1 for h in holds)))
+
+
+def _inside(t_us: NDArray[np.int64], span: tuple[int, int], window: tuple[int, int]) -> Any:
+    """What selects the instants inside a window: all, a mask, or None for none. Most blocks lie on one side of most."""
+    begin, end = window
+    if span[1] < begin or span[0] >= end:
+        return None
+    if begin <= span[0] and span[1] < end:
+        return slice(None)
+    mask = (t_us >= begin) & (t_us < end)
+    return mask if mask.any() else None
 
 
 def evaluate(checks: Mapping[str, _HasBounds], summary: Mapping[str, Any]) -> list[dict[str, Any]]:

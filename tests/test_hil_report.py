@@ -81,6 +81,9 @@ def test_bus_load_over_time_is_that_of_the_frames(tmp_path):
     for n in range(6000):  # first half with a frame every 200 us, second with one every 100 us
         t_us = n * 200 if n < 3000 else 600_000 + (n - 3000) * 100
         lines.append(f"({t_us // 10**6}.{t_us % 10**6:06d}) pkxyz 28A##1{frame.data.hex().upper()}\n")
+    sync_us = frame_duration_ns(Frame(0x080, b"\x01", True, True), 1_000_000, 5_000_000) / 1000
+    shifted = [line.replace("(0.", "(7.").replace("(1.", "(8.") for line in lines]
+    shifted.insert(0, f"({7 + round(sync_us) * 1e-6:.6f}) pkxyz 080##101\n")  # a SYNC that began at 7 s
     lines.insert(100, "(0.019801) pkxyz 20000080#0000000000000000\n")  # an error frame is no frame of the wire's
     (tmp_path / "frames.log").write_text("".join(lines))
     trace = read_bus_trace(tmp_path / "frames.log", can)
@@ -89,6 +92,9 @@ def test_bus_load_over_time_is_that_of_the_frames(tmp_path):
     assert trace.load[late] == pytest.approx(duration_us / 100, rel=1e-3)
     assert early.sum() > 40
     assert late.sum() > 40
+    (tmp_path / "late.log").write_text("".join(shifted))
+    late_trace = read_bus_trace(tmp_path / "late.log", can)
+    assert late_trace.t_s[1:] == pytest.approx(trace.t_s[1:], abs=2e-4)
     (tmp_path / "empty.log").write_text("")
     assert read_bus_trace(tmp_path / "empty.log", can) is None
 
