@@ -17,7 +17,7 @@ CONTROLLER = 0x77F
 TURNAROUND_US = 7
 
 
-class Crc8H2F(Crc8Base):
+class Crc8H2F(Crc8Base):  # type: ignore[misc]
     """AUTOSAR's, by a library that neither side uses."""
 
     _poly, _initvalue, _xor_output = 0x2F, 0xFF, 0xFF
@@ -150,7 +150,7 @@ class Rig:
         return [t_us for t_us, frame in self.sent if frame.can_id == cob_id]
 
 
-class LockstepNetwork(canopen.Network):
+class LockstepNetwork(canopen.Network):  # type: ignore[misc]
     """The canopen library as master: no threads, and a reply is there before ``send_message`` returns."""
 
     def __init__(self, rig: Rig) -> None:

@@ -77,7 +77,7 @@ def test_the_controllers_codec_reads_the_sense_pdo() -> None:
 
 def test_drive_is_applied_before_the_sample_and_at_the_same_instant() -> None:
     rig = operational()
-    order = []
+    order: list[tuple[object, ...]] = []
     rig.plant.advance_to = lambda t_us: order.append(("advance", t_us))  # type: ignore[method-assign]
     rig.plant.drive = lambda counts: order.append(("drive", counts))  # type: ignore[method-assign]
     rig.plant.sample = lambda: order.append(("sample",)) or ZERO  # type: ignore[method-assign,func-returns-value]
