@@ -1,21 +1,36 @@
-"""The fast lane: the same cycle and the same plant in one compiled loop, with the delays and the quantisation of the bus.
+"""The fast lane: the same cycle and the same plant in one compiled loop, with the delays and the quantisation of the
+bus.
 
 No frames, no gate, no driver: on a fault-free scenario they change no bit, and a test holds the two lanes to that.
 """
 
+import numpy as np
 from numba import njit
+from numpy.typing import NDArray
 
 from hil.truth import observe
 from pkxyz_ctrl.cycle import cycle
 from sim import kernels
 
+Array = NDArray[np.float64]
+Records = NDArray[np.void]
+
 
 @njit(cache=True)
-def run_block(law, memory, reference, plant_params, plant_state, sample_us, rows, count) -> None:
+def run_block(
+    law: np.void,
+    memory: np.void,
+    reference: Array,
+    plant_params: Records,
+    plant_state: Records,
+    sample_us: NDArray[np.int64],
+    rows: Records,
+    count: int,
+) -> None:
     """Run ``count`` ticks and write their rows to ``rows[:count]``.
 
-    ``sample_us`` (count,) int64: plant time of each sample. At a sample the drive counts of the last tick are applied, as
-    the amplifier does on SYNC; the truth is taken just before them.
+    ``sample_us`` (count,) int64: plant time of each sample. At a sample the drive counts of the last tick are
+    applied, as the amplifier does on SYNC; the truth is taken just before them.
     """
     seen, row = memory[0]["input"], memory[0]["row"]
     for i in range(count):

@@ -43,9 +43,9 @@ def run(
 ) -> LaneResult:
     """Run a setup in the lane "lockstep" or "fast".
 
-    ``on_block`` gets the rows (n,) of ``ROW`` in order and must not keep them; ``on_progress`` the ticks done and in all.
-    What was run before an exception (Ctrl-C) has been handed on. Raises ``ConfigError`` for a bus that the lane can't use
-    and ``StartUpError`` where the amplifier doesn't start.
+    ``on_block`` gets the rows (n,) of ``ROW`` in order and must not keep them; ``on_progress`` the ticks done and in
+    all. What was run before an exception (Ctrl-C) has been handed on. Raises ``ConfigError`` for a bus that the lane
+    can't use and ``StartUpError`` where the amplifier doesn't start.
     """
     blocks = Blocks(setup.trajectory, setup.bus.period_us, setup.ticks, on_block, on_progress)
     law = setup.law  # designed before the stopwatch runs
@@ -68,17 +68,22 @@ def _run_fast(setup: Setup, law: NDArray[np.void], blocks: Blocks) -> list[str]:
     mode = int(Mode.IDLE)
     while count := blocks.next_count():
         reference = blocks.reference(memory)
-        run_block(law, memory, reference, plant.params, plant.state, _sample_us(setup, blocks.done, count), blocks.rows, count)
-        entered = np.flatnonzero((blocks.rows["mode"][:count] == Mode.FAULT) & (np.r_[mode, blocks.rows["mode"][: count - 1]] != Mode.FAULT))
-        for i in entered:
-            faults.append(f"at {blocks.rows['t_us'][i] * 1e-6:.4f} s: {explain(int(blocks.rows['trips'][i]))}")
+        run_block(
+            law, memory, reference, plant.params, plant.state, _sample_us(setup, blocks.done, count), blocks.rows, count
+        )
+        entered = np.flatnonzero(
+            (blocks.rows["mode"][:count] == Mode.FAULT) & (np.r_[mode, blocks.rows["mode"][: count - 1]] != Mode.FAULT)
+        )
+        faults += [f"at {row['t_us'] * 1e-6:.4f} s: {explain(int(row['trips']))}" for row in blocks.rows[entered]]
         mode = int(blocks.rows["mode"][count - 1])
         blocks.hand_on(count)
     return faults
 
 
 def _sample_us(setup: Setup, first: int, count: int) -> NDArray[np.int64]:
-    """Plant time of the samples: the end of each tick's SYNC, whose length depends on its counter, since the first one."""
+    """Plant time of the samples: the end of each tick's SYNC, whose length depends on its counter, since the first
+    one.
+    """
     start = np.arange(first, first + count, dtype=np.int64) * setup.bus.period_us
     can = setup.bus.can
     if can is None:

@@ -7,8 +7,9 @@ from sim.geometry import strokes
 
 
 @njit(cache=True)
-def observe(plant, state, out) -> None:
-    """Write ``position_m``, ``stroke_m`` and ``comb_voltage_v`` (3,) of a plant's records to those fields of the record ``out``.
+def observe(plant: np.void, state: np.void, out: np.void) -> None:
+    """Write ``position_m``, ``stroke_m`` and ``comb_voltage_v`` (3,) of a plant's records to those fields of the
+    record ``out``.
 
     As ``sim.plant.Plant`` defines them: the parasitic mode's part is in the position and in the strokes.
     """

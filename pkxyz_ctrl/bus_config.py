@@ -24,7 +24,9 @@ class CanConfig(FrozenModel):
     compute_us: Annotated[int, Field(ge=0, le=1000)]
     """From the end of the sense frame until the controller's drive frame is ready to be sent; lockstep charges it."""
     sense_deadline_us: Annotated[int, Field(gt=0)]
-    """After the start of a tick: when the controller computes without this tick's sense frame, so that its drive frame is in time."""
+    """After the start of a tick: when the controller computes without this tick's sense frame, so that its drive
+    frame is in time.
+    """
     heartbeat_deadline_us: Annotated[int, Field(gt=0)]
     """After the start of a tick: until when a drive frame and our heartbeat behind it end before the next SYNC."""
     driver: DriverConfig
@@ -32,7 +34,9 @@ class CanConfig(FrozenModel):
     @model_validator(mode="after")
     def _rates_match(self) -> Self:
         if self.driver.fd != (self.data_bitrate_bit_per_s is not None):
-            raise ValueError("driver.fd and data_bitrate_bit_per_s belong together: give both for CAN FD, neither for classic CAN")
+            raise ValueError(
+                "driver.fd and data_bitrate_bit_per_s belong together: give both for CAN FD, neither for classic CAN"
+            )
         return self
 
 
@@ -61,7 +65,9 @@ class BusConfig(FrozenModel):
     def _deadlines_within_the_period(self) -> Self:
         can = self.can
         if can is not None and max(can.sense_deadline_us + can.compute_us, can.heartbeat_deadline_us) >= self.period_us:
-            raise ValueError("can.sense_deadline_us + compute_us and can.heartbeat_deadline_us must lie within period_us")
+            raise ValueError(
+                "can.sense_deadline_us + compute_us and can.heartbeat_deadline_us must lie within period_us"
+            )
         return self
 
     @property

@@ -27,7 +27,9 @@ class ConfigError(ValueError):
 class FrozenModel(BaseModel):
     """Base of every configuration model: immutable, no unknown keys, no NaN, no silent conversion."""
 
-    model_config = ConfigDict(frozen=True, extra="forbid", allow_inf_nan=False, strict=True, use_attribute_docstrings=True)
+    model_config = ConfigDict(
+        frozen=True, extra="forbid", allow_inf_nan=False, strict=True, use_attribute_docstrings=True
+    )
 
 
 Model = TypeVar("Model", bound=BaseModel)
@@ -48,7 +50,9 @@ def find(kind: str, name_or_path: str | Path) -> Path:
     if not path.is_file():
         near = difflib.get_close_matches(text, names(kind), n=1)
         hint = f"did you mean {near[0]!r}? " if near else ""
-        raise ConfigError(f"{kind}: no configuration named {text!r}; {hint}known: {_known(kind)}; or give the path of a TOML file")
+        raise ConfigError(
+            f"{kind}: no configuration named {text!r}; {hint}known: {_known(kind)}; or give the path of a TOML file"
+        )
     return path
 
 
@@ -107,13 +111,23 @@ def _explain(source: str, item: dict[str, Any], model: type[BaseModel]) -> str:
     message = str(item["msg"]).removeprefix("Value error, ")
     shown = item.get("input")
     got = "" if isinstance(shown, dict | BaseModel) else f" (got {shown!r})"
-    return f"{source}: {key or 'file'}: {message[:1].lower() + message[1:]}{got}{_unit_hint(location[-1]) if location else ''}"
+    unit = _unit_hint(location[-1]) if location else ""
+    return f"{source}: {key or 'file'}: {message[:1].lower() + message[1:]}{got}{unit}"
 
 
 _UNITS = {
-    "m": "metres", "s": "seconds", "us": "integer microseconds", "v": "volts", "n": "newtons", "f": "farads", "hz": "hertz", "kg": "kilograms",
-    "pa": "pascals", "rad": "radians", "a": "amperes",
-}  # fmt: skip
+    "m": "metres",
+    "s": "seconds",
+    "us": "integer microseconds",
+    "v": "volts",
+    "n": "newtons",
+    "f": "farads",
+    "hz": "hertz",
+    "kg": "kilograms",
+    "pa": "pascals",
+    "rad": "radians",
+    "a": "amperes",
+}
 
 
 def _unit_hint(key: str) -> str:

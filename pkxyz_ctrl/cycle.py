@@ -1,7 +1,8 @@
 """One period of the controller, compiled: events and modes, the tick, the monitors, the record.
 
-This is where core and safety meet: neither knows the other. ``cycle`` is called once a period, by the loop that waits for a
-clock and by the lane that does not; it reads ``memory["input"]`` and leaves counts, mode and record in ``memory["row"]``.
+This is where core and safety meet: neither knows the other. ``cycle`` is called once a period, by the loop that waits
+for a clock and by the lane that does not; it reads ``memory["input"]`` and leaves counts, mode and record in
+``memory["row"]``.
 """
 
 import numpy as np
@@ -12,6 +13,9 @@ from pkxyz_ctrl.core import tick
 from pkxyz_ctrl.row import ROW
 from pkxyz_ctrl.safety.modes import LOOP_CLOSED, Event, Mode, enable_event, next_homed, next_mode
 from pkxyz_ctrl.safety.monitors import LIMITS, MONITOR_MEMORY, OBSERVATION, SenseStatus, check
+
+Array = NDArray[np.float64]
+Records = NDArray[np.void]
 
 INPUT = np.dtype(
     [
@@ -72,11 +76,12 @@ def new_memory(mode: Mode = Mode.BOOT) -> NDArray[np.void]:
 
 
 @njit(cache=True)
-def cycle(law_array, memory_array, reference) -> None:
-    """One period. ``law_array`` (1,) of ``LAW``, ``memory_array`` (1,) of ``MEMORY``, ``reference`` (n, 9) rows of the trajectory.
+def cycle(law_array: Records, memory_array: Records, reference: Array) -> None:
+    """One period. ``law_array`` (1,) of ``LAW``, ``memory_array`` (1,) of ``MEMORY``, ``reference`` (n, 9) rows of
+    the trajectory.
 
-    Row ``reference_tick - reference_base`` is the set-point at this sample; the law looks up to three rows further. Rows
-    before the first and past the last are taken as the first and the last.
+    Row ``reference_tick - reference_base`` is the set-point at this sample; the law looks up to three rows further.
+    Rows before the first and past the last are taken as the first and the last.
     """
     law, memory = law_array[0], memory_array[0]
     _handle(law, memory, _asked(law, memory))
@@ -106,7 +111,7 @@ def cycle(law_array, memory_array, reference) -> None:
 
 
 @njit(cache=True)
-def _asked(law, memory) -> int:
+def _asked(law: np.void, memory: np.void) -> int:
     """The event of this tick: what came in, else the next step of the automatic start."""
     event = memory["input"]["event"]
     if event == _NONE and law["autostart"] != 0:
@@ -119,7 +124,7 @@ def _asked(law, memory) -> int:
 
 
 @njit(cache=True)
-def _handle(law, memory, event: int) -> None:
+def _handle(law: np.void, memory: np.void, event: int) -> None:
     """Let an event act on the mode, and prepare what the mode that is entered needs."""
     mode = memory["mode"]
     memory["row"]["event"] = event
@@ -143,7 +148,7 @@ def _handle(law, memory, event: int) -> None:
 
 
 @njit(cache=True)
-def _average(law, memory) -> None:
+def _average(law: np.void, memory: np.void) -> None:
     """Add this sample to the average at rest; once there are enough, that is where zero is."""
     for i in range(3):
         memory["homing_sum"][i] += memory["input"]["sense_count"][i]
@@ -160,7 +165,7 @@ def _average(law, memory) -> None:
 
 
 @njit(cache=True)
-def _reference_row(memory, reference, ahead: int, out) -> None:
+def _reference_row(memory: np.void, reference: Array, ahead: int, out: Array) -> None:
     """Write the row (9,) of the set-point ``ahead`` ticks from this one to ``out``."""
     if memory["mode"] == _TRACKING:
         index = memory["reference_tick"] - memory["input"]["reference_base"] + ahead
@@ -170,7 +175,7 @@ def _reference_row(memory, reference, ahead: int, out) -> None:
 
 
 @njit(cache=True)
-def _monitor(law, memory, saturated: int) -> int:
+def _monitor(law: np.void, memory: np.void, saturated: int) -> int:
     """Let the monitors look at this tick; a trip takes the voltages of this very tick to 0."""
     seen, state, obs = memory["input"], memory["tick"], memory["observation"]
     obs["mode"], obs["sense_status"] = memory["mode"], seen["sense_status"]
@@ -181,7 +186,9 @@ def _monitor(law, memory, saturated: int) -> int:
         obs["sense_count"][i] = seen["sense_count"][i]
         obs["stroke_m"][i] = state["stroke_m"][i]
         obs["innovation_m"][i] = state["estimate"]["innovation_m"][i]
-        obs["voltage_step_v"][i] = law["tick"]["drive"]["volt_per_count"] * (state["count"][0, i] - state["count"][1, i])
+        obs["voltage_step_v"][i] = law["tick"]["drive"]["volt_per_count"] * (
+            state["count"][0, i] - state["count"][1, i]
+        )
     trips = check(law["limits"], memory["monitors"], obs) | seen["trips"]
     if trips != 0 and memory["mode"] != _FAULT:
         _handle(law, memory, _TRIP)
@@ -190,7 +197,7 @@ def _monitor(law, memory, saturated: int) -> int:
 
 
 @njit(cache=True)
-def _write_row(law, memory, reference, trips: int, saturated: int) -> None:
+def _write_row(law: np.void, memory: np.void, reference: Array, trips: int, saturated: int) -> None:
     row, seen, state = memory["row"], memory["input"], memory["tick"]
     estimate, drive, origin = state["estimate"], law["tick"]["drive"], law["tick"]["estimator"]["operating_point_m"]
     setpoint = memory["now"]

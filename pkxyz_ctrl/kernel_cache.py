@@ -17,7 +17,9 @@ _KEPT = 4
 
 
 def choose_kernel_cache() -> None:
-    """Set numba's cache folder for this process; an own NUMBA_CACHE_DIR is respected, an unwritable home left to numba."""
+    """Set numba's cache folder for this process; an own NUMBA_CACHE_DIR is respected, an unwritable home left to
+    numba.
+    """
     if "NUMBA_CACHE_DIR" in os.environ:
         return
     home = Path(os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache") / "pkxyz_ctrl"
@@ -40,7 +42,9 @@ def is_cold() -> bool:
 
 
 def _digest_of_kernels() -> str:
-    """Over every file that holds a kernel and all of ours that these import: a kernel freezes the constants that it uses."""
+    """Over every file that holds a kernel and all of ours that these import: a kernel freezes the constants that it
+    uses.
+    """
     root = Path(__file__).parent.parent
     sources = {path: path.read_bytes() for package in _PACKAGES for path in sorted((root / package).rglob("*.py"))}
     relevant: set[Path] = set()

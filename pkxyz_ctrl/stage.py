@@ -24,6 +24,7 @@ from pkxyz_ctrl.mechanics.flexures import crank_hinge_stiffness, folded_spring_s
 from pkxyz_ctrl.stage_config import StageConfig
 
 Array = NDArray[np.float64]
+Records = NDArray[np.void]
 
 
 class StageDomainError(ValueError):
@@ -31,7 +32,9 @@ class StageDomainError(ValueError):
 
 
 class Stage:
-    """The user's handle on one device. Immutable; every method is a pure function of its arguments and the stage file."""
+    """The user's handle on one device. Immutable; every method is a pure function of its arguments and the stage
+    file.
+    """
 
     def __init__(self, config: StageConfig) -> None:
         self.config = config
@@ -39,7 +42,9 @@ class Stage:
         self.elasticity = np.zeros(1, elasticity.ELASTICITY)
         self.elasticity["slider_n_per_m"] = 4 * folded_spring_stiffness(config.flexures)
         self.elasticity["crank_n_m_per_rad"] = 4 * crank_hinge_stiffness(config.flexures)
-        self.elasticity["link_n_m_per_rad"] = 4 * config.flexures.out_of_plane_chains * link_hinge_stiffness(config.flexures)
+        self.elasticity["link_n_m_per_rad"] = (
+            4 * config.flexures.out_of_plane_chains * link_hinge_stiffness(config.flexures)
+        )
         self.geometry.flags.writeable = False
         self.elasticity.flags.writeable = False
         self.force_gain_n_per_v2 = force_gain_n_per_v2(config.drive_comb)
@@ -57,11 +62,14 @@ class Stage:
         return f"Stage({self.config.name!r})"
 
     def inverse_kinematics(self, position_m: ArrayLike) -> Array:
-        """Strokes (..., 3) in m for positions (..., 3) in m (Eq. 8); raises ``StageDomainError`` where a link can't reach."""
+        """Strokes (..., 3) in m for positions (..., 3) in m (Eq. 8); raises ``StageDomainError`` where a link can't
+        reach.
+        """
         return self._at_positions(position_m, _strokes_each, (3,))
 
     def forward_kinematics(self, strokes_m: ArrayLike) -> Array:
-        """Positions (..., 3) in m for strokes (..., 3) in m, on the assembly branch of the rest pose (Newton on the exact closure).
+        """Positions (..., 3) in m for strokes (..., 3) in m, on the assembly branch of the rest pose (Newton on the
+        exact closure).
 
         Raises ``StageDomainError`` for strokes at which the links don't close.
         """
@@ -96,7 +104,9 @@ class Stage:
         """
         voltage = _finite(voltage_v, "voltage_v")
         if np.any(np.abs(voltage) > self.voltage_max_v):
-            raise StageDomainError(f"voltage {np.abs(voltage).max():.6g} V is beyond the limit of {self.voltage_max_v:g} V")
+            raise StageDomainError(
+                f"voltage {np.abs(voltage).max():.6g} V is beyond the limit of {self.voltage_max_v:g} V"
+            )
         return np.asarray(self.force_gain_n_per_v2 * voltage * voltage)
 
     def comb_voltage(self, force_n: ArrayLike) -> Array:
@@ -115,11 +125,15 @@ class Stage:
         return np.asarray(np.minimum(np.sqrt(force / self.force_gain_n_per_v2), self.voltage_max_v))
 
     def holding_forces(self, position_m: ArrayLike) -> Array:
-        """Comb forces (..., 3) in N that hold a position: F = J^-T dV/dx (Eq. 23). Negative where combs would have to push."""
+        """Comb forces (..., 3) in N that hold a position: F = J^-T dV/dx (Eq. 23). Negative where combs would have to
+        push.
+        """
         return self._at_elastic(position_m, _holding_each, (3,))
 
     def holding_voltages(self, position_m: ArrayLike) -> Array:
-        """Comb voltages (..., 3) in V that hold a position; ``StageDomainError`` where that takes a push or more than the limit."""
+        """Comb voltages (..., 3) in V that hold a position; ``StageDomainError`` where that takes a push or more than
+        the limit.
+        """
         force = self.holding_forces(position_m)
         return self.comb_voltage(np.where((force < 0) & (force > -1e-15), 0.0, force))
 
@@ -128,14 +142,18 @@ class Stage:
         strokes = _triples(strokes_m, "strokes_m")
         overlap = self.config.sense_comb.overlap_rest_m
         if np.any(strokes <= -overlap):
-            raise StageDomainError(f"stroke {strokes.min() * 1e6:.6g} um leaves the sense comb's overlap of {overlap * 1e6:g} um")
+            raise StageDomainError(
+                f"stroke {strokes.min() * 1e6:.6g} um leaves the sense comb's overlap of {overlap * 1e6:g} um"
+            )
         return self.sense_rest_f + self.sense_gradient_f_per_m * strokes
 
     def strokes_from_capacitance(self, capacitance_f: ArrayLike) -> Array:
         """Strokes (..., 3) in m from sense capacitances (..., 3) in F: the inverse of ``sense_capacitance``."""
         capacitance = _triples(capacitance_f, "capacitance_f")
         if np.any(capacitance <= 0):
-            raise StageDomainError(f"capacitance {capacitance.min() * 1e15:.6g} fF is not positive: the sense comb has no overlap there")
+            raise StageDomainError(
+                f"capacitance {capacitance.min() * 1e15:.6g} fF is not positive: the sense comb has no overlap there"
+            )
         return (capacitance - self.sense_rest_f) / self.sense_gradient_f_per_m
 
     def _at_positions(self, position_m: ArrayLike, kernel: Callable[..., None], shape: tuple[int, ...]) -> Array:
@@ -156,10 +174,15 @@ class Stage:
         at, limit = _first_outside(self.geometry, flat)
         if limit == 4:
             reach = float(self.geometry["link_m"][0] - self.geometry["height_rest_m"][0])
-            raise StageDomainError(f"position {_um(flat[at])} um: z must stay below {reach * 1e6:.6g} um, the reach of the out-of-plane links")
+            raise StageDomainError(
+                f"position {_um(flat[at])} um: z must stay below {reach * 1e6:.6g} um, "
+                "the reach of the out-of-plane links"
+            )
         if limit:
             reach = float(self.geometry["crank_m"][0])
-            raise StageDomainError(f"position {_um(flat[at])} um: crank {limit} would have to be longer than {reach * 1e6:g} um")
+            raise StageDomainError(
+                f"position {_um(flat[at])} um: crank {limit} would have to be longer than {reach * 1e6:g} um"
+            )
         return flat, position.shape[:-1]
 
 
@@ -182,7 +205,7 @@ def _um(triple: Array) -> str:
 
 
 @njit(cache=True)
-def _first_outside(geometry, positions):
+def _first_outside(geometry: Records, positions: Array) -> tuple[int, int]:
     for i in range(len(positions)):
         limit = kinematics.in_domain(geometry[0], positions[i])
         if limit != 0:
@@ -191,13 +214,13 @@ def _first_outside(geometry, positions):
 
 
 @njit(cache=True)
-def _strokes_each(geometry, positions, out):
+def _strokes_each(geometry: Records, positions: Array, out: Array) -> None:
     for i in range(len(positions)):
         kinematics.strokes(geometry[0], positions[i], out[i])
 
 
 @njit(cache=True)
-def _positions_each(geometry, strokes, out):
+def _positions_each(geometry: Records, strokes: Array, out: Array) -> int:
     for i in range(len(strokes)):
         out[i] = 0.0
         if kinematics.position_from_strokes(geometry[0], strokes[i], out[i]) < 0:
@@ -206,31 +229,31 @@ def _positions_each(geometry, strokes, out):
 
 
 @njit(cache=True)
-def _jacobian_each(geometry, positions, out):
+def _jacobian_each(geometry: Records, positions: Array, out: Array) -> None:
     for i in range(len(positions)):
         kinematics.jacobian(geometry[0], positions[i], out[i])
 
 
 @njit(cache=True)
-def _energy_each(geometry, elastic, positions, out):
+def _energy_each(geometry: Records, elastic: Records, positions: Array, out: Array) -> None:
     for i in range(len(positions)):
         out[i] = elasticity.energy(geometry[0], elastic[0], positions[i])
 
 
 @njit(cache=True)
-def _gradient_each(geometry, elastic, positions, out):
+def _gradient_each(geometry: Records, elastic: Records, positions: Array, out: Array) -> None:
     for i in range(len(positions)):
         elasticity.energy_gradient(geometry[0], elastic[0], positions[i], out[i])
 
 
 @njit(cache=True)
-def _stiffness_each(geometry, elastic, positions, out):
+def _stiffness_each(geometry: Records, elastic: Records, positions: Array, out: Array) -> None:
     for i in range(len(positions)):
         elasticity.stiffness(geometry[0], elastic[0], positions[i], out[i])
 
 
 @njit(cache=True)
-def _holding_each(geometry, elastic, positions, out):
+def _holding_each(geometry: Records, elastic: Records, positions: Array, out: Array) -> None:
     gradient, j, inverse = np.empty(3), np.empty((3, 3)), np.empty((3, 3))
     for i in range(len(positions)):
         elasticity.energy_gradient(geometry[0], elastic[0], positions[i], gradient)

@@ -11,7 +11,8 @@ Positive = Annotated[float, Field(gt=0)]
 
 
 class GeometryConfig(FrozenModel):
-    """Dimensions of the mechanism (paper, Fig. 2 and 3). The out-of-plane link is given either by its projection and height
+    """Dimensions of the mechanism (paper, Fig. 2 and 3). The out-of-plane link is given either by its projection and
+    height
     at rest or by its length and elevation at rest."""
 
     base_radius_m: Positive
@@ -37,7 +38,8 @@ class GeometryConfig(FrozenModel):
         )
         if given != 2 or by_legs == by_polar:
             raise ValueError(
-                "give the link either by link_projection_rest_m and link_height_rest_m or by link_length_m and elevation_rest_rad"
+                "give the link either by link_projection_rest_m and link_height_rest_m "
+                "or by link_length_m and elevation_rest_rad"
             )
         if self.base_radius_m - self.projection_rest_m - self.crank_length_m <= 0:
             raise ValueError("links do not close: base_radius_m must exceed link projection at rest + crank_length_m")
@@ -48,7 +50,8 @@ class GeometryConfig(FrozenModel):
         """delta_0."""
         if self.link_projection_rest_m is not None:
             return self.link_projection_rest_m
-        assert self.link_length_m is not None and self.elevation_rest_rad is not None
+        assert self.link_length_m is not None
+        assert self.elevation_rest_rad is not None
         return self.link_length_m * math.cos(self.elevation_rest_rad)
 
     @property
@@ -56,7 +59,8 @@ class GeometryConfig(FrozenModel):
         """z_0."""
         if self.link_height_rest_m is not None:
             return self.link_height_rest_m
-        assert self.link_length_m is not None and self.elevation_rest_rad is not None
+        assert self.link_length_m is not None
+        assert self.elevation_rest_rad is not None
         return self.link_length_m * math.sin(self.elevation_rest_rad)
 
 
@@ -78,7 +82,8 @@ class FlexureConfig(FrozenModel):
     link_hinge_thickness_m: Positive
     link_hinge_width_m: Positive
     out_of_plane_chains: Literal[1, 3] = 1
-    """How many chains' out-of-plane hinges count in the stiffness: 1 as Eq. 19 prints it, 3 as the text describes it."""
+    """How many chains' out-of-plane hinges count in the stiffness: 1 as Eq. 19 prints it, 3 as the text describes it.
+    """
 
 
 class CombConfig(FrozenModel):

@@ -3,8 +3,8 @@
     minimise  1/2 |J^T F - w|^2   subject to   lower <= F <= upper
 
 J = dq/dx at the set-point, w the demanded platform force. Three variables, so the exact solution is a matter of trying
-active sets: the free one first (in operation nearly always right), then every other until the KKT conditions hold. Strictly
-convex as J is regular, hence one solution and at most 27 tries, in a fixed order: bounded time, same bits.
+active sets: the free one first (in operation nearly always right), then every other until the KKT conditions hold.
+Strictly convex as J is regular, hence one solution and at most 27 tries, in a fixed order: bounded time, same bits.
 """
 
 import numpy as np
@@ -37,7 +37,9 @@ def _search(jacobian: Array, demand_n: Array, lower_n: Array, upper_n: Array, be
     scale = 0.0
     for i in range(3):
         for k in range(3):
-            hessian[i, k] = jacobian[i, 0] * jacobian[k, 0] + jacobian[i, 1] * jacobian[k, 1] + jacobian[i, 2] * jacobian[k, 2]
+            hessian[i, k] = (
+                jacobian[i, 0] * jacobian[k, 0] + jacobian[i, 1] * jacobian[k, 1] + jacobian[i, 2] * jacobian[k, 2]
+            )
         linear[i] = jacobian[i, 0] * demand_n[0] + jacobian[i, 1] * demand_n[1] + jacobian[i, 2] * demand_n[2]
         scale = max(scale, abs(linear[i]), abs(upper_n[i]))
     tolerance = 1e-13 * scale
@@ -57,7 +59,9 @@ def _search(jacobian: Array, demand_n: Array, lower_n: Array, upper_n: Array, be
 
 
 @njit(cache=True)
-def _solve_fixed(hessian: Array, linear: Array, lower: Array, upper: Array, state: NDArray[np.int64], out: Array) -> None:
+def _solve_fixed(
+    hessian: Array, linear: Array, lower: Array, upper: Array, state: NDArray[np.int64], out: Array
+) -> None:
     """Minimise 1/2 F^T H F - linear^T F with the non-free components held at their bounds."""
     free = np.empty(3, np.int64)
     count = 0
@@ -89,8 +93,12 @@ def _residual(hessian: Array, linear: Array, state: NDArray[np.int64], fixed: Ar
 
 
 @njit(cache=True)
-def kkt_violation(hessian: Array, linear: Array, lower: Array, upper: Array, state: NDArray[np.int64], force: Array) -> float:
-    """How far a candidate is from the KKT conditions: bounds passed by free components, multipliers of the wrong sign (both in N)."""
+def kkt_violation(
+    hessian: Array, linear: Array, lower: Array, upper: Array, state: NDArray[np.int64], force: Array
+) -> float:
+    """How far a candidate is from the KKT conditions: bounds passed by free components, multipliers of the wrong sign
+    (both in N).
+    """
     worst = 0.0
     for i in range(3):
         if state[i] == _FREE:

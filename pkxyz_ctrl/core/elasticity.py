@@ -1,9 +1,11 @@
-"""Strain energy of the flexures, its gradient (the force that holds a position) and its Hessian (the stiffness), compiled.
+"""Strain energy of the flexures, its gradient (the force that holds a position) and its Hessian (the stiffness),
+compiled.
 
-    V = 2 K1 sum q_i^2 + 2 K2 sum theta_i^2 + 2 c K3 (alpha - alpha_0)^2,   sin(theta_i) = s_i / L1,   sin(alpha) = z / L2
+    V = 2 K1 sum q_i^2 + 2 K2 sum theta_i^2 + 2 c K3 (alpha - alpha_0)^2,   sin(theta_i) = s_i / L1,   sin(alpha) = z
+    / L2
 
-c chains count in the out-of-plane term (Eq. 19 as printed: 1). The Hessian at rest is Eq. 19; elsewhere the curvature of q,
-theta and alpha, which the paper drops, is in it.
+c chains count in the out-of-plane term (Eq. 19 as printed: 1). The Hessian at rest is Eq. 19; elsewhere the curvature
+of q, theta and alpha, which the paper drops, is in it.
 """
 
 import math
@@ -27,7 +29,7 @@ ELASTICITY = np.dtype(
 
 
 @njit(cache=True)
-def energy(geometry, elasticity, position_m: Array) -> float:
+def energy(geometry: np.void, elasticity: np.void, position_m: Array) -> float:
     """Strain energy in J at ``position_m`` (3,), 0 at rest."""
     x, y = position_m[0], position_m[1]
     _, delta, drop = link(geometry, position_m[2])
@@ -42,14 +44,16 @@ def energy(geometry, elasticity, position_m: Array) -> float:
 
 
 @njit(cache=True)
-def _elevation_change(geometry, dz: float, delta: float) -> float:
-    """alpha - alpha_0 in rad from its sine, z delta_0 - delta z_0 over L2^2, with the small difference written as a quotient."""
+def _elevation_change(geometry: np.void, dz: float, delta: float) -> float:
+    """alpha - alpha_0 in rad from its sine, z delta_0 - delta z_0 over L2^2, with the small difference written as a
+    quotient.
+    """
     z0, delta0, reach = geometry["height_rest_m"], geometry["projection_rest_m"], geometry["link_m"]
     return math.asin(dz * (delta0 + z0 * (dz + 2.0 * z0) / (delta + delta0)) / (reach * reach))
 
 
 @njit(cache=True)
-def energy_gradient(geometry, elasticity, position_m: Array, out: Array) -> None:
+def energy_gradient(geometry: np.void, elasticity: np.void, position_m: Array, out: Array) -> None:
     """dV/dx (3,) in N: the force at the platform that holds it at ``position_m``."""
     e, n = geometry["e"], geometry["n"]
     k1, k2 = elasticity["slider_n_per_m"], elasticity["crank_n_m_per_rad"]
@@ -69,7 +73,7 @@ def energy_gradient(geometry, elasticity, position_m: Array, out: Array) -> None
 
 
 @njit(cache=True)
-def stiffness(geometry, elasticity, position_m: Array, out: Array) -> None:
+def stiffness(geometry: np.void, elasticity: np.void, position_m: Array, out: Array) -> None:
     """d2V/dx2 (3,3) in N/m at ``position_m``; at rest it is Eq. 19."""
     j = np.empty((3, 3))
     jacobian(geometry, position_m, j)

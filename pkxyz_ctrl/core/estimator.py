@@ -1,14 +1,14 @@
 """Kalman filter of the platform: position, velocity and disturbance force, nine states, constant gain, compiled.
 
-State s = [x - x_0, v, d] in platform coordinates about the operating point x_0. Over one period, with the comb forces held
-and approached through the amplifier's pole::
+State s = [x - x_0, v, d] in platform coordinates about the operating point x_0. Over one period, with the comb forces
+held and approached through the amplifier's pole::
 
     s+ = Phi s + Gamma w + Gamma_lag (w_old - w),   w = J(x)^T F - grad V(x) + K_0 (x - x_0)
 
-so the linear part carries the resonance and the input w the exact energy gradient and Jacobian, taken where the estimate
-will be in mid-period: the filter follows the stage over the whole workspace with one gain. The commanded forces of the last tick act from the sample of this
-one, hence the loop's period of delay is in the bookkeeping of w, not in extra states. A sample shows x - tau v, tau being
-the sense chain's delay.
+so the linear part carries the resonance and the input w the exact energy gradient and Jacobian, taken where the
+estimate will be in mid-period: the filter follows the stage over the whole workspace with one gain. The commanded
+forces of the last tick act from the sample of this one, hence the loop's period of delay is in the bookkeeping of w,
+not in extra states. A sample shows x - tau v, tau being the sense chain's delay.
 """
 
 import numpy as np
@@ -46,27 +46,43 @@ ESTIMATE = np.dtype(
 
 
 @njit(cache=True)
-def update(estimator, estimate, measured_m: Array, has_measurement: bool) -> None:
-    """Measurement update at a sample: filtered = predicted + gain (y - h(predicted)). Without a measurement the prediction stands."""
+def update(estimator: np.void, estimate: np.void, measured_m: Array, has_measurement: bool) -> None:
+    """Measurement update at a sample: filtered = predicted + gain (y - h(predicted)). Without a measurement the
+    prediction stands.
+    """
     predicted, filtered, innovation = estimate["predicted"], estimate["filtered"], estimate["innovation_m"]
     gain, origin, tau = estimator["gain"], estimator["operating_point_m"], estimator["sense_delay_s"]
     for i in range(3):
         innovation[i] = measured_m[i] - origin[i] - (predicted[i] - tau * predicted[3 + i]) if has_measurement else 0.0
     for i in range(9):
-        filtered[i] = predicted[i] + gain[i, 0] * innovation[0] + gain[i, 1] * innovation[1] + gain[i, 2] * innovation[2]
+        filtered[i] = (
+            predicted[i] + gain[i, 0] * innovation[0] + gain[i, 1] * innovation[1] + gain[i, 2] * innovation[2]
+        )
 
 
 @njit(cache=True)
-def midway(estimator, s: Array, position_m: Array) -> None:
-    """Position (3,) half a period after the state ``s`` (9,), where ``net_input`` is to be evaluated: at the start of the period
+def midway(estimator: np.void, s: Array, position_m: Array) -> None:
+    """Position (3,) half a period after the state ``s`` (9,), where ``net_input`` is to be evaluated: at the start of
+    the period
     it would lag behind a moving stage, and the disturbance would have to make up for it."""
     for i in range(3):
         position_m[i] = estimator["operating_point_m"][i] + s[i] + estimator["half_period_s"] * s[3 + i]
 
 
 @njit(cache=True)
-def net_input(geometry, elasticity, estimator, position_m: Array, force_n: Array, force_old_n: Array, w: Array, w_change: Array) -> None:
-    """w (3,) and w_old - w (3,) in N at an estimated position, for the comb forces that act now and those that acted before."""
+def net_input(
+    geometry: np.void,
+    elasticity: np.void,
+    estimator: np.void,
+    position_m: Array,
+    force_n: Array,
+    force_old_n: Array,
+    w: Array,
+    w_change: Array,
+) -> None:
+    """w (3,) and w_old - w (3,) in N at an estimated position, for the comb forces that act now and those that acted
+    before.
+    """
     stiffness, origin = estimator["stiffness_n_per_m"], estimator["operating_point_m"]
     energy_gradient(geometry, elasticity, position_m, w_change)
     platform_force(geometry, position_m, force_n, w)
@@ -83,8 +99,10 @@ def net_input(geometry, elasticity, estimator, position_m: Array, force_n: Array
 
 
 @njit(cache=True)
-def predict(estimator, s: Array, w: Array, w_change: Array, out: Array) -> None:
-    """Time update over one period: write the state (9,) that follows from ``s`` and the input of ``net_input`` to ``out``, another array."""
+def predict(estimator: np.void, s: Array, w: Array, w_change: Array, out: Array) -> None:
+    """Time update over one period: write the state (9,) that follows from ``s`` and the input of ``net_input`` to
+    ``out``, another array.
+    """
     transition, gamma, gamma_lag = estimator["transition"], estimator["input"], estimator["input_lag"]
     for i in range(6):
         total = 0.0

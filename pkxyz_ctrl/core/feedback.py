@@ -2,10 +2,10 @@
 
     w = grad V(r_f) + C v_f + m a_f  -  g [ K_x (x - r) + K_v (v - r') + d ]
 
-r, r' are the reference (as ``sampled_target`` sees it) at the instant the force begins to act (one period after the sample), x, v, d the estimate predicted
-for it; r_f, v_f, a_f are the reference at the middle of the interval in which it acts, as the amplifier lets it act. Combs
-only pull, so at rest there is no force to take away: the feedback's authority g rises from 0 to 1 with the least of the
-forces that hold r.
+r, r' are the reference (as ``sampled_target`` sees it) at the instant the force begins to act (one period after the
+sample), x, v, d the estimate predicted for it; r_f, v_f, a_f are the reference at the middle of the interval in which
+it acts, as the amplifier lets it act. Combs only pull, so at rest there is no force to take away: the feedback's
+authority g rises from 0 to 1 with the least of the forces that hold r.
 """
 
 import numpy as np
@@ -29,7 +29,7 @@ FEEDBACK = np.dtype(
 
 
 @njit(cache=True)
-def ahead(feedback, now: Array, after: Array, out: Array) -> None:
+def ahead(feedback: np.void, now: Array, after: Array, out: Array) -> None:
     """Reference row (9,) at ``lead_s`` past the row ``now``: constant jerk towards the row ``after``, one period later.
 
     A row is position m, velocity m/s, acceleration m/s^2.
@@ -44,7 +44,7 @@ def ahead(feedback, now: Array, after: Array, out: Array) -> None:
 
 
 @njit(cache=True)
-def add_motion(feedback, row: Array, out: Array) -> None:
+def add_motion(feedback: np.void, row: Array, out: Array) -> None:
     """Add damping and inertia of a reference row (9,) to the force ``out`` (3,): C v + m a."""
     damping, mass = feedback["damping_n_s_per_m"], feedback["mass_kg"]
     for i in range(3):
@@ -54,12 +54,13 @@ def add_motion(feedback, row: Array, out: Array) -> None:
 
 
 @njit(cache=True)
-def sampled_target(feedback, now: Array, feedforward_n: Array, feedforward_last_n: Array, out: Array) -> None:
-    """The row (9,) that the sampled state has to meet: ``now``, with the velocity that held forces really give at a sample.
+def sampled_target(feedback: np.void, now: Array, feedforward_n: Array, feedforward_last_n: Array, out: Array) -> None:
+    """The row (9,) that the sampled state has to meet: ``now``, with the velocity that held forces really give at a
+    sample.
 
-    A force that is held for a period T in place of one that grows by f' in the time makes the velocity ripple about its mean;
-    at the samples the ripple is -f' T^2 / (12 m), which at 631 Hz and 5 kHz is 5 % of the velocity. Without this term the
-    feedback takes the ripple for an error and pushes the stage ahead of its reference.
+    A force that is held for a period T in place of one that grows by f' in the time makes the velocity ripple about
+    its mean; at the samples the ripple is -f' T^2 / (12 m), which at 631 Hz and 5 kHz is 5 % of the velocity. Without
+    this term the feedback takes the ripple for an error and pushes the stage ahead of its reference.
     """
     share = feedback["period_s"] / (12.0 * feedback["mass_kg"])
     for i in range(3):
@@ -69,7 +70,7 @@ def sampled_target(feedback, now: Array, feedforward_n: Array, feedforward_last_
 
 
 @njit(cache=True)
-def authority(feedback, inverse: Array, holding_n: Array) -> float:
+def authority(feedback: np.void, inverse: Array, holding_n: Array) -> float:
     """g in 0..1 from the least comb force of J^-T ``holding_n``; ``inverse`` is J^-1 at the set-point."""
     least = np.inf
     for i in range(3):
@@ -78,11 +79,17 @@ def authority(feedback, inverse: Array, holding_n: Array) -> float:
 
 
 @njit(cache=True)
-def add_feedback(feedback, origin_m: Array, predicted: Array, reference: Array, share: float, out: Array) -> None:
-    """Subtract share times the feedback force from ``out`` (3,); ``predicted`` (9,) is about ``origin_m``, ``reference`` a row (9,)."""
+def add_feedback(
+    feedback: np.void, origin_m: Array, predicted: Array, reference: Array, share: float, out: Array
+) -> None:
+    """Subtract share times the feedback force from ``out`` (3,); ``predicted`` (9,) is about ``origin_m``,
+    ``reference`` a row (9,).
+    """
     kx, kv = feedback["position_gain_n_per_m"], feedback["velocity_gain_n_s_per_m"]
     for i in range(3):
         total = predicted[6 + i]
         for k in range(3):
-            total += kx[i, k] * (origin_m[k] + predicted[k] - reference[k]) + kv[i, k] * (predicted[3 + k] - reference[3 + k])
+            total += kx[i, k] * (origin_m[k] + predicted[k] - reference[k]) + kv[i, k] * (
+                predicted[3 + k] - reference[3 + k]
+            )
         out[i] -= share * total

@@ -1,8 +1,8 @@
 """Kinematics of the three chains, compiled: strokes, Jacobian, curvature and their inverse.
 
-Frame: origin at the rest position of the platform, x and y in the wafer plane, z up, away from the handle layer. Chain i
-acts along e_i at 90, 210, 330 degrees (paper, Eq. 2); n_i is e_i turned by +90 degrees. For a platform at ``position_m``
-= (x, y, z) relative to rest, with s_i = (x, y).n_i, delta = sqrt(L2^2 - (z_0 + z)^2)::
+Frame: origin at the rest position of the platform, x and y in the wafer plane, z up, away from the handle layer.
+Chain i acts along e_i at 90, 210, 330 degrees (paper, Eq. 2); n_i is e_i turned by +90 degrees. For a platform at
+``position_m`` = (x, y, z) relative to rest, with s_i = (x, y).n_i, delta = sqrt(L2^2 - (z_0 + z)^2)::
 
     q_i = (x, y).e_i + (delta_0 - delta) + (L1 - sqrt(L1^2 - s_i^2))
 
@@ -52,8 +52,10 @@ def geometry_record(config: GeometryConfig) -> NDArray[np.void]:
 
 
 @njit(cache=True)
-def in_domain(geometry, position_m: Array) -> int:
-    """0 if the links can reach ``position_m`` (3,); 1, 2, 3 if the crank of that chain can't; 4 if the links can't (|z_0 + z| >= L2)."""
+def in_domain(geometry: np.void, position_m: Array) -> int:
+    """0 if the links can reach ``position_m`` (3,); 1, 2, 3 if the crank of that chain can't; 4 if the links can't
+    (|z_0 + z| >= L2).
+    """
     n = geometry["n"]
     for i in range(3):
         if not abs(n[i, 0] * position_m[0] + n[i, 1] * position_m[1]) < geometry["crank_m"]:
@@ -64,7 +66,7 @@ def in_domain(geometry, position_m: Array) -> int:
 
 
 @njit(cache=True)
-def link(geometry, dz: float) -> tuple[float, float, float]:
+def link(geometry: np.void, dz: float) -> tuple[float, float, float]:
     """The out-of-plane links at height ``dz`` above rest: height z, projection delta, and delta_0 - delta, all in m."""
     reach, z0 = geometry["link_m"], geometry["height_rest_m"]
     z = z0 + dz
@@ -73,7 +75,7 @@ def link(geometry, dz: float) -> tuple[float, float, float]:
 
 
 @njit(cache=True)
-def crank(geometry, i: int, x: float, y: float) -> tuple[float, float]:
+def crank(geometry: np.void, i: int, x: float, y: float) -> tuple[float, float]:
     """Chain i's crank at (x, y): s = L1 sin(theta), across its direction of action, and c = L1 cos(theta), in m."""
     n, length = geometry["n"], geometry["crank_m"]
     s = n[i, 0] * x + n[i, 1] * y
@@ -81,14 +83,14 @@ def crank(geometry, i: int, x: float, y: float) -> tuple[float, float]:
 
 
 @njit(cache=True)
-def stroke(geometry, i: int, x: float, y: float, s: float, c: float, drop: float) -> float:
+def stroke(geometry: np.void, i: int, x: float, y: float, s: float, c: float, drop: float) -> float:
     """q_i in m from what ``crank`` and ``link`` say."""
     e = geometry["e"]
     return e[i, 0] * x + e[i, 1] * y + drop + s * s / (geometry["crank_m"] + c)
 
 
 @njit(cache=True)
-def strokes(geometry, position_m: Array, out: Array) -> None:
+def strokes(geometry: np.void, position_m: Array, out: Array) -> None:
     """Inverse kinematics (Eq. 8): strokes q (3,) in m relative to rest. ``position_m`` must be ``in_domain``."""
     x, y = position_m[0], position_m[1]
     _, _, drop = link(geometry, position_m[2])
@@ -98,7 +100,7 @@ def strokes(geometry, position_m: Array, out: Array) -> None:
 
 
 @njit(cache=True)
-def jacobian(geometry, position_m: Array, out: Array) -> None:
+def jacobian(geometry: np.void, position_m: Array, out: Array) -> None:
     """dq/dx (3,3) at ``position_m``: rows [e_i + n_i tan(theta_i), tan(alpha)]. Eq. 12 is its value at rest."""
     e, n = geometry["e"], geometry["n"]
     z, delta, _ = link(geometry, position_m[2])
@@ -112,7 +114,7 @@ def jacobian(geometry, position_m: Array, out: Array) -> None:
 
 
 @njit(cache=True)
-def platform_force(geometry, position_m: Array, comb_force_n: Array, out: Array) -> None:
+def platform_force(geometry: np.void, position_m: Array, comb_force_n: Array, out: Array) -> None:
     """J^T F (3,) in N: what comb forces (3,) do to the platform at ``position_m`` (Eq. 23)."""
     e, n = geometry["e"], geometry["n"]
     z, delta, _ = link(geometry, position_m[2])
@@ -129,11 +131,12 @@ def platform_force(geometry, position_m: Array, comb_force_n: Array, out: Array)
 
 
 @njit(cache=True)
-def newton_step(geometry, strokes_m: Array, position_m: Array) -> float:
+def newton_step(geometry: np.void, strokes_m: Array, position_m: Array) -> float:
     """Move ``position_m`` (3,) in place by one Newton step towards q(x) = ``strokes_m``; the size of the step in m.
 
-    The Jacobian is the exact one at the position handed in, so the error that is left is quadratic in the step: a step of
-    1 um leaves about 1 nm, one of 30 nm less than 1 pm. Returns inf and moves nothing where the Jacobian is singular.
+    The Jacobian is the exact one at the position handed in, so the error that is left is quadratic in the step: a
+    step of 1 um leaves about 1 nm, one of 30 nm less than 1 pm. Returns inf and moves nothing where the Jacobian is
+    singular.
 
     The third column of J is the same in every row, so z is eliminated by differences and two unknowns remain.
     """
@@ -162,8 +165,9 @@ def newton_step(geometry, strokes_m: Array, position_m: Array) -> float:
 
 
 @njit(cache=True)
-def position_from_strokes(geometry, strokes_m: Array, position_m: Array) -> int:
-    """Forward kinematics: Newton from the position handed in (rest is always a good start), in place, until it stands still.
+def position_from_strokes(geometry: np.void, strokes_m: Array, position_m: Array) -> int:
+    """Forward kinematics: Newton from the position handed in (rest is always a good start), in place, until it stands
+    still.
 
     Returns the number of steps (4 to 5 within the workspace) or -1 where it leaves the links' domain or doesn't settle.
     """

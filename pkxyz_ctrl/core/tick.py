@@ -1,9 +1,10 @@
-"""The tick: sense counts in, drive counts out. Composes kinematics, filter, law, allocation and voltage; PURE and compiled.
+"""The tick: sense counts in, drive counts out. Composes kinematics, filter, law, allocation and voltage; PURE and
+compiled.
 
-Three steps, so that whoever composes them can look between: ``measure`` (counts -> position), ``estimate`` (filter and its
-prediction to the instant of action), ``act`` (law -> comb forces -> counts). ``rest`` stands in for ``act`` while the loop is
-open. Everything works on two records: ``law`` (numbers that were designed, never written) and ``memory`` (what lives from
-tick to tick).
+Three steps, so that whoever composes them can look between: ``measure`` (counts -> position), ``estimate`` (filter
+and its prediction to the instant of action), ``act`` (law -> comb forces -> counts). ``rest`` stands in for ``act``
+while the loop is open. Everything works on two records: ``law`` (numbers that were designed, never written) and
+``memory`` (what lives from tick to tick).
 """
 
 import math
@@ -84,8 +85,10 @@ MEMORY = np.dtype(
 
 
 @njit(cache=True)
-def measure(law, memory, sense_count: NDArray[np.int32]) -> None:
-    """Sense counts (3,) -> capacitances -> strokes -> ``measurement_m``, by one Newton step from the predicted position."""
+def measure(law: np.void, memory: np.void, sense_count: NDArray[np.int32]) -> None:
+    """Sense counts (3,) -> capacitances -> strokes -> ``measurement_m``, by one Newton step from the predicted
+    position.
+    """
     sense = law["sense"]
     capacitance, stroke, position = memory["sense_f"], memory["stroke_m"], memory["measurement_m"]
     predicted, origin = memory["estimate"]["predicted"], law["estimator"]["operating_point_m"]
@@ -97,8 +100,10 @@ def measure(law, memory, sense_count: NDArray[np.int32]) -> None:
 
 
 @njit(cache=True)
-def estimate(law, memory, has_measurement: bool) -> None:
-    """Filter the measurement, then predict to the next sample and on to the instant from which this tick's force acts."""
+def estimate(law: np.void, memory: np.void, has_measurement: bool) -> None:
+    """Filter the measurement, then predict to the next sample and on to the instant from which this tick's force
+    acts.
+    """
     estimator, state, drive, scratch = law["estimator"], memory["estimate"], law["drive"], memory["scratch"]
     filtering.update(estimator, state, memory["measurement_m"], has_measurement)
     position, w, w_change = scratch["position_m"], scratch["w_n"], scratch["w_change_n"]
@@ -119,7 +124,7 @@ def estimate(law, memory, has_measurement: bool) -> None:
 
 
 @njit(cache=True)
-def act(law, memory, now: Array, after: Array) -> bool:
+def act(law: np.void, memory: np.void, now: Array, after: Array) -> bool:
     """Law, allocation and voltages for the reference rows (9,) at the start and the end of the interval of action.
 
     Writes demand, comb forces, slack and the new counts. Returns whether a comb force met a limit.
@@ -149,14 +154,14 @@ def act(law, memory, now: Array, after: Array) -> bool:
 
 
 @njit(cache=True)
-def rest(memory) -> None:
+def rest(memory: np.void) -> None:
     """The open loop: 0 V on every comb at once, no demand. A release to 0 V is never delayed by the slew limit."""
     _push(memory)
     release(memory)
 
 
 @njit(cache=True)
-def release(memory) -> None:
+def release(memory: np.void) -> None:
     """Take back what this tick decided: 0 V goes out instead."""
     for i in range(3):
         memory["count"][0, i] = 0
@@ -169,7 +174,7 @@ def release(memory) -> None:
 
 
 @njit(cache=True)
-def _push(memory) -> None:
+def _push(memory: np.void) -> None:
     """Make room for this tick's counts: the history moves on by one."""
     count = memory["count"]
     for age in range(DELAY_MAX, 0, -1):
@@ -178,7 +183,7 @@ def _push(memory) -> None:
 
 
 @njit(cache=True)
-def set_position(law, memory, position_m: Array) -> None:
+def set_position(law: np.void, memory: np.void, position_m: Array) -> None:
     """Start the filter at a position (3,) at rest, without disturbance: after homing, and wherever a state is known."""
     for i in range(9):
         known = position_m[i] - law["estimator"]["operating_point_m"][i] if i < 3 else 0.0
@@ -190,7 +195,7 @@ def set_position(law, memory, position_m: Array) -> None:
 
 
 @njit(cache=True)
-def is_finite(memory) -> bool:
+def is_finite(memory: np.void) -> bool:
     """Whether the estimate and the forces of this tick are numbers."""
     total = 0.0
     for i in range(9):

@@ -1,7 +1,8 @@
 """Comb forces to amplifier counts: limits, the square-root law and first-order noise shaping, compiled.
 
-F = G V^2 (Eq. 33), V = scale x count. What a count cannot express is carried into the next tick, so the quantisation error
-of the voltage is pushed to high frequency, where the stage does not follow: its spectrum gains the factor |1 - z^-1|.
+F = G V^2 (Eq. 33), V = scale x count. What a count cannot express is carried into the next tick, so the quantisation
+error of the voltage is pushed to high frequency, where the stage does not follow: its spectrum gains the factor |1 -
+z^-1|.
 """
 
 import math
@@ -26,9 +27,14 @@ DRIVE = np.dtype(
 
 
 @njit(cache=True)
-def force_limits(drive, count_last: Counts, lower_n: Array, upper_n: Array) -> None:
+def force_limits(drive: np.void, count_last: Counts, lower_n: Array, upper_n: Array) -> None:
     """Comb forces (3,) reachable in one tick from the last counts (3,): slew limit, no push, voltage limit."""
-    slew, most, scale, gain = drive["count_slew_max"], drive["count_max"], drive["volt_per_count"], drive["force_gain_n_per_v2"]
+    slew, most, scale, gain = (
+        drive["count_slew_max"],
+        drive["count_max"],
+        drive["volt_per_count"],
+        drive["force_gain_n_per_v2"],
+    )
     for i in range(3):
         low = scale * max(0, count_last[i] - slew)
         high = scale * min(most, count_last[i] + slew)
@@ -37,14 +43,17 @@ def force_limits(drive, count_last: Counts, lower_n: Array, upper_n: Array) -> N
 
 
 @njit(cache=True)
-def counts_for_forces(drive, force_n: Array, count_last: Counts, carry_v: Array, count: Counts) -> None:
+def counts_for_forces(drive: np.void, force_n: Array, count_last: Counts, carry_v: Array, count: Counts) -> None:
     """Counts (3,) for forces (3,) >= 0; ``carry_v`` (3,) holds the error from tick to tick, at most one count of it.
 
-    Whatever the forces are (NaN and infinity too), every count stays within 0..count_max and within the slew limit of the last one.
+    Whatever the forces are (NaN and infinity too), every count stays within 0..count_max and within the slew limit of
+    the last one.
     """
     slew, most, scale = drive["count_slew_max"], drive["count_max"], drive["volt_per_count"]
     for i in range(3):
-        wanted = math.sqrt(force_n[i] / drive["force_gain_n_per_v2"]) if force_n[i] > 0.0 else 0.0  # NaN counts as no force
+        wanted = (
+            math.sqrt(force_n[i] / drive["force_gain_n_per_v2"]) if force_n[i] > 0.0 else 0.0
+        )  # NaN counts as no force
         if drive["noise_shaping"] != 0 and wanted > 0.0:
             wanted += carry_v[i]
         low, high = max(0, count_last[i] - slew), min(most, count_last[i] + slew)
@@ -54,7 +63,7 @@ def counts_for_forces(drive, force_n: Array, count_last: Counts, carry_v: Array,
 
 
 @njit(cache=True)
-def forces_of_counts(drive, count: Counts, force_n: Array) -> None:
+def forces_of_counts(drive: np.void, count: Counts, force_n: Array) -> None:
     """Comb forces (3,) in N that counts (3,) give by the nominal law."""
     for i in range(3):
         voltage = drive["volt_per_count"] * count[i]

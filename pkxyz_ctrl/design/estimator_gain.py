@@ -1,4 +1,5 @@
-"""The Kalman filter's constant gain: filterpy discretises the noise and runs the filter, scipy solves the Riccati equation.
+"""The Kalman filter's constant gain: filterpy discretises the noise and runs the filter, scipy solves the Riccati
+equation.
 
 The two must agree, or there is no controller: a gain that only one of them believes in is an error in the model.
 """
@@ -26,7 +27,9 @@ class DesignError(RuntimeError):
 def process_noise(model: LinearStage, config: EstimatorConfig, period_s: float) -> tuple[Array, Array]:
     """Phi (9,9) and Q (9,9) by van Loan's method for white force noise on v and a random walk of d."""
     shaping = np.zeros((9, 6))
-    shaping[3:6, 0:3] = np.eye(3) * config.force_noise_n_per_rthz / (math.sqrt(2.0) * model.mass_kg)  # one-sided to two-sided
+    shaping[3:6, 0:3] = (
+        np.eye(3) * config.force_noise_n_per_rthz / (math.sqrt(2.0) * model.mass_kg)
+    )  # one-sided to two-sided
     shaping[6:9, 3:6] = np.eye(3) * config.disturbance_drift_n_per_rts
     return van_loan_discretization(model.a, shaping, period_s)
 
@@ -57,7 +60,9 @@ _UNITS = np.repeat([1e-9, 1e-6, 1e-6], 3)
 
 
 def kalman_gain(sampled: SampledStage, q: Array, h: Array, r: Array) -> Array:
-    """Steady-state gain (9,3) of the measurement update, by scipy's discrete Riccati solver; raises ``DesignError`` unless filterpy agrees."""
+    """Steady-state gain (9,3) of the measurement update, by scipy's discrete Riccati solver; raises ``DesignError``
+    unless filterpy agrees.
+    """
     scale = _UNITS
     phi = sampled.phi * scale[None, :] / scale[:, None]
     q_scaled = q / np.outer(scale, scale)
@@ -83,4 +88,7 @@ def _agree_with_filterpy(phi: Array, q: Array, h: Array, r: Array, predicted: Ar
             break
     error = float(np.abs(reference.K - gain).max() / np.abs(gain).max())
     if not error < 1e-6:
-        raise DesignError(f"Kalman gain: scipy and filterpy differ by {error:.1e} of its largest entry; check the noise levels of the controller file")
+        raise DesignError(
+            f"Kalman gain: scipy and filterpy differ by {error:.1e} of its largest entry; "
+            "check the noise levels of the controller file"
+        )

@@ -55,11 +55,13 @@ def count_max(stage: Stage, controller: ControllerConfig, bus: BusConfig) -> int
 def _check_limits(stage: Stage, controller: ControllerConfig, bus: BusConfig) -> None:
     if controller.limits.voltage_max_v > stage.voltage_max_v:
         raise ConfigError(
-            f"controller {controller.name!r}: limits.voltage_max_v = {controller.limits.voltage_max_v:g} V is beyond the "
-            f"{stage.voltage_max_v:g} V of stage {stage.config.name!r}; lower it"
+            f"controller {controller.name!r}: limits.voltage_max_v = {controller.limits.voltage_max_v:g} V is beyond "
+            f"the {stage.voltage_max_v:g} V of stage {stage.config.name!r}; lower it"
         )
     if slew_counts(controller, bus) < 1:
-        raise ConfigError(f"controller {controller.name!r}: limits.slew_max_v_per_s allows less than one count a tick; raise it")
+        raise ConfigError(
+            f"controller {controller.name!r}: limits.slew_max_v_per_s allows less than one count a tick; raise it"
+        )
 
 
 def _fill_stage(law: Any, stage: Stage, bus: BusConfig) -> None:

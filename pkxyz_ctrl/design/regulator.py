@@ -15,10 +15,13 @@ Array = NDArray[np.float64]
 def regulator_gain(sampled: SampledStage, config: RegulatorConfig) -> tuple[Array, Array]:
     """K_x (3,3) in N/m and K_v (3,3) in N s/m of w = -K_x x - K_v v, for Bryson weights.
 
-    The regulator is designed for the state at the instant at which its force begins to act, which the filter predicts, so
-    the loop's delay needs no further states. Raises ``DesignError`` where scipy's solution or stability says otherwise.
+    The regulator is designed for the state at the instant at which its force begins to act, which the filter
+    predicts, so the loop's delay needs no further states. Raises ``DesignError`` where scipy's solution or stability
+    says otherwise.
     """
-    weights = np.diag(np.repeat([config.position_error_m, config.velocity_error_m_per_s], 3) ** -2.0) * config.force_n**2
+    weights = (
+        np.diag(np.repeat([config.position_error_m, config.velocity_error_m_per_s], 3) ** -2.0) * config.force_n**2
+    )
     scale = np.repeat([config.position_error_m, config.velocity_error_m_per_s], 3)  # unit state of the scaled problem
     phi = sampled.phi[:6, :6] * scale[None, :] / scale[:, None]
     gamma = sampled.gamma[:6] * config.force_n / scale[:, None]
@@ -30,6 +33,9 @@ def regulator_gain(sampled: SampledStage, config: RegulatorConfig) -> tuple[Arra
     error = float(np.abs(gain - check).max() / np.abs(check).max())
     radius = float(np.abs(np.linalg.eigvals(phi - gamma @ gain)).max())
     if not (error < 1e-6 and radius < 1.0):
-        raise DesignError(f"regulator: python-control and scipy differ by {error:.1e}, closed-loop spectral radius {radius:.6f}; check the weights")
+        raise DesignError(
+            f"regulator: python-control and scipy differ by {error:.1e}, "
+            f"closed-loop spectral radius {radius:.6f}; check the weights"
+        )
     physical = gain * config.force_n / scale[None, :]
     return physical[:, :3], physical[:, 3:]
