@@ -144,25 +144,27 @@ def _remedy_for_unknown(key: str, fields: list[str]) -> str:
     return f"did you mean {near[0]!r}?" if near else f"known here: {', '.join(fields)}"
 
 
-def _fields_at(location: tuple[int | str, ...], model: Any) -> list[str]:
-    """Names of the fields at a place of a nested model, as far as the place can be followed."""
+def _fields_at(location: tuple[int | str, ...], model: type[BaseModel]) -> list[str]:
+    """Names of the fields at a place of a nested model; of all that may stand there, where the place doesn't tell."""
+    models = [model]
     for part in location:
-        if isinstance(part, int) or not (isinstance(model, type) and issubclass(model, BaseModel)):
+        if isinstance(part, int):
             continue
-        field = model.model_fields.get(str(part))
-        if field is None:
-            break
-        candidates = [field.annotation, *_arguments(field.annotation)]
-        nested = [c for c in candidates if isinstance(c, type) and issubclass(c, BaseModel)]
-        model = nested[0] if nested else model
-    return list(model.model_fields) if isinstance(model, type) and issubclass(model, BaseModel) else []
+        tagged = [m for m in models if "kind" in m.model_fields and part in _values(m.model_fields["kind"].annotation)]
+        stepped = [_models(m.model_fields[part].annotation) for m in models if part in m.model_fields]
+        models = tagged or [m for found in stepped for m in found] or models
+    return [name for m in models for name in m.model_fields]
 
 
-def _arguments(annotation: Any) -> list[Any]:
-    found: list[Any] = []
-    for argument in getattr(annotation, "__args__", ()):
-        found += [argument, *_arguments(argument)]
-    return found
+def _models(annotation: Any) -> list[type[BaseModel]]:
+    """The models inside a type, however it is wrapped: ``tuple[A | B, ...]`` gives A and B."""
+    if isinstance(annotation, type) and issubclass(annotation, BaseModel):
+        return [annotation]
+    return [m for argument in getattr(annotation, "__args__", ()) for m in _models(argument)]
+
+
+def _values(literal: Any) -> tuple[Any, ...]:
+    return getattr(literal, "__args__", ())
 
 
 def plain(model: BaseModel) -> dict[str, Any]:
