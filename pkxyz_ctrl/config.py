@@ -88,7 +88,10 @@ def parse(data: dict[str, Any], model: type[Model], source: str) -> Model:
     try:
         return model.model_validate(_listed_as_tuples(data))
     except ValidationError as error:
-        lines = [_explain(source, dict(item), model) for item in error.errors(include_url=False)]
+        items = error.errors(include_url=False)
+        inner = {item["loc"][:n] for item in items for n in range(len(item["loc"]))}
+        # A list whose items are wrong also counts as too short; only the items are worth a line.
+        lines = [_explain(source, dict(item), model) for item in items if item["loc"] not in inner or not item["loc"]]
         raise ConfigError("\n".join(dict.fromkeys(lines))) from None
 
 

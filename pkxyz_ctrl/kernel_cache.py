@@ -35,12 +35,6 @@ def choose_kernel_cache() -> None:
     _forget_old(home)
 
 
-def is_cold() -> bool:
-    """Whether nothing has been compiled yet from these sources: the first run takes longer and should say so."""
-    folder = os.environ.get("NUMBA_CACHE_DIR")
-    return folder is not None and not any(Path(folder).rglob("*.nbc"))
-
-
 def _digest_of_kernels() -> str:
     """Over every file that holds a kernel and all of ours that these import: a kernel freezes the constants that it
     uses.
