@@ -1,0 +1,161 @@
+"""Forces to counts: limits that nothing can pass, the square-root law there and back, noise shaping by its spectrum."""
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from loop_rig import tick_law
+from scipy import signal
+
+from pkxyz_ctrl.core.voltage import counts_for_forces, force_limits, forces_of_counts
+
+MOST = 32767
+HOSTILE = st.one_of(
+    st.floats(allow_nan=True, allow_infinity=True, allow_subnormal=True),
+    st.sampled_from([np.nan, np.inf, -np.inf, -0.0, 5e-324, 1e308, -1e308]),
+    st.floats(0, 3e-3),
+)
+COUNTS = st.tuples(*[st.integers(0, MOST)] * 3).map(lambda c: np.array(c, np.int32))
+
+
+def drive_with(*, slew=MOST, most=MOST, shaping=1):
+    drive = tick_law()["drive"]
+    drive["count_slew_max"], drive["count_max"], drive["noise_shaping"] = slew, most, shaping
+    return drive
+
+
+def convert(drive, force_n, last, carry_v):
+    count = np.zeros(3, np.int32)
+    counts_for_forces(drive, np.asarray(force_n, dtype=float), last, carry_v, count)
+    return count
+
+
+@settings(max_examples=400, deadline=None)
+@given(
+    st.lists(st.tuples(HOSTILE, HOSTILE, HOSTILE), min_size=1, max_size=8),
+    COUNTS,
+    st.integers(1, MOST),
+    st.integers(1, MOST),
+    st.booleans(),
+)
+def test_no_force_however_hostile_leaves_the_limits(forces, last, slew, most, shaping):
+    """Tick after tick, the carry of the last one included."""
+    drive, carry, last = drive_with(slew=slew, most=most, shaping=shaping), np.zeros(3), np.minimum(last, most)
+    for force in forces:
+        count = convert(drive, force, last, carry)
+        assert np.all((count >= 0) & (count <= most))
+        assert np.all(np.abs(count.astype(int) - last) <= slew)
+        assert np.all(np.abs(carry) <= drive["volt_per_count"])
+        last = count
+
+
+@pytest.mark.parametrize("force", [np.nan, -np.inf, -1.0, -0.0, 0.0])
+def test_what_is_no_pull_is_0_v(force):
+    drive, carry = drive_with(), np.full(3, 1.0)
+    assert convert(drive, [force] * 3, np.full(3, 20_000, np.int32), carry).tolist() == [0, 0, 0]
+
+
+@pytest.mark.parametrize("force", [np.inf, 1e300, 1.0])
+def test_what_is_too_much_is_the_most(force):
+    drive = drive_with(most=30_000)
+    assert convert(drive, [force] * 3, np.full(3, 20_000, np.int32), np.zeros(3)).tolist() == [30_000] * 3
+
+
+@settings(max_examples=200, deadline=None)
+@given(COUNTS)
+def test_counts_to_forces_and_back(count):
+    """Every count is found again from the force that it gives, exactly, with nothing left to carry."""
+    for shaping in (0, 1):
+        drive, force, carry = drive_with(shaping=shaping), np.zeros(3), np.zeros(3)
+        forces_of_counts(drive, count, force)
+        volts = count * (200 / 32767)
+        assert force == pytest.approx(drive["force_gain_n_per_v2"] * volts**2, rel=1e-12)
+        assert np.array_equal(convert(drive, force, count, carry), count)
+        assert np.abs(carry).max() <= 1e-12 * 200
+
+
+@settings(max_examples=200, deadline=None)
+@given(st.tuples(*[st.floats(0, 2.6e-3)] * 3), COUNTS, st.integers(1, MOST), st.integers(1, MOST))
+def test_a_force_within_the_limits_is_met_to_half_a_count(fractions, last, slew, most):
+    """What ``force_limits`` promises, ``counts_for_forces`` keeps: inside them only the rounding is left."""
+    drive, last, lower, upper = drive_with(slew=slew, most=most), np.minimum(last, most), np.zeros(3), np.zeros(3)
+    force_limits(drive, last, lower, upper)
+    assert np.all((lower >= 0) & (lower <= upper))
+    force = np.clip(fractions, lower, upper)
+    count = convert(drive, force, last, np.zeros(3))
+    wanted = np.sqrt(force / drive["force_gain_n_per_v2"]) / drive["volt_per_count"]
+    assert np.abs(count - wanted).max() <= 0.5 + 1e-6
+
+
+def sweep(shaping, ticks=1 << 16):
+    """Voltage error in counts of a slow sweep over thousands of counts on three combs (ticks, 3), and the carries."""
+    drive, carry = drive_with(shaping=shaping), np.zeros(3)
+    t = np.arange(ticks)[:, None]
+    volts = 100 + 60 * np.sin(2 * np.pi * t / np.array([9973.0, 7919.0, 12007.0]))
+    force = drive["force_gain_n_per_v2"] * volts**2
+    counts, carries = np.zeros((ticks, 3), np.int32), np.zeros((ticks, 3))
+    last = np.round(volts[0] / drive["volt_per_count"]).astype(np.int32)
+    for k in range(ticks):
+        counts_for_forces(drive, force[k], last, carry, counts[k])
+        last, carries[k] = counts[k], carry
+    return counts - volts / drive["volt_per_count"], carries / drive["volt_per_count"]
+
+
+def spectrum(error, bands):
+    """One-sided density in counts^2 times the sampling rate, averaged over bands of the normalised frequency."""
+    f, density = signal.welch(error, fs=1.0, nperseg=1024, axis=0, detrend=False)
+    return np.array([density[(f >= low) & (f < high)].mean() for low, high in bands]), f
+
+
+BANDS = [(0.01, 0.03), (0.03, 0.07), (0.07, 0.15), (0.15, 0.25), (0.25, 0.35), (0.35, 0.45), (0.45, 0.5)]
+WHITE = 2 / 12  # one count's rounding, one-sided over half the sampling rate
+
+
+def test_shaped_error_rises_as_the_first_difference():
+    """|1 - z^-1|^2 times the white density of rounding, in seven bands; at low frequencies far below it."""
+    error, carry = sweep(shaping=1)
+    density, f = spectrum(error, BANDS)
+    shape = np.abs(1 - np.exp(-2j * np.pi * f)) ** 2
+    expected = np.array([WHITE * shape[(f >= low) & (f < high)].mean() for low, high in BANDS])
+    assert np.all((density > 0.85 * expected) & (density < 1.15 * expected))
+    assert density[0] < 0.03 * WHITE
+    assert 0.248 < np.abs(carry).mean() < 0.252  # uniform over one count
+    assert np.abs(carry).max() <= 0.5 + 1e-9
+    # the errors are differences of the carry, so they telescope: no sum ever exceeds a count
+    assert np.abs(np.cumsum(error, axis=0)).max() <= 0.5 + 1e-6
+    assert np.abs(error.mean(axis=0)).max() < 1 / len(error)
+
+
+def test_unshaped_error_is_white():
+    error, carry = sweep(shaping=0)
+    density, _ = spectrum(error, BANDS)
+    assert np.all((density > 0.85 * WHITE) & (density < 1.15 * WHITE))
+    assert np.abs(error).max() <= 0.5 + 1e-9
+    assert np.abs(carry + error).max() < 1e-6  # it is noted, and not used
+
+
+def test_a_constant_between_two_counts_is_met_on_average():
+    """0.3 of a count: three ticks in ten the upper one. Without shaping it would be the lower one for ever."""
+    drive = drive_with()
+    force = np.full(3, drive["force_gain_n_per_v2"] * (20_000.3 * drive["volt_per_count"]) ** 2)
+    for shaping, mean in ((1, 20_000.3), (0, 20_000.0)):
+        drive["noise_shaping"] = shaping
+        carry, last, total = np.zeros(3), np.full(3, 20_000, np.int32), np.zeros(3)
+        for _ in range(1000):
+            last = convert(drive, force, last, carry)
+            total += last
+        assert total / 1000 == pytest.approx(np.full(3, mean), rel=0, abs=2e-3)
+
+
+def test_the_carry_does_not_wind_up_at_a_limit():
+    """A thousand ticks beyond the limit leave one count of carry; two ticks later the voltage is right to a count."""
+    drive, carry, last = drive_with(most=10_000), np.zeros(3), np.full(3, 9_000, np.int32)
+    high = np.full(3, drive["force_gain_n_per_v2"] * 150.0**2)
+    low = np.full(3, drive["force_gain_n_per_v2"] * (8_000 * drive["volt_per_count"]) ** 2)
+    for _ in range(1000):
+        last = convert(drive, high, last, carry)
+    assert last.tolist() == [10_000] * 3
+    for _ in range(3):
+        last = convert(drive, low, last, carry)
+        assert np.abs(last - 8_000).max() <= 1
+    assert last.tolist() == [8_000] * 3
