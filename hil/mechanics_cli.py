@@ -1,0 +1,328 @@
+"""``pkxyz paper``, ``workspace``, ``design`` and ``linearisation``: the design theory at the command line.
+
+Here lengths are um, voltages V and frequencies Hz; behind it all is SI. Errors of the theory become
+``ConfigError``, one line.
+"""
+
+import json
+import math
+from collections.abc import Iterator
+from contextlib import contextmanager
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, Any
+
+import typer
+from rich.console import Console
+from rich.table import Table
+
+from pkxyz_ctrl.config import ConfigError, load, require_finite
+
+if TYPE_CHECKING:
+    from pkxyz_ctrl.mechanics.reproduction import Row
+    from pkxyz_ctrl.mechanics.selection import Selection
+    from pkxyz_ctrl.stage import Stage
+
+_screen = Console(highlight=False)
+
+AsJson = Annotated[bool, typer.Option("--json", help="Print JSON, and nothing else.")]
+StageName = Annotated[str, typer.Option("--stage", help="A shipped stage's name or a TOML file.")]
+OutFolder = Annotated[Path | None, typer.Option(help="Folder for the pictures; none are drawn without it.")]
+
+
+@contextmanager
+def _one_line_errors() -> Iterator[None]:
+    from pkxyz_ctrl.mechanics.errors import GeometryError, InfeasibleDesignError
+    from pkxyz_ctrl.stage import StageDomainError
+
+    try:
+        yield
+    except (GeometryError, InfeasibleDesignError, StageDomainError) as error:
+        raise ConfigError(str(error)) from None
+
+
+def _folder(out: Path) -> Path:
+    try:
+        out.mkdir(parents=True, exist_ok=True)
+    except OSError as error:
+        raise ConfigError(f"{out}: cannot be made a folder: {error.strerror}; give another with --out") from None
+    return out
+
+
+def paper(as_json: AsJson = False, out: OutFolder = None) -> None:
+    """Every number that the paper prints, beside what its two designs give; with --out also its figures."""
+    from pkxyz_ctrl.mechanics.published import entries
+    from pkxyz_ctrl.mechanics.reproduction import reproduction_table
+    from pkxyz_ctrl.stage import Stage
+
+    stages = {name: Stage.load(name) for name in ("printed", "reconstructed")}
+    rows = reproduction_table(entries(), stages["printed"], stages["reconstructed"])
+    if out is not None:
+        from hil.mechanics_figures import draw_design_space, draw_modes
+        from hil.workspace_figures import draw_edge_path, draw_workspace
+
+        folder, stage = _folder(out), stages["reconstructed"]
+        draw_design_space(stages, folder / "figure_4_design_space.png")
+        draw_workspace(stage, 130.0, folder / "figure_7_workspace.png")
+        draw_modes(stage, folder / "figure_8_modes.png")
+        draw_edge_path(stage, folder / "figure_b_edge_path.png")
+    if as_json:
+        print(json.dumps({"rows": [_row_data(row) for row in rows]}, allow_nan=False))
+        return
+    _screen.print(_paper_table(rows))
+    counts = {v: sum(row.verdict == v for row in rows) for v in dict.fromkeys(row.verdict for row in rows)}
+    _screen.print(f"{len(rows)} numbers: " + ", ".join(f"{n} {v}" for v, n in counts.items()))
+
+
+def _row_data(row: "Row") -> dict[str, Any]:
+    corrected = (
+        None if row.corrected_from_to is None else dict(zip(("text", "computed"), row.corrected_from_to, strict=True))
+    )
+    return {key: value for key, value in vars(row).items() if key != "corrected_from_to"} | {"corrected": corrected}
+
+
+def _paper_table(rows: "list[Row]") -> Table:
+    table = Table(box=None, pad_edge=False, header_style="dim")
+    for heading in ("where", "number", "unit", "published", "printed", "reconstr.", "off (%)", "verdict", "why"):
+        numeric = heading in ("published", "printed", "reconstr.", "off (%)")
+        table.add_column(
+            heading, justify="right" if numeric else "left", no_wrap=numeric or heading in ("where", "verdict")
+        )
+    colours = {"reproduces": "green", "rounded": "cyan", "misprint": "yellow", "not reproducible": "red"}
+    for row in rows:
+        off = [d for d in (row.difference_printed, row.difference_reconstructed) if d is not None]
+        nearest = f"{min(off, key=abs) * 100:+.2g}" if off else ""
+        figures = ["" if v is None else f"{v:.5g}" for v in (row.printed, row.reconstructed)]
+        verdict = f"[{colours[row.verdict]}]{row.verdict}[/]"
+        table.add_row(row.where, row.quantity, row.unit, row.published_text, *figures, nearest, verdict, row.why)
+    return table
+
+
+def workspace(
+    stage: StageName = "reconstructed",
+    v_max: Annotated[float | None, typer.Option(help="Voltage limit in V; default: the stage's.")] = None,
+    as_json: AsJson = False,
+    out: OutFolder = None,
+) -> None:
+    """What the platform reaches, the cubes inside, and how much of it a voltage limit can hold."""
+    from pkxyz_ctrl.mechanics.workspace import held_volume
+    from pkxyz_ctrl.mechanics.workspace import workspace as measure
+    from pkxyz_ctrl.stage import Stage
+
+    device = Stage.load(stage)
+    limit = device.voltage_max_v if v_max is None else require_finite(v_max, "--v-max")
+    with _one_line_errors():
+        found, held = measure(device), held_volume(device, limit)
+        data = _workspace_data(device, limit) | {
+            "volume_um3": {
+                "linear": found.linear_volume_m3 * 1e18,
+                "exact": found.exact_volume.value_m3 * 1e18,
+                "exact_error": found.exact_volume.error_m3 * 1e18,
+                "held": held.value_m3 * 1e18,
+                "held_error": held.error_m3 * 1e18,
+                "held_share": held.value_m3 / found.exact_volume.value_m3,
+            },
+            "extents_um": {
+                kind: {axis: [float(low[i]) * 1e6, float(high[i]) * 1e6] for i, axis in enumerate("xyz")}
+                for kind, low, high in (
+                    ("linear", found.linear_low_m, found.linear_high_m),
+                    ("exact", found.exact_low_m, found.exact_high_m),
+                )
+            },
+        }
+        if out is not None:
+            from hil.workspace_figures import draw_workspace
+
+            draw_workspace(device, limit, _folder(out) / "workspace.png")
+    if as_json:
+        print(json.dumps(data, allow_nan=False))
+        return
+    _print_workspace(data)
+
+
+def _workspace_data(device: "Stage", limit_v: float) -> dict[str, Any]:
+    from pkxyz_ctrl.mechanics.inscribed import inscribed_cube
+    from pkxyz_ctrl.mechanics.workspace import box_corners, stroke_box, voltage_needed_v
+
+    corners = box_corners(*stroke_box(device))
+    positions, volts = device.forward_kinematics(corners), voltage_needed_v(device, corners)
+    return {
+        "stage": device.config.name,
+        "v_max": limit_v,
+        "inscribed_cube_um": {
+            "standing": inscribed_cube(device).side_m * 1e6,
+            "along_axes": inscribed_cube(device, aligned=True).side_m * 1e6,
+        },
+        "corners": [
+            {
+                "stroke_um": [float(v) * 1e6 for v in q],
+                "position_um": [float(v) * 1e6 for v in p],
+                "voltage_v": None if math.isnan(volt) else float(volt),
+            }
+            for q, p, volt in zip(corners, positions, volts, strict=True)
+        ],
+    }
+
+
+def _print_workspace(data: dict[str, Any]) -> None:
+    volume, cube = data["volume_um3"], data["inscribed_cube_um"]
+    _screen.print(f"Stage {data['stage']}, limit {data['v_max']:g} V")
+    table = Table(box=None, pad_edge=False, show_header=False)
+    table.add_row("volume, exact", f"{volume['exact']:.1f} µm³", f"linear {volume['linear']:.1f} µm³")
+    share = f"{volume['held_share']:.1%} of it, ± {volume['held_error']:.2g} µm³"
+    table.add_row(f"held with {data['v_max']:g} V", f"{volume['held']:.1f} µm³", share)
+    for axis in "xyz":
+        (low, high), (flat_low, flat_high) = (data["extents_um"][kind][axis] for kind in ("exact", "linear"))
+        table.add_row(axis, f"{low:.2f} to {high:.2f} µm", f"linear {flat_low:.2f} to {flat_high:.2f} µm")
+    table.add_row(
+        "inscribed cube",
+        f"{cube['standing']:.2f} µm",
+        f"standing on its corner; along x, y, z {cube['along_axes']:.2f} µm",
+    )
+    _screen.print(table)
+    corners = Table(box=None, pad_edge=False, header_style="dim")
+    for heading in ("corner: strokes (µm)", "position (µm)", "needs (V)"):
+        corners.add_column(heading, justify="right")
+    for corner in data["corners"]:
+        strokes, position = (", ".join(f"{v:.4g}" for v in corner[k]) for k in ("stroke_um", "position_um"))
+        volts = corner["voltage_v"]
+        words = "a push" if volts is None else f"{volts:.1f}" + ("" if volts <= data["v_max"] else " too much")
+        corners.add_row(strokes, position, words)
+    _screen.print(corners)
+
+
+def design(
+    out: Annotated[Path, typer.Option(help="Stage file to write.")] = Path("designed.toml"),
+    stroke: Annotated[float, typer.Option(help="Stroke of a comb, um.")] = 25.0,
+    cube: Annotated[float, typer.Option(help="Side of the cube to be reached, um.")] = 20.0,
+    f_min: Annotated[float, typer.Option(help="Lowest natural frequency, Hz.")] = 500.0,
+    f_max: Annotated[float, typer.Option(help="Highest natural frequency, Hz.")] = 1000.0,
+    v_max: Annotated[float, typer.Option(help="Comb voltage limit, V; the paper's 130 V cannot reach 25 um.")] = 200.0,
+    force: Annotated[float | None, typer.Option(help="Comb force limit, mN, in place of --v-max.")] = None,
+    layers: Annotated[
+        str, typer.Option(help="Device layer 1 / device layer 2 / handle / oxide, um.")
+    ] = "90/27/300/0.5",
+    radius: Annotated[float, typer.Option(help="Base radius r, um.")] = 2000.0,
+    mass: Annotated[float, typer.Option(help="Effective moving mass, mg.")] = 4.833,
+    chains: Annotated[int, typer.Option(help="Chains whose out-of-plane hinges count, 1 or 3.")] = 1,
+    stage: Annotated[str, typer.Option(help="Stage whose flexures and combs are taken.")] = "reconstructed",
+    picture: Annotated[Path | None, typer.Option(help="PNG of the feasible region.")] = None,
+    as_json: AsJson = False,
+) -> None:
+    """Dimensions from requirements (the paper's section IV), written as a stage file that `pkxyz sil --stage`
+    runs.
+    """
+    from pkxyz_ctrl.mechanics.combs import voltage_for_force_v
+    from pkxyz_ctrl.mechanics.selection import Requirements, select
+    from pkxyz_ctrl.stage_config import StageConfig
+
+    template = load("stages", stage, StageConfig)
+    if chains not in (1, 3):
+        raise ConfigError(f"--chains must be 1 (Eq. 19 as printed) or 3 (as the text describes it), got {chains}")
+    if out.suffix != ".toml":
+        raise ConfigError(f"{out}: --out must be a .toml file, so that --stage finds it")
+    layer = _layers_m(layers)
+    if force is not None:
+        comb = template.drive_comb.model_copy(update={"finger_height_m": layer[0]})
+        v_max = float(voltage_for_force_v(comb, require_finite(force, "--force") * 1e-3))
+    with _one_line_errors():
+        need = Requirements(
+            stroke_m=stroke / 1e6,
+            cube_side_m=cube / 1e6,
+            frequency_min_hz=f_min,
+            frequency_max_hz=f_max,
+            voltage_max_v=v_max,
+            device_layer_1_m=layer[0],
+            device_layer_2_m=layer[1],
+            handle_layer_m=layer[2],
+            oxide_m=layer[3],
+            base_radius_m=radius / 1e6,
+            mass_kg=mass / 1e6,
+            out_of_plane_chains=chains,
+        )
+        if need.voltage_max_v > 1000:
+            raise ConfigError(f"voltage limit <= 1000 V is violated: {need.voltage_max_v:g} V")
+        chosen = select(need, template, name=out.stem)
+    from hil.stage_file import write_stage_file
+
+    write_stage_file(chosen, need, out)
+    if picture is not None:
+        from hil.mechanics_figures import draw_selection
+
+        draw_selection(chosen, picture)
+    _report_design(chosen, out, as_json)
+
+
+def _layers_m(text: str) -> list[float]:
+    try:
+        layers = [float(part) / 1e6 for part in text.split("/")]
+    except ValueError:
+        layers = []
+    if len(layers) != 4:
+        raise ConfigError(
+            f"--layers takes four thicknesses in um, device 1/device 2/handle/oxide, like 90/27/300/0.5; got {text!r}"
+        )
+    return layers
+
+
+def _report_design(chosen: "Selection", out: Path, as_json: bool) -> None:
+    from pkxyz_ctrl.mechanics.selection import MARGINS
+
+    geometry = chosen.config.geometry
+    height, reach = geometry.height_rest_m, geometry.projection_rest_m
+    data = {
+        "stage_file": str(out),
+        "l1_um": geometry.crank_length_m * 1e6,
+        "l2_um": math.hypot(height, reach) * 1e6,
+        "alpha_0_rad": math.atan2(height, reach),
+        "cube_um": chosen.cube_side_m * 1e6,
+        "feasible_share": float(chosen.region.feasible().mean()),
+        "margins": dict(zip(MARGINS, chosen.margin.tolist(), strict=True)),
+    }
+    if as_json:
+        print(json.dumps(data, allow_nan=False))
+        return
+    _screen.print(f"L1 = {data['l1_um']:.1f} µm, L2 = {data['l2_um']:.1f} µm, alpha_0 = {data['alpha_0_rad']:.4f} rad")
+    table = Table(box=None, pad_edge=False, header_style="dim")
+    table.add_column("requirement")
+    table.add_column("margin", justify="right")
+    for name, margin in zip(MARGINS, chosen.margin, strict=True):
+        table.add_row(name, f"{margin:.1%}" if margin < 10 else "ample")
+    _screen.print(table)
+    _screen.print(f"written to {out}; run it with: pkxyz sil --stage {out}", soft_wrap=True)
+
+
+def linearisation(
+    stage: StageName = "reconstructed",
+    move: Annotated[float, typer.Option(help="Size of the moves about a set-point, um.")] = 1.0,
+    as_json: AsJson = False,
+    out: OutFolder = None,
+) -> None:
+    """What one constant Jacobian costs against relinearising at the set-point and against the exact solution."""
+    import numpy as np
+
+    from pkxyz_ctrl.mechanics.linearisation import linearisation_study
+    from pkxyz_ctrl.stage import Stage
+
+    device = Stage.load(stage)
+    with _one_line_errors():
+        study = linearisation_study(device, points=17, move_m=move * 1e-6)
+    kinds = {
+        "constant_at_rest": study.at_rest_m,
+        "constant_at_middle": study.at_middle_m,
+        "newton_step": study.newton_m,
+        "relinearised": study.relinearised_m,
+    }
+    worst = {k: dict(zip("xyz", (np.abs(e).max(axis=0) * 1e9).tolist(), strict=True)) for k, e in kinds.items()}
+    if out is not None:
+        from hil.mechanics_figures import draw_linearisation
+
+        draw_linearisation(study, device.config.name, _folder(out) / "linearisation.png")
+    if as_json:
+        print(json.dumps({"stage": device.config.name, "move_um": move, "worst_nm": worst}, allow_nan=False))
+        return
+    table = Table(box=None, pad_edge=False, header_style="dim")
+    for heading in ("worst error (nm)", "x", "y", "z"):
+        table.add_column(heading, justify="left" if " " in heading else "right")
+    for kind, error in worst.items():
+        table.add_row(kind.replace("_", " "), *(f"{error[axis]:.3g}" for axis in "xyz"))
+    _screen.print(table)
