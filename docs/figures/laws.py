@@ -1,0 +1,100 @@
+"""Writes docs/figures/laws.png: what each part of the law is worth, on runs of the fast lane with that part taken out."""
+
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import scipy.signal
+from matplotlib.backends.backend_agg import FigureCanvasAgg
+from matplotlib.figure import Figure
+from numpy.typing import NDArray
+
+from hil import lanes
+from hil.scenario import load_scenario
+from hil.setup import Setup
+
+BLUE, ORANGE, GREY = "#0072b2", "#d55e00", "#8a8a8a"
+
+
+def rows_of(setup: Setup, law: NDArray[np.void] | None = None) -> NDArray[np.void]:
+    """All rows of a fast-lane run; ``law`` replaces the designed numbers."""
+    if law is not None:
+        setup = replace(setup)
+        setup.__dict__["law"] = law
+    blocks: list[NDArray[np.void]] = []
+    lanes.run(setup, "fast", on_block=lambda block: blocks.append(block.copy()))
+    return np.concatenate(blocks)
+
+
+def changed(setup: Setup, change: str) -> NDArray[np.void]:
+    """The setup's law with one part taken out."""
+    law = setup.law.copy()
+    feedback = law["tick"]["feedback"]
+    if change == "no feedback":
+        feedback["authority_force_n"] = 1e9
+    elif change == "feed-forward at the sample":
+        feedback["lead_s"] = 0.0
+    elif change == "no noise shaping":
+        law["tick"]["drive"]["noise_shaping"] = 0
+    return law
+
+
+def error_nm(rows: NDArray[np.void], axis: int) -> NDArray[np.float64]:
+    """True position less reference in nm."""
+    return (rows["position_m"][:, axis] - rows["reference_m"][:, axis]) * 1e9
+
+
+def draw_errors(figure: Figure) -> None:
+    """Error in x on two lines of the mild plant, whole and without its parts."""
+    scenario = load_scenario("raster_mild")
+    setup = scenario.setup()
+    whole = rows_of(setup)
+    axes = figure.add_subplot(1, 2, 1)
+    window = slice(*np.searchsorted(whole["t_us"], [400_000, 440_000]))
+    t_ms = (whole["t_us"][window] - 400_000) * 1e-3
+    for name, colour in (("no feedback", GREY), ("feed-forward at the sample", ORANGE)):
+        error = error_nm(rows_of(setup, changed(setup, name)), 0)[window]
+        offset = error.mean() if name == "no feedback" else 0.0
+        label = f"{name} (less its mean, {offset:.0f} nm)" if offset else name
+        axes.plot(t_ms, error - offset, color=colour, label=label)
+    axes.plot(t_ms, error_nm(whole, 0)[window], color=BLUE, label="the whole law")
+    axes.set(xlabel="time (ms)", ylabel="error in x (nm)", title="Two lines of a raster, mild plant")
+    axes.set_ylim(-27, 45)
+    axes.legend(frameon=False, fontsize=9, loc="upper right")
+
+
+def draw_quantisation(figure: Figure) -> None:
+    """Spectrum of the voltage's rounding error while holding, with and without noise shaping."""
+    setup = load_scenario("raster").setup()
+    axes = figure.add_subplot(1, 2, 2)
+    gain = float(setup.law["tick"]["drive"]["force_gain_n_per_v2"][0])
+    for name, colour in (("no noise shaping", ORANGE), ("noise shaping", BLUE)):
+        rows = rows_of(setup, changed(setup, name))
+        hold = rows[(rows["t_us"] > 950_000)]
+        rounding_v = hold["voltage_v"] - np.sqrt(hold["force_n"] / gain)
+        rate_hz = 1 / setup.bus.period_s
+        f, density = scipy.signal.welch(rounding_v, rate_hz, nperseg=256, axis=0)
+        axes.loglog(f[1:], np.sqrt(density.mean(axis=1))[1:] * 1e6, color=colour, label=name)
+    f = np.array([20.0, 2500.0])
+    axes.axvspan(20, 772, color="#e9eef2", zorder=0)
+    axes.annotate("the stage follows", (24, 6), color="#5b6770", fontsize=9)
+    axes.set(
+        xlim=f, xlabel="frequency (Hz)", ylabel="voltage error (uV/rtHz)", title="Rounding to 6.1 mV counts, while holding"
+    )
+    axes.legend(frameon=False, fontsize=9, loc="lower right")
+
+
+def main() -> None:
+    """Draw both panels."""
+    figure = Figure(figsize=(11, 4.2), layout="constrained", dpi=130)
+    FigureCanvasAgg(figure)
+    draw_errors(figure)
+    draw_quantisation(figure)
+    for axes in figure.axes:
+        axes.spines[["top", "right"]].set_visible(False)
+        axes.title.set_fontsize(11)
+    figure.savefig(Path(__file__).with_suffix(".png"))
+
+
+if __name__ == "__main__":
+    main()

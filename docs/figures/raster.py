@@ -1,0 +1,15 @@
+"""Writes docs/figures/raster.png, the picture of the README: what ``pkxyz sil`` leaves behind."""
+
+import shutil
+import tempfile
+from pathlib import Path
+
+from hil.run_folder import RunFolder
+from hil.scenario import load_scenario
+from hil.sil import draw, run_into
+
+if __name__ == "__main__":
+    with tempfile.TemporaryDirectory() as scratch:
+        folder = RunFolder(Path(scratch) / "raster")
+        draw(folder, run_into(folder, load_scenario("raster"), "lockstep", lambda done, total: None))
+        shutil.copy(folder.picture, Path(__file__).with_suffix(".png"))
