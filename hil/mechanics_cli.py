@@ -13,6 +13,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 from rich.console import Console
+from rich.markup import escape
 from rich.table import Table
 
 from pkxyz_ctrl.config import ConfigError, load, require_finite
@@ -23,6 +24,8 @@ if TYPE_CHECKING:
     from pkxyz_ctrl.stage import Stage
 
 _screen = Console(highlight=False)
+_WIDE = 150  # columns that the table of the paper's numbers needs
+_VERDICT_COLOURS = {"reproduces": "green", "rounded": "cyan", "misprint": "yellow", "not reproducible": "red"}
 
 AsJson = Annotated[bool, typer.Option("--json", help="Print JSON, and nothing else.")]
 StageName = Annotated[str, typer.Option("--stage", help="A shipped stage's name or a TOML file.")]
@@ -68,7 +71,11 @@ def paper(as_json: AsJson = False, out: OutFolder = None) -> None:
     if as_json:
         print(json.dumps({"rows": [_row_data(row) for row in rows]}, allow_nan=False))
         return
-    _screen.print(_paper_table(rows))
+    if _screen.width >= _WIDE:
+        _screen.print(_paper_table(rows))
+    else:
+        for row in rows:
+            _screen.print(_paper_lines(row), soft_wrap=True)
     counts = {v: sum(row.verdict == v for row in rows) for v in dict.fromkeys(row.verdict for row in rows)}
     _screen.print(f"{len(rows)} numbers: " + ", ".join(f"{n} {v}" for v, n in counts.items()))
 
@@ -80,6 +87,15 @@ def _row_data(row: "Row") -> dict[str, Any]:
     return {key: value for key, value in vars(row).items() if key != "corrected_from_to"} | {"corrected": corrected}
 
 
+def _paper_lines(row: "Row") -> str:
+    """A row for a narrow screen or a pipe: one line of figures, one of reason."""
+    figures = [f"{row.published_text} {row.unit}".rstrip() + " published"]
+    for design, value in (("printed", row.printed), ("reconstructed", row.reconstructed)):
+        figures += [] if value is None else [f"{value:.6g} {design}"]
+    verdict = f"[{_VERDICT_COLOURS[row.verdict]}]{row.verdict}[/]"
+    return f"{row.where}  {escape(row.quantity)}: {', '.join(figures)}: {verdict}\n    {row.why}"
+
+
 def _paper_table(rows: "list[Row]") -> Table:
     table = Table(box=None, pad_edge=False, header_style="dim")
     for heading in ("where", "number", "unit", "published", "printed", "reconstr.", "off (%)", "verdict", "why"):
@@ -87,13 +103,14 @@ def _paper_table(rows: "list[Row]") -> Table:
         table.add_column(
             heading, justify="right" if numeric else "left", no_wrap=numeric or heading in ("where", "verdict")
         )
-    colours = {"reproduces": "green", "rounded": "cyan", "misprint": "yellow", "not reproducible": "red"}
     for row in rows:
         off = [d for d in (row.difference_printed, row.difference_reconstructed) if d is not None]
         nearest = f"{min(off, key=abs) * 100:+.2g}" if off else ""
-        figures = ["" if v is None else f"{v:.5g}" for v in (row.printed, row.reconstructed)]
-        verdict = f"[{colours[row.verdict]}]{row.verdict}[/]"
-        table.add_row(row.where, row.quantity, row.unit, row.published_text, *figures, nearest, verdict, row.why)
+        figures = ["" if v is None else f"{v:.6g}" for v in (row.printed, row.reconstructed)]
+        verdict = f"[{_VERDICT_COLOURS[row.verdict]}]{row.verdict}[/]"
+        table.add_row(
+            row.where, escape(row.quantity), row.unit, row.published_text, *figures, nearest, verdict, row.why
+        )
     return table
 
 

@@ -64,11 +64,18 @@ def draw_design_space(stages: dict[str, Stage], out: Path) -> None:
     plot.contourf(elevation, link * 1e6, needed * 1e3, [0, 1.0], colors=[WASH], zorder=0)
     plot.clabel(lines, fmt=lambda mn: f"{mn:g} mN", fontsize=9, inline_spacing=4)
     plot.text(0.93, 1480, "lifts with less than 1 mN", fontsize=9, color=COLOURS[0])
+    box = {"facecolor": "white", "alpha": 0.9, "edgecolor": "none", "pad": 1.0}
     for (name, stage), mark, side in zip(stages.items(), ("o", "s"), ((8, 5), (-8, -14)), strict=False):
         at = (float(stage.geometry["elevation_rest_rad"][0]), float(stage.geometry["link_m"][0]) * 1e6)
         plot.plot(*at, mark, color=INK, markersize=6, markerfacecolor="white", markeredgewidth=1.4)
         plot.annotate(
-            name, at, xytext=side, textcoords="offset points", fontsize=9, ha="right" if side[0] < 0 else "left"
+            name,
+            at,
+            xytext=side,
+            textcoords="offset points",
+            fontsize=9,
+            bbox=box,
+            ha="right" if side[0] < 0 else "left",
         )
     dress(plot, "elevation of the links at rest, α₀ (rad)", "length of the links, L₂ (µm)")
     figure.savefig(out)

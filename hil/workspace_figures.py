@@ -18,7 +18,7 @@ from pkxyz_ctrl.stage import Stage, StageDomainError
 
 Array = NDArray[np.float64]
 
-_MAP, _LIMIT = "viridis", "#E31A1C"
+_MAP, _LIMIT = "viridis", "white"
 
 
 def draw_workspace(stage: Stage, voltage_max_v: float, out: Path) -> None:
@@ -100,7 +100,9 @@ def _draw_sections(figure: Figure, stage: Stage, voltage_max_v: float) -> None:
     bar.set_label("highest comb voltage needed (V)")
     if voltage_max_v < highest:
         bar.ax.axhline(voltage_max_v, color=_LIMIT, linewidth=2.4)
-    figure.text(0.515, 0.015, f"black: stroke limits; red: {voltage_max_v:g} V, held inside it", fontsize=9, color=INK)
+    figure.text(
+        0.515, 0.015, f"black: stroke limits; white: {voltage_max_v:g} V, held inside it", fontsize=9, color=INK
+    )
 
 
 def section(stage: Stage, height_m: float, line_m: Array) -> tuple[Array, Array]:
