@@ -143,7 +143,7 @@ def test_inscribed_cubes_fit_and_touch(stage: Stage) -> None:
         inside = cube.centre_m + cube.side_m * seeded_points(5000, [-0.5] * 3, [0.5] * 3) @ cube.edges.T
         for points in (inside, cube.corners_m()):
             strokes = stage.inverse_kinematics(points)
-            assert strokes.min() >= 0
+            assert strokes.min() >= -1e-18  # a corner at rest is 0 up to the rounding of its position
             assert strokes.max() <= SPAN_M + 1e-18
         grown = cube.centre_m + cube.side_m * 1.01 * (cube.corners_m() - cube.centre_m) / cube.side_m
         strokes = stage.inverse_kinematics(grown)
