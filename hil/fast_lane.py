@@ -30,13 +30,15 @@ def run_block(
     """Run ``count`` ticks and write their rows to ``rows[:count]``.
 
     ``sample_us`` (count,) int64: plant time of each sample. At a sample the drive counts of the last tick are
-    applied, as the amplifier does on SYNC; the truth is taken just before them.
+    applied, as the amplifier does on SYNC, or with two periods of delay those of the tick before it; the truth is
+    taken just before them.
     """
     seen, row = memory[0]["input"], memory[0]["row"]
+    due = memory[0]["tick"]["count"][law[0]["tick"]["delay_periods"] - 1]
     for i in range(count):
         kernels.advance(plant_params, plant_state, sample_us[i] - plant_state[0]["t_us"])
         observe(plant_params[0], plant_state[0], row)
-        kernels.drive(plant_params, plant_state, row["drive_count"])
+        kernels.drive(plant_params, plant_state, due)
         kernels.sample(plant_params, plant_state, seen["sense_count"])
         cycle(law, memory, reference)
         rows[i] = row

@@ -62,7 +62,9 @@ MEMORY = np.dtype(
 )
 
 _UNUSABLE = int(SenseStatus.MISSING | SenseStatus.CRC | SenseStatus.LENGTH | SenseStatus.DUPLICATE)
-_NONE, _HOME, _HOMED, _TRACK, _TRIP = (int(e) for e in (Event.NONE, Event.HOME, Event.HOMED, Event.TRACK, Event.TRIP))
+_NONE, _HOME, _HOMED, _ENABLE, _TRACK, _TRIP = (
+    int(e) for e in (Event.NONE, Event.HOME, Event.HOMED, Event.ENABLE, Event.TRACK, Event.TRIP)
+)
 _IDLE, _HOMING, _ENABLED, _TRACKING, _FAULT = (
     int(m) for m in (Mode.IDLE, Mode.HOMING, Mode.ENABLED, Mode.TRACKING, Mode.FAULT)
 )
@@ -112,15 +114,15 @@ def cycle(law_array: Records, memory_array: Records, reference: Array) -> None:
 
 @njit(cache=True)
 def _asked(law: np.void, memory: np.void) -> int:
-    """The event of this tick: what came in, else the next step of the automatic start."""
+    """The event of this tick: what came in, else the next step of the automatic start. Nobody enables before homing."""
     event = memory["input"]["event"]
     if event == _NONE and law["autostart"] != 0:
         mode = memory["mode"]
         if mode == _IDLE:
-            return enable_event(True) if memory["homed"] != 0 else _HOME
-        if mode == _ENABLED:
-            return _TRACK
-    return event
+            event = _ENABLE if memory["homed"] != 0 else _HOME
+        elif mode == _ENABLED:
+            event = _TRACK
+    return enable_event(memory["homed"] != 0) if event == _ENABLE else event
 
 
 @njit(cache=True)

@@ -120,10 +120,10 @@ def test_two_infinities_do_not_cancel():
 
 
 def test_saturation_is_told_and_slack_is_what_is_missing():
-    """25 um above the middle cannot be held at 200 V: a force meets its limit. Always demand = J^T F + slack."""
+    """30 um above the middle cannot be held at 200 V: a force meets its limit. Always demand = J^T F + slack."""
     law, memory = tick_law(), new_tick_memory()
     law["drive"]["count_slew_max"] = law["drive"]["count_max"]
-    for at, expected in ((exact(MIDDLE), False), (exact(MIDDLE) + np.array([0, 0, 25e-6]), True)):
+    for at, expected in ((exact(MIDDLE), False), (exact(MIDDLE) + np.array([0, 0, 30e-6]), True)):
         row = np.concatenate([at, np.zeros(6)])
         memory["estimate"]["ahead"][:] = row - np.r_[law["estimator"]["operating_point_m"], np.zeros(6)]
         memory["feedforward_known"] = 0

@@ -1,0 +1,316 @@
+"""One controller period after another, by script: start, homing, lost frames, faults, holds, and the ends of blocks."""
+
+import dataclasses
+
+import numpy as np
+import pytest
+from loop_rig import MIDDLE, Cycle, bus, controller_with, counts_at, law, rows_of, setup, stage
+from numpy.typing import NDArray
+
+from hil.metrics import Metrics
+from pkxyz_ctrl.design.law import design_law
+from pkxyz_ctrl.safety.modes import Event, Mode
+from pkxyz_ctrl.safety.monitors import NodeEvent, SenseStatus
+from pkxyz_ctrl.safety.trips import Trip
+
+HOMING_TICKS = 250  # 0.05 s at 5 kHz
+AT_REST = counts_at(np.zeros(3))
+
+
+def noisy(counts: NDArray[np.int32], tick: int) -> NDArray[np.int32]:
+    """Counts with a little noise, never the same twice in a row: 0, 3, -2 ... whose mean over 250 ticks is 0."""
+    return counts + np.array([(0, 3, -2, 1, -2)[(tick + 2 * i) % 5] for i in range(3)], np.int32)
+
+
+def homed(autostart: bool = False, reference: NDArray[np.float64] | None = None) -> Cycle:
+    """A cycle after homing at rest: IDLE, with sense offsets of zero."""
+    c = Cycle(law(autostart=autostart), reference)
+    for k in range(HOMING_TICKS):
+        c.tick(noisy(AT_REST, k), event=Event.HOME if k == 0 and not autostart else Event.NONE)
+    assert c.mode is Mode.IDLE
+    return c
+
+
+def enabled() -> Cycle:
+    c = homed()
+    c.tick(noisy(AT_REST, 0), event=Event.ENABLE)
+    assert c.mode is Mode.ENABLED
+    return c
+
+
+def tracking(reference: NDArray[np.float64] | None = None) -> Cycle:
+    c = homed(reference=reference)
+    c.tick(noisy(AT_REST, 0), event=Event.ENABLE)
+    c.tick(noisy(AT_REST, 1), event=Event.TRACK)
+    assert c.mode is Mode.TRACKING
+    return c
+
+
+def test_the_automatic_start_tick_by_tick():
+    c = Cycle(law(), np.zeros((16, 9)))
+    rows = [c.tick(noisy(AT_REST, k)) for k in range(HOMING_TICKS + 10)]
+    modes = [Mode(int(r["mode"])) for r in rows]
+    n = HOMING_TICKS
+    assert modes == [Mode.HOMING] * (n - 1) + [Mode.IDLE, Mode.ENABLED] + [Mode.TRACKING] * 9
+    events = {k: Event(int(r["event"])) for k, r in enumerate(rows) if r["event"]}
+    assert events == {0: Event.HOME, n - 1: Event.HOMED, n: Event.ENABLE, n + 1: Event.TRACK}
+    assert [int(r["tick"]) for r in rows] == list(range(n + 10))
+    assert [int(r["t_us"]) for r in rows] == [200 * k for k in range(n + 10)]
+    assert [int(r["reference_tick"]) for r in rows] == [-1] * (n + 1) + list(range(9))
+    assert not any(r["trips"] for r in rows)
+    assert not any(r["drive_count"].any() for r in rows[: n - 1])  # 0 V while homing
+
+
+def test_homing_finds_the_offsets_and_takes_them_away():
+    """A few fF off on each channel, in noise: found to a hundredth of a count, and from then on the strokes are 0."""
+    offset_counts = np.array([30, -22, 41])
+    c = Cycle(law(autostart=False))
+    for k in range(HOMING_TICKS):
+        row = c.tick(noisy(AT_REST + offset_counts, k), event=Event.HOME if k == 0 else Event.NONE)
+    assert c.mode is Mode.IDLE
+    analog = bus().analog
+    exact = analog.sense_offset_f + (AT_REST + offset_counts) * analog.sense_farad_per_count - stage().sense_rest_f
+    found = c.memory["tick"]["sense_zero_f"][0]
+    assert found == pytest.approx(exact, rel=0, abs=0.01 * analog.sense_farad_per_count)
+    assert np.abs(row["measurement_m"]).max() < 4e-9  # of this one noisy sample: 3 counts of 0.53 nm, through J^-1
+    assert np.abs(row["estimate_m"]).max() < 4e-9
+    row = c.tick(AT_REST + offset_counts)
+    assert np.abs(row["measurement_m"]).max() < 0.02e-9
+
+
+def test_homing_averages_only_frames_that_came():
+    c = Cycle(law(autostart=False))
+    ticks, wild = 0, np.array([30_000, -30_000, 30_000])
+    c.tick(noisy(AT_REST, 0), event=Event.HOME)
+    while c.mode is Mode.HOMING:
+        ticks += 1
+        missing = ticks % 100 == 50
+        c.tick(wild if missing else noisy(AT_REST, ticks), status=SenseStatus.MISSING if missing else 0)
+    assert ticks == HOMING_TICKS - 1 + 3  # the three that were missing are made up for
+    assert np.abs(c.memory["tick"]["sense_zero_f"]).max() < 0.51 * bus().analog.sense_farad_per_count
+
+
+def test_homing_again_starts_from_nothing():
+    c = homed()
+    for k in range(HOMING_TICKS):
+        c.tick(noisy(AT_REST + 100, k), event=Event.HOME if k == 0 else Event.NONE)
+    zero = c.memory["tick"]["sense_zero_f"][0] / bus().analog.sense_farad_per_count
+    assert zero == pytest.approx(np.full(3, 100.0), abs=0.51)
+
+
+def test_nobody_enables_before_homing():
+    c = Cycle(law(autostart=False))
+    for k in range(5):
+        row = c.tick(noisy(AT_REST, k), event=Event.ENABLE)
+        assert c.mode is Mode.IDLE
+        assert row["event"] == Event.ENABLE_UNHOMED
+        assert not row["drive_count"].any()
+
+
+def test_a_missing_frame_is_bridged_by_the_prediction():
+    """Up to four in a row: no innovation, the filter follows its own prediction, the loop stays closed."""
+    c = enabled()
+    for k in range(4):
+        predicted = c.memory["tick"]["estimate"]["predicted"][0].copy()
+        measured = c.memory["tick"]["measurement_m"][0].copy()
+        row = c.tick((0, 0, 0), status=SenseStatus.MISSING)
+        origin = c.law["tick"]["estimator"]["operating_point_m"][0]
+        assert np.array_equal(row["estimate_m"], origin + predicted[:3]), k
+        assert np.array_equal(row["measurement_m"], measured)
+        assert not row["innovation_m"].any()
+        assert c.mode is Mode.ENABLED
+        assert row["trips"] == 0
+    row = c.tick(noisy(AT_REST, 9))
+    assert c.mode is Mode.ENABLED
+    assert row["innovation_m"].any()
+    for _ in range(4):  # the good one between them starts the count anew
+        c.tick((0, 0, 0), status=SenseStatus.MISSING)
+        assert c.mode is Mode.ENABLED
+
+
+@pytest.mark.parametrize("status", [SenseStatus.MISSING, SenseStatus.CRC | SenseStatus.MISSING, SenseStatus.DUPLICATE])
+def test_the_fifth_stale_frame_is_a_fault_with_0_v_in_that_tick(status):
+    c = in_the_middle()
+    rows = [c.tick((1, 2, 3), status=int(status)) for _ in range(6)]
+    assert all(r["mode"] == Mode.TRACKING and (r["drive_count"] > 20_000).all() for r in rows[:4])
+    assert rows[4]["mode"] == rows[5]["mode"] == Mode.FAULT
+    assert rows[4]["trips"] & Trip.SENSE_STALE
+    assert rows[4]["event"] == Event.TRIP
+    for row in rows[4:]:
+        assert not row["drive_count"].any()
+        assert not any(row[name].any() for name in ("voltage_v", "force_n", "demand_n", "slack_n"))
+
+
+def in_the_middle() -> Cycle:
+    """Tracking a reference that stands at mid-workspace, as if the stage had got there."""
+    at = stage().forward_kinematics(MIDDLE)
+    c = tracking(np.tile(np.r_[at, np.zeros(6)], (16, 1)))
+    memory, drive = c.memory["tick"][0], c.law["tick"]["drive"][0]
+    memory["count"][:] = np.round(stage().holding_voltages(at) / drive["volt_per_count"]).astype(np.int32)
+    for name in ("predicted", "filtered", "ahead"):
+        memory["estimate"][name][:3] = at - c.law["tick"]["estimator"]["operating_point_m"][0]
+        memory["estimate"][name][3:] = 0.0
+    c.tick(noisy(counts_at(MIDDLE), 0))
+    assert c.mode is Mode.TRACKING
+    return c
+
+
+@pytest.mark.parametrize("mode", [Mode.IDLE, Mode.ENABLED, Mode.TRACKING])
+@pytest.mark.parametrize("trip", [Trip.GATE_BLOCKED, Trip.OPERATOR])
+def test_a_trip_from_outside_acts_in_that_tick(mode, trip):
+    c = {Mode.IDLE: homed, Mode.ENABLED: enabled, Mode.TRACKING: in_the_middle}[mode]()
+    assert c.mode is mode
+    row = c.tick(noisy(AT_REST if mode is not Mode.TRACKING else counts_at(MIDDLE), 1), trips=int(trip))
+    assert row["mode"] == Mode.FAULT
+    assert row["trips"] == trip
+    assert not row["drive_count"].any()
+    row = c.tick(noisy(AT_REST, 2))  # latched, and told once
+    assert row["mode"] == Mode.FAULT
+    assert row["trips"] == 0
+    assert row["event"] == Event.NONE
+
+
+@pytest.mark.parametrize("event", [e for e in Event if e not in (Event.CLEAR, Event.NONE)])
+def test_a_fault_stays_whatever_is_asked(event):
+    c = in_the_middle()
+    c.tick(noisy(AT_REST, 0), trips=int(Trip.OPERATOR))
+    row = c.tick(noisy(AT_REST, 1), event=event)
+    assert row["mode"] == Mode.FAULT
+    assert not row["drive_count"].any()
+
+
+def test_clear_begins_again_and_forgets_the_offsets():
+    c = homed(autostart=True)
+    c.tick(noisy(AT_REST, 0), trips=int(Trip.OPERATOR))
+    assert c.tick(noisy(AT_REST, 1), event=Event.CLEAR)["mode"] == Mode.BOOT
+    assert not c.memory["homed"][0]
+    for k in range(3):  # the automatic start waits for the node
+        assert c.tick(noisy(AT_REST, k))["mode"] == Mode.BOOT
+    assert c.tick(noisy(AT_REST, 2), event=Event.NODE_FOUND)["mode"] == Mode.PRE_OPERATIONAL
+    assert c.tick(noisy(AT_REST, 3), event=Event.NODE_READY)["mode"] == Mode.IDLE
+    assert c.tick(noisy(AT_REST, 4))["mode"] == Mode.HOMING
+
+
+def test_node_events_and_numbers_that_are_none():
+    for event, trip in (
+        (NodeEvent.HEARTBEAT_LOST, Trip.HEARTBEAT_LOST),
+        (NodeEvent.EMERGENCY, Trip.NODE_EMERGENCY),
+        (NodeEvent.REBOOTED, Trip.NODE_REBOOTED),
+    ):
+        row = enabled().tick(noisy(AT_REST, 3), node_events=int(event))
+        assert row["mode"] == Mode.FAULT
+        assert row["trips"] == trip
+    c = in_the_middle()
+    c.reference[:] = np.nan
+    row = c.tick(noisy(counts_at(MIDDLE), 1))
+    assert row["mode"] == Mode.FAULT
+    assert row["trips"] & Trip.NOT_FINITE
+    assert not row["drive_count"].any()
+
+
+def test_a_stage_that_is_not_where_it_should_be_trips_on_innovation():
+    """Five samples that jump back and forth by 4 um: the fifth is a fault."""
+    c = in_the_middle()
+    for k in range(4):  # a jump back and forth, which no disturbance explains
+        row = c.tick(noisy(counts_at(MIDDLE + (2e-6 if k % 2 else -2e-6)), k))
+        assert row["mode"] == Mode.TRACKING
+    row = c.tick(noisy(counts_at(MIDDLE - 2e-6), 5))
+    assert row["mode"] == Mode.FAULT
+    assert row["trips"] & (Trip.INNOVATION_X | Trip.INNOVATION_Y | Trip.INNOVATION_Z)
+
+
+def ramp(n: int = 16) -> NDArray[np.float64]:
+    """Rows that tell their index: 1 nm a tick in x, from 1 um."""
+    rows = np.zeros((n, 9))
+    rows[:, 0] = 1e-6 + 1e-9 * np.arange(n)
+    return rows
+
+
+def index_of(row: NDArray[np.float64]) -> int:
+    return round(float(row[0] - 1e-6) / 1e-9)
+
+
+@pytest.mark.parametrize("delay", [1, 2])
+@pytest.mark.parametrize("base", [0, 5, -3])
+def test_reference_rows_by_index_and_clamped_at_both_ends(delay, base):
+    blind = controller_with(monitors={"innovation_count": -1})  # the stage of this script does not move at all
+    designed = design_law(stage(), blind, bus("fd_5k", delay), autostart=False)
+    c = Cycle(designed, ramp(), Mode.IDLE)
+    c.memory["homed"] = 1
+    c.tick(noisy(AT_REST, 0), event=Event.ENABLE)
+    for k in range(20):
+        row = c.tick(noisy(AT_REST, k + 1), event=Event.TRACK if k == 0 else Event.NONE, base=base)
+        assert c.mode is Mode.TRACKING
+        assert row["reference_tick"] == k
+        assert index_of(row["reference_m"]) == min(max(k - base, 0), 15)
+        assert index_of(c.memory["after"][0]) == min(max(k - base + delay + 1, 0), 15)
+
+
+def test_hold_keeps_the_set_point_and_track_goes_on_from_there():
+    c = tracking(ramp())
+    for k in range(6):
+        row = c.tick(noisy(AT_REST, k))
+    at = index_of(row["reference_m"])
+    assert at == 6
+    for k in range(5):
+        row = c.tick(noisy(AT_REST, k), event=Event.HOLD if k == 0 else Event.NONE)
+        assert c.mode is Mode.ENABLED
+        assert index_of(row["reference_m"]) == at
+        assert row["reference_tick"] == -1
+        assert not c.memory["setpoint"][0, 3:].any()
+    row = c.tick(noisy(AT_REST, 0), event=Event.TRACK)
+    assert index_of(row["reference_m"]) == at + 1
+
+
+def test_disable_opens_the_loop_at_once_and_enable_begins_at_rest():
+    c = in_the_middle()
+    row = c.tick(noisy(counts_at(MIDDLE), 1), event=Event.DISABLE)
+    assert c.mode is Mode.IDLE
+    assert not row["drive_count"].any()
+    assert row["trips"] == 0
+    row = c.tick(noisy(AT_REST, 1), event=Event.ENABLE)
+    assert not row["reference_m"].any()  # the set-point is rest, not where it was
+    c.tick(noisy(AT_REST, 2), event=Event.TRACK)
+    assert c.memory["reference_tick"][0] == 1  # and the trajectory starts anew
+
+
+def test_voltages_never_change_faster_than_the_slew_limit_but_for_a_release():
+    """A reference that jumps by 12 um asks for everything at once and gets 20 V a tick; a fault gets 160 V at once."""
+    c = in_the_middle()
+    c.reference[:, 2] -= 12e-6
+    last, steps = c.memory["tick"]["count"][0, 0].copy(), []
+    for k in range(4):
+        row = c.tick(noisy(counts_at(MIDDLE), k + 1))
+        steps.append(np.abs(row["drive_count"] - last).max())
+        last = row["drive_count"].copy()
+        assert row["saturated"] == (np.abs(row["slack_n"]).max() > 1e-9)
+    slew = c.law["tick"]["drive"]["count_slew_max"][0]
+    assert slew == int(20 / (200 / 32767))
+    assert steps[0] == max(steps) == slew
+    assert not c.tick(noisy(counts_at(MIDDLE), 9), trips=int(Trip.OPERATOR))["drive_count"].any()
+    assert last.min() > 15_000
+
+
+def test_an_event_and_a_trip_are_taken_once():
+    c = homed()
+    c.tick(noisy(AT_REST, 0), event=Event.ENABLE)
+    assert c.memory["input"]["event"][0] == Event.NONE
+    c.tick(noisy(AT_REST, 1), trips=int(Trip.OPERATOR))
+    assert c.memory["input"]["trips"][0] == 0
+
+
+def test_two_periods_of_delay_in_closed_loop():
+    """The same scan on the same plant with a law that knows of the second period: as good as with one."""
+    slow = dataclasses.replace(setup(), bus=bus("fd_5k", 2))
+    rows, result = rows_of(slow, "fast")
+    assert result.faults == ()
+    metrics = Metrics(slow.trajectory, slow.bus.period_us)
+    metrics.update(rows)
+    figures = metrics.figures()
+    assert figures["saturated_ticks"] == 0
+    assert all(0.2 < v < 2.0 for v in figures["rms_error_nm"].values())
+    assert all(0.2 < v < 2.0 for v in figures["hold_noise_nm"].values())
+    # counts of a tick reach the combs two ticks later, through an amplifier that is there within a period
+    live = np.flatnonzero(rows["mode"] == Mode.TRACKING)[1000:-4]
+    assert np.abs(rows["comb_voltage_v"][live + 3] - rows["voltage_v"][live]).max() < 1e-6
+    assert np.abs(rows["comb_voltage_v"][live + 2] - rows["voltage_v"][live]).max() > 1e-3
