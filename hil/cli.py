@@ -12,6 +12,7 @@ import typer
 from rich.console import Console
 from rich.table import Table
 
+from hil import mechanics_cli
 from pkxyz_ctrl.config import CONFIG_DIR, ConfigError, names
 
 app = typer.Typer(
@@ -129,6 +130,10 @@ def configs(as_json: Annotated[bool, typer.Option("--json", help="Print JSON.")]
 
 app.command("sil")(sil)
 app.command("configs")(configs)
+app.command("paper")(mechanics_cli.paper)
+app.command("workspace")(mechanics_cli.workspace)
+app.command("design")(mechanics_cli.design)
+app.command("linearisation")(mechanics_cli.linearisation)
 
 
 def _run_with_progress(folder: Any, scenario: Any, lane: str, *, quiet: bool) -> dict[str, Any]:

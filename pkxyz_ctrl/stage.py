@@ -19,7 +19,7 @@ from numpy.typing import ArrayLike, NDArray
 from pkxyz_ctrl.config import load
 from pkxyz_ctrl.core import elasticity, kinematics
 from pkxyz_ctrl.core.linear3 import inverse3
-from pkxyz_ctrl.mechanics.combs import capacitance_gradient_f_per_m, force_gain_n_per_v2
+from pkxyz_ctrl.mechanics.combs import capacitance_gradient_f_per_m, force_gain_n_per_v2, voltage_for_force_v
 from pkxyz_ctrl.mechanics.flexures import crank_hinge_stiffness, folded_spring_stiffness, link_hinge_stiffness
 from pkxyz_ctrl.stage_config import StageConfig
 
@@ -122,7 +122,7 @@ class Stage:
                 f"force {force.max() * 1e6:.6g} uN needs {math.sqrt(force.max() / self.force_gain_n_per_v2):.1f} V, "
                 f"beyond the limit of {self.voltage_max_v:g} V ({self.force_max_n * 1e6:.6g} uN)"
             )
-        return np.asarray(np.minimum(np.sqrt(force / self.force_gain_n_per_v2), self.voltage_max_v))
+        return np.asarray(np.minimum(voltage_for_force_v(self.config.drive_comb, force), self.voltage_max_v))
 
     def holding_forces(self, position_m: ArrayLike) -> Array:
         """Comb forces (..., 3) in N that hold a position: F = J^-T dV/dx (Eq. 23). Negative where combs would have to
@@ -173,10 +173,10 @@ class Stage:
         flat = position.reshape(-1, 3)
         at, limit = _first_outside(self.geometry, flat)
         if limit == 4:
-            reach = float(self.geometry["link_m"][0] - self.geometry["height_rest_m"][0])
+            reach, rest = float(self.geometry["link_m"][0]), float(self.geometry["height_rest_m"][0])
             raise StageDomainError(
-                f"position {_um(flat[at])} um: z must stay below {reach * 1e6:.6g} um, "
-                "the reach of the out-of-plane links"
+                f"position {_um(flat[at])} um: z must stay between {-(reach + rest) * 1e6:.6g} and "
+                f"{(reach - rest) * 1e6:.6g} um, the reach of the out-of-plane links"
             )
         if limit:
             reach = float(self.geometry["crank_m"][0])
