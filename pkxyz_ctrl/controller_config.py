@@ -64,7 +64,8 @@ class ControllerConfig(FrozenModel):
     """One controller."""
 
     name: Annotated[str, Field(min_length=1)]
-    law: Literal["lqg"]
+    law: Literal["lqg", "open_loop"]
+    """lqg: Kalman filter and state feedback; open_loop: feed-forward alone."""
     operating_strokes_m: tuple[float, float, float]
     """Strokes about which gains are designed; the energy gradient and the kinematics are exact everywhere."""
     homing_s: Annotated[float, Field(gt=0, le=10)]

@@ -49,7 +49,8 @@ MEMORY = np.dtype(
         ("observation", OBSERVATION),
         ("row", ROW),
         ("setpoint", "f8", (9,)),  # what is held while enabled and not tracking
-        ("now", "f8", (9,)),  # scratch: rows of the reference
+        ("here", "f8", (9,)),  # rows of the reference: at this sample ...
+        ("now", "f8", (9,)),  # ... and where this tick's force begins and ends to act
         ("after", "f8", (9,)),
         ("tick_index", "i8"),
         ("reference_tick", "i8"),
@@ -95,16 +96,17 @@ def cycle(law_array: Records, memory_array: Records, reference: Array) -> None:
             _average(law, memory)
     tick.estimate(law["tick"], memory["tick"], usable)
     saturated = 0
+    here, now, after = memory["here"], memory["now"], memory["after"]
+    _reference_row(memory, reference, 0, here)
     if LOOP_CLOSED[memory["mode"]] != 0:
         delay = law["tick"]["delay_periods"]
-        now, after = memory["now"], memory["after"]
         _reference_row(memory, reference, delay, now)
         _reference_row(memory, reference, delay + 1, after)
-        saturated = 1 if tick.act(law["tick"], memory["tick"], now, after) else 0
+        saturated = 1 if tick.act(law["tick"], memory["tick"], here, now, after) else 0
     else:
         tick.rest(memory["tick"])
     trips = _monitor(law, memory, saturated)
-    _write_row(law, memory, reference, trips, saturated)
+    _write_row(law, memory, trips, saturated)
     if memory["mode"] == _TRACKING:
         memory["reference_tick"] += 1
     memory["tick_index"] += 1
@@ -199,11 +201,10 @@ def _monitor(law: np.void, memory: np.void, saturated: int) -> int:
 
 
 @njit(cache=True)
-def _write_row(law: np.void, memory: np.void, reference: Array, trips: int, saturated: int) -> None:
+def _write_row(law: np.void, memory: np.void, trips: int, saturated: int) -> None:
     row, seen, state = memory["row"], memory["input"], memory["tick"]
     estimate, drive, origin = state["estimate"], law["tick"]["drive"], law["tick"]["estimator"]["operating_point_m"]
-    setpoint = memory["now"]
-    _reference_row(memory, reference, 0, setpoint)
+    setpoint = memory["here"]
     row["t_us"] = memory["tick_index"] * law["period_us"]
     row["tick"] = memory["tick_index"]
     row["reference_tick"] = memory["reference_tick"] if memory["mode"] == _TRACKING else -1

@@ -13,7 +13,7 @@ import numpy as np
 from numba import njit
 from numpy.typing import NDArray
 
-from pkxyz_ctrl.core import allocation, feedback, kinematics, voltage
+from pkxyz_ctrl.core import allocation, feedback, kinematics, linear_law, voltage
 from pkxyz_ctrl.core import estimator as filtering
 from pkxyz_ctrl.core.elasticity import ELASTICITY, energy_gradient
 from pkxyz_ctrl.core.linear3 import inverse3, multiply3_transposed
@@ -37,11 +37,18 @@ LAW = np.dtype(
         ("sense", SENSE),
         ("estimator", filtering.ESTIMATOR),
         ("feedback", feedback.FEEDBACK),
+        ("linear", linear_law.LINEAR_LAW),
         ("drive", voltage.DRIVE),
+        ("kind", "i4"),  # OPEN_LOOP, STATE_FEEDBACK or LINEAR
         ("delay_periods", "i4"),  # periods from a sample to the start of the action that it causes: 1 or 2
     ],
     align=True,
 )
+
+OPEN_LOOP, STATE_FEEDBACK, LINEAR = 0, 1, 2
+"""What feeds back: nothing, the filter's state through gains, or a linear law of the user's choice on what was
+measured.
+"""
 
 DELAY_MAX = 2
 
@@ -70,6 +77,8 @@ MEMORY = np.dtype(
         ("sense_f", "f8", (3,)),
         ("stroke_m", "f8", (3,)),
         ("measurement_m", "f8", (3,)),
+        ("seen_m", "f8", (3,)),  # the measurement, or the estimate in its place
+        ("linear", linear_law.LINEAR_STATE),
         ("count", "i4", (DELAY_MAX + 1, 3)),  # counts commanded, newest first
         ("carry_v", "f8", (3,)),
         ("demand_n", "f8", (3,)),
@@ -110,6 +119,9 @@ def estimate(law: np.void, memory: np.void, has_measurement: bool) -> None:
     acting, acted, start = scratch["acting_n"], scratch["acted_n"], scratch["state"]
     ahead = state["ahead"]
     start[:] = state["filtered"]
+    for i in range(3):
+        estimated = estimator["operating_point_m"][i] + start[i]
+        memory["seen_m"][i] = memory["measurement_m"][i] if has_measurement else estimated
     delay = law["delay_periods"]
     for step in range(delay):
         age = delay - 1 - step
@@ -124,8 +136,9 @@ def estimate(law: np.void, memory: np.void, has_measurement: bool) -> None:
 
 
 @njit(cache=True)
-def act(law: np.void, memory: np.void, now: Array, after: Array) -> bool:
-    """Law, allocation and voltages for the reference rows (9,) at the start and the end of the interval of action.
+def act(law: np.void, memory: np.void, here: Array, now: Array, after: Array) -> bool:
+    """Law, allocation and voltages for the reference rows (9,) at the sample, and at the start and the end of the
+    interval of action.
 
     Writes demand, comb forces, slack and the new counts. Returns whether a comb force met a limit.
     """
@@ -142,7 +155,11 @@ def act(law: np.void, memory: np.void, now: Array, after: Array) -> bool:
     feedback.sampled_target(gains, now, demand, last, row)
     memory["feedforward_n"][:] = demand
     memory["feedforward_known"] = 1
-    feedback.add_feedback(gains, law["estimator"]["operating_point_m"], memory["estimate"]["ahead"], row, share, demand)
+    kind, origin = law["kind"], law["estimator"]["operating_point_m"]
+    if kind == STATE_FEEDBACK:
+        feedback.add_feedback(gains, origin, memory["estimate"]["ahead"], row, share, demand)
+    elif kind == LINEAR:
+        linear_law.add_feedback(law["linear"], memory["linear"], memory["seen_m"], here, share, demand)
     _push(memory)
     voltage.force_limits(drive, count[1], scratch["lower_n"], scratch["upper_n"])
     memory["active_set_steps"] = allocation.allocate(j, inverse, demand, scratch["lower_n"], scratch["upper_n"], force)
@@ -150,6 +167,8 @@ def act(law: np.void, memory: np.void, now: Array, after: Array) -> bool:
     multiply3_transposed(j, force, given)
     for i in range(3):
         memory["slack_n"][i] = demand[i] - given[i]
+    if kind == LINEAR:
+        linear_law.advance(law["linear"], memory["linear"], memory["slack_n"])
     return memory["active_set_steps"] > 1
 
 
@@ -171,6 +190,7 @@ def release(memory: np.void) -> None:
         memory["force_n"][i] = 0.0
     memory["active_set_steps"] = 0
     memory["feedforward_known"] = 0
+    linear_law.clear(memory["linear"])
 
 
 @njit(cache=True)

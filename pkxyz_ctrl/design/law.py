@@ -10,6 +10,7 @@ from pkxyz_ctrl import cycle
 from pkxyz_ctrl.bus_config import BusConfig
 from pkxyz_ctrl.config import ConfigError
 from pkxyz_ctrl.controller_config import ControllerConfig
+from pkxyz_ctrl.core.tick import OPEN_LOOP, STATE_FEEDBACK
 from pkxyz_ctrl.design.estimator_gain import kalman_gain, measurement_matrix, measurement_noise, process_noise
 from pkxyz_ctrl.design.plant_model import LinearStage, SampledStage, linearise, sample
 from pkxyz_ctrl.design.regulator import regulator_gain
@@ -28,6 +29,7 @@ def design_law(stage: Stage, controller: ControllerConfig, bus: BusConfig, *, au
     _fill_feedback(law["tick"]["feedback"], stage, controller, bus, model, sampled)
     _fill_drive(law["tick"]["drive"], stage, controller, bus)
     _fill_monitors(law["limits"], controller, bus)
+    law["tick"]["kind"] = {"open_loop": OPEN_LOOP, "lqg": STATE_FEEDBACK}[controller.law]
     law["tick"]["delay_periods"] = bus.delay_periods
     law["period_us"] = bus.period_us
     law["homing_ticks"] = max(1, round(controller.homing_s / bus.period_s))

@@ -1,0 +1,74 @@
+"""Any linear feedback law as a state-space system about the reference, compiled.
+
+    w = -(C x + D e),   x+ = A x + B e + U s,   e = y - r
+
+e is the measured position less the reference at the sample (m), w a force at the platform (N) that joins the feed-
+forward and acts ``delay_periods`` later, s what the combs could not give of the last demand (N): U unwinds
+integrators.
+"""
+
+import numpy as np
+from numba import njit
+from numpy.typing import NDArray
+
+Array = NDArray[np.float64]
+
+ORDER_MAX = 24
+
+LINEAR_LAW = np.dtype(
+    [
+        ("a", "f8", (ORDER_MAX, ORDER_MAX)),
+        ("b", "f8", (ORDER_MAX, 3)),
+        ("c", "f8", (3, ORDER_MAX)),
+        ("d", "f8", (3, 3)),
+        ("unwind", "f8", (ORDER_MAX, 3)),
+        ("order", "i4"),
+    ],
+    align=True,
+)
+
+LINEAR_STATE = np.dtype(
+    [
+        ("x", "f8", (ORDER_MAX,)),
+        ("next", "f8", (ORDER_MAX,)),
+        ("error_m", "f8", (3,)),
+    ],
+    align=True,
+)
+
+
+@njit(cache=True)
+def add_feedback(linear: np.void, state: np.void, seen_m: Array, reference: Array, share: float, out: Array) -> None:
+    """Add share times w to ``out`` (3,) for the position seen (3,) and the reference row (9,) of the same sample."""
+    order, error = linear["order"], state["error_m"]
+    for i in range(3):
+        error[i] = seen_m[i] - reference[i]
+    for i in range(3):
+        total = 0.0
+        for k in range(order):
+            total += linear["c"][i, k] * state["x"][k]
+        for k in range(3):
+            total += linear["d"][i, k] * error[k]
+        out[i] -= share * total
+
+
+@njit(cache=True)
+def advance(linear: np.void, state: np.void, slack_n: Array) -> None:
+    """Time update with the error of ``add_feedback`` and the slack (3,) of this tick."""
+    order, x, following = linear["order"], state["x"], state["next"]
+    for i in range(order):
+        total = 0.0
+        for k in range(order):
+            total += linear["a"][i, k] * x[k]
+        for k in range(3):
+            total += linear["b"][i, k] * state["error_m"][k] + linear["unwind"][i, k] * slack_n[k]
+        following[i] = total
+    for i in range(order):
+        x[i] = following[i]
+
+
+@njit(cache=True)
+def clear(state: np.void) -> None:
+    """Forget: the loop is open."""
+    for i in range(ORDER_MAX):
+        state["x"][i] = 0.0
