@@ -19,7 +19,8 @@ from pkxyz_ctrl.controller_config import ControllerConfig
 from pkxyz_ctrl.stage import Stage
 from pkxyz_ctrl.stage_config import StageConfig
 from pkxyz_ctrl.trajectory import Segment, Trajectory, TrajectoryError
-from pkxyz_ctrl.trajectory.check import check_against
+from pkxyz_ctrl.trajectory.check import DriveLimits, check_against
+from pkxyz_ctrl.trajectory.table import in_folder
 from sim.config import Device, PlantConfig
 
 if TYPE_CHECKING:
@@ -130,8 +131,10 @@ def load_scenario(
     if problems:
         raise ConfigError("\n".join(dict.fromkeys(problems)))
     try:
-        trajectory = Trajectory(scenario.reference)
-        check_against(Stage(parts["stage"]), trajectory)
+        trajectory = Trajectory(in_folder(scenario.reference, source.parent))
+        limits = parts["controller"].limits
+        drive = DriveLimits(limits.voltage_max_v, limits.slew_max_v_per_s, parts["bus"].period_us)
+        check_against(Stage(parts["stage"]), trajectory, drive)
     except TrajectoryError as error:
         raise TrajectoryError(f"{source}: {error}") from None
     if trajectory.duration_us * 1e-6 > scenario.duration_s:
@@ -154,4 +157,7 @@ def resolve(scenario: Scenario) -> dict[str, Any]:
     data = config.plain(scenario.config)
     for key in ("stage", "plant", "controller", "bus"):
         data[key] = config.plain(getattr(scenario, key))
+    tables = {f"reference.{n}": s.source_sha256 for n, s in enumerate(scenario.trajectory.segments) if s.source_sha256}
+    if tables:
+        data["sha256"] = tables
     return {**data, "digest": config.digest(data)}

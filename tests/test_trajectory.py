@@ -9,7 +9,8 @@ from pkxyz_ctrl.config import CONFIG_DIR, FrozenModel, parse, read_toml
 from pkxyz_ctrl.stage import Stage
 from pkxyz_ctrl.trajectory import Hold, Move, Raster, Segment, Trajectory, TrajectoryError
 from pkxyz_ctrl.trajectory.check import check_against
-from pkxyz_ctrl.trajectory.pieces import advance, at_rest
+from pkxyz_ctrl.trajectory.motion import at_rest
+from pkxyz_ctrl.trajectory.pieces import advance, joined
 from pkxyz_ctrl.trajectory.raster import reversal, reversal_time_s, step, step_time_s
 from pkxyz_ctrl.trajectory.segments import Limits, travel
 
@@ -48,8 +49,9 @@ def planned(segments):
 
 
 def pieces_of(trajectory):
-    duration = np.diff(trajectory._start_us) * 1e-6
-    return duration, trajectory._state, trajectory._jerk
+    """Durations, states and jerks of every piece; the last, of standing still at the end, has no duration."""
+    every = joined(trajectory._motions)
+    return every.duration_s[:-1], every.state, every.jerk_m_per_s3
 
 
 @settings(max_examples=60, deadline=None)
@@ -203,17 +205,21 @@ def test_the_default_scan_can_be_followed_and_worse_ones_say_when_and_why_not():
     stage = Stage.load("reconstructed")
     check_against(stage, Trajectory(parse(data, Reference, str(source)).reference))
     bounds = {"velocity_max_m_per_s": 1e-3, "acceleration_max_m_per_s2": 0.1, "jerk_max_m_per_s3": 20.0}
+    harsh = {"velocity_max_m_per_s": 0.1, "acceleration_max_m_per_s2": 100.0, "jerk_max_m_per_s3": 1e6}
     weak = Stage(
         stage.config.model_copy(update={"limits": stage.config.limits.model_copy(update={"voltage_max_v": 150.0})})
     )
     cases = [
-        (stage, (0.0, 0.0, -1e-6), "stroke 1 would be -.* outside 0 to 25 um"),
-        (stage, (5e-6, 0.0, 3e-6), "combs only pull"),
-        (stage, (0.0, 0.0, 400e-6), "stroke 1 would be 25"),
-        (weak, (0.0, 0.0, 30e-6), r"comb [123] would need 150\.\d V, beyond the limit of 150 V"),
+        (stage, [(0.0, 0.0, -1e-6)], "stroke 1 would be -.* outside 0 to 25 um"),
+        (stage, [(0.0, 0.0, 2e-6), (0.0, 0.0, 0.0)], "combs only pull"),
+        (stage, [(0.0, 0.0, 400e-6)], "stroke 1 would be 25"),
+        (weak, [(0.0, 0.0, 30e-6)], r"comb [123] would need 150\.\d V, beyond the limit of 150 V"),
     ]
-    for device, target, message in cases:
-        trajectory = Trajectory([Move(kind="move", to_m=target, **bounds)])
+    for device, targets, message in cases:
+        limits = [bounds, harsh][: len(targets)]
+        trajectory = Trajectory(
+            [Move(kind="move", to_m=to, **given) for to, given in zip(targets, limits, strict=True)]
+        )
         with pytest.raises(TrajectoryError, match=message) as refused:
             check_against(device, trajectory)
         named_us = round(float(str(refused.value).split(": ")[1].split(" s after")[0]) * 1e6)

@@ -15,13 +15,26 @@ import numpy as np
 from numpy.typing import NDArray
 from pydantic import Field
 
-from pkxyz_ctrl.trajectory.pieces import Array, Pieces, TrajectoryError, joined, still
+from pkxyz_ctrl.trajectory.motion import Array, Motion, TrajectoryError
+from pkxyz_ctrl.trajectory.periodic import Circle, Lissajous, Rosette, Sine
+from pkxyz_ctrl.trajectory.pieces import still
 from pkxyz_ctrl.trajectory.raster import Raster
 from pkxyz_ctrl.trajectory.segments import Hold, Move
+from pkxyz_ctrl.trajectory.spiral import Spiral
+from pkxyz_ctrl.trajectory.steps import Staircase, Steps
+from pkxyz_ctrl.trajectory.sweep import Sweep
+from pkxyz_ctrl.trajectory.table import Table
+from pkxyz_ctrl.trajectory.waypoints import Waypoints
 
-__all__ = ["Hold", "Move", "Raster", "Segment", "TimedSegment", "Trajectory", "TrajectoryError"]
+__all__ = [
+    "Circle", "Hold", "Lissajous", "Move", "Raster", "Rosette", "Segment", "Sine", "Spiral", "Staircase", "Steps",
+    "Sweep", "Table", "TimedSegment", "Trajectory", "TrajectoryError", "Waypoints",
+]  # fmt: skip
 
-Segment = Annotated[Hold | Move | Raster, Field(discriminator="kind")]
+AnySegment = (
+    Hold | Move | Raster | Circle | Lissajous | Rosette | Sine | Spiral | Staircase | Steps | Sweep | Table | Waypoints
+)
+Segment = Annotated[AnySegment, Field(discriminator="kind")]
 """Any segment of a reference, told apart by ``kind``."""
 
 Window = tuple[int, int]
@@ -40,31 +53,41 @@ class TimedSegment:
     """the parts of the scan at constant velocity"""
     still_us: Window | None
     """where hold noise is taken"""
+    jumps_us: tuple[int, ...] = ()
+    """where the position jumps, on purpose: the first instants at the new places"""
+    highest_hz: float = 0.0
+    """of a periodic motion; 0 for others"""
+    source_sha256: str | None = None
+    """digest of the file that it was read from, if there is one"""
 
 
 class Trajectory:
     """Segments one after another from the rest pose; immutable. Each segment ends on a whole microsecond."""
 
-    def __init__(self, segments: Sequence[Hold | Move | Raster]) -> None:
+    def __init__(self, segments: Sequence[AnySegment]) -> None:
         """Raises ``TrajectoryError``, naming the segment, where one can't be planned."""
         if not segments:
             raise TrajectoryError("reference: has no segments; give at least one [[reference]]")
         position = np.zeros(3)
         start_us = 0
-        parts: list[Pieces] = []
+        motions: list[Motion] = []
+        starts_us: list[float] = []
         timed: list[TimedSegment] = []
-        starts: list[Array] = []
         for n, segment in enumerate(segments):
             try:
                 plan = segment.plan(position)
             except TrajectoryError as error:
                 raise TrajectoryError(f"reference.{n} ({segment.kind}): {error}") from None
-            length_us = math.ceil(plan.pieces.total_s * 1e6 - 1e-3)
             position = plan.end_m
-            rest_s = length_us * 1e-6 - plan.pieces.total_s
-            pieces = joined([plan.pieces, still(position, rest_s)]) if rest_s > 0 else plan.pieces
-            parts.append(pieces)
-            starts.append(start_us + np.concatenate([[0.0], np.cumsum(pieces.duration_s[:-1])]) * 1e6)
+            t_s = 0.0
+            for motion in plan.motions:
+                motions.append(motion)
+                starts_us.append(start_us + t_s * 1e6)
+                t_s += motion.total_s
+            length_us = math.ceil(t_s * 1e6 - 1e-3)
+            if (rest_s := length_us * 1e-6 - t_s) > 0:
+                motions.append(still(position, rest_s))
+                starts_us.append(start_us + t_s * 1e6)
             timed.append(
                 TimedSegment(
                     segment.kind,
@@ -73,17 +96,17 @@ class Trajectory:
                     _window(start_us, plan.scan_s),
                     tuple(w for line in plan.lines_s if (w := _window(start_us, line))),
                     _window(start_us, plan.still_s),
+                    tuple(start_us + math.ceil(t * 1e6 - 1e-3) for t in plan.jumps_s),
+                    plan.highest_hz,
+                    plan.source_sha256,
                 )
             )
             start_us += length_us
-        parts.append(still(position, 1.0))
-        starts.append(np.array([float(start_us)]))
         self.segments = tuple(timed)
         self.duration_us = start_us
         self.end_m = position
-        every = joined(parts)
-        self._start_us = np.concatenate(starts)
-        self._state, self._jerk = every.state, every.jerk_m_per_s3
+        self._motions = (*motions, still(position, 1.0))
+        self._start_us = np.array([*starts_us, float(start_us)])
         self._segment_start_us = np.array([s.t_start_us for s in timed])
 
     def sample(self, first_tick: int, count: int, period_us: int) -> Array:
@@ -91,15 +114,15 @@ class Trajectory:
 
         Before 0 and after the end it stands still. The bits of a tick don't depend on which others are asked for.
         """
-        t_us = _instants_us(first_tick, count, period_us)
-        piece = np.maximum(np.searchsorted(self._start_us, t_us, side="right") - 1, 0)
-        t = (np.maximum(t_us - self._start_us[piece], 0.0) * 1e-6)[:, None]
-        p, v, a = np.moveaxis(self._state[piece], 1, 0)
-        j = self._jerk[piece]
+        t_us = np.maximum(_instants_us(first_tick, count, period_us), 0)
         out = np.empty((count, 9))
-        out[:, 0:3] = p + t * (v + t * (a / 2 + t * (j / 6)))
-        out[:, 3:6] = v + t * (a + t * (j / 2))
-        out[:, 6:9] = a + t * j
+        # the motion of each start up to now is on; rows are in order of time, so each motion has a slice of them
+        bounds = np.searchsorted(t_us, self._start_us[1:], side="left")
+        begins = np.concatenate([[0], bounds])
+        ends = np.concatenate([bounds, [count]])
+        for n in np.flatnonzero(ends > begins):
+            rows = slice(begins[n], ends[n])
+            out[rows] = self._motions[n].sample((t_us[rows] - self._start_us[n]) * 1e-6)
         return out
 
     def segment_index(self, first_tick: int, count: int, period_us: int) -> NDArray[np.int16]:

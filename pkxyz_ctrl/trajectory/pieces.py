@@ -1,20 +1,13 @@
-"""Pieces of constant jerk: the one form that every trajectory takes, whatever planned it."""
+"""Pieces of constant jerk: the form of every motion that limits on velocity, acceleration and jerk shape."""
 
 from collections.abc import Sequence
 from typing import NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 
-from pkxyz_ctrl.config import ConfigError
-
-Array = NDArray[np.float64]
+from pkxyz_ctrl.trajectory.motion import Array, at_rest
 
 _MERGE_S = 1e-12  # break points of two axes closer than this are one: at 100 m/s2 it moves a velocity by 0.1 nm/s
-
-
-class TrajectoryError(ConfigError):
-    """A reference that can't be planned or that the device can't follow. The message says where and which limit."""
 
 
 class Pieces(NamedTuple):
@@ -36,6 +29,19 @@ class Pieces(NamedTuple):
         """State (3, 3) at the end of the last piece."""
         return advance(self.state[-1], self.jerk_m_per_s3[-1], float(self.duration_s[-1]))
 
+    def sample(self, t_s: Array) -> Array:
+        """(n, 9) at instants (n,): cubic in time inside each piece."""
+        start_s = np.concatenate([[0.0], np.cumsum(self.duration_s[:-1])])
+        piece = np.maximum(np.searchsorted(start_s, t_s, side="right") - 1, 0)
+        t = (t_s - start_s[piece])[:, None]
+        p, v, a = np.moveaxis(self.state[piece], 1, 0)
+        j = self.jerk_m_per_s3[piece]
+        out = np.empty((len(t_s), 9))
+        out[:, 0:3] = p + t * (v + t * (a / 2 + t * (j / 6)))
+        out[:, 3:6] = v + t * (a + t * (j / 2))
+        out[:, 6:9] = a + t * j
+        return out
+
 
 class Phases(NamedTuple):
     """Jerk of one axis: ``jerk_m_per_s3[i]`` for ``duration_s[i]``."""
@@ -49,11 +55,6 @@ def advance(state: Array, jerk_m_per_s3: Array, duration_s: float) -> Array:
     p, v, a = state
     t, j = duration_s, jerk_m_per_s3
     return np.array([p + t * (v + t * (a / 2 + t * j / 6)), v + t * (a + t * j / 2), a + t * j])
-
-
-def at_rest(position_m: Sequence[float] | Array) -> Array:
-    """State (3, 3) of standing still at a position (3,)."""
-    return np.array([position_m, (0.0, 0.0, 0.0), (0.0, 0.0, 0.0)], dtype=np.float64)
 
 
 def still(position_m: Array, duration_s: float) -> Pieces:

@@ -1,16 +1,14 @@
 """Raster scan in three dimensions: lines along x, steps along y during the turn-around, layers along z, to and fro."""
 
 import math
-from typing import Annotated, Literal, NamedTuple
+from typing import Literal, NamedTuple
 
 import numpy as np
-from pydantic import Field
 
 from pkxyz_ctrl.config import FrozenModel
-from pkxyz_ctrl.trajectory.pieces import Array, Phases, Pieces, TrajectoryError, at_rest, from_phases, joined
-from pkxyz_ctrl.trajectory.segments import Limits, NotNegative, Plan, Position, Positive, travel
-
-Count = Annotated[int, Field(ge=1)]
+from pkxyz_ctrl.trajectory.motion import Array, TrajectoryError, at_rest
+from pkxyz_ctrl.trajectory.pieces import Phases, Pieces, from_phases, joined
+from pkxyz_ctrl.trajectory.segments import Count, Limits, NotNegative, Plan, Position, Positive, travel
 
 
 class Raster(FrozenModel):
@@ -56,7 +54,7 @@ class Raster(FrozenModel):
         lines = tuple(
             (begin + n / self.line_rate_hz, begin + n / self.line_rate_hz + line_s) for n in range(len(starts))
         )
-        return Plan(joined(parts), centre, scan_s=(begin, lines[-1][1]), lines_s=lines)
+        return Plan((joined(parts),), centre, scan_s=(begin, lines[-1][1]), lines_s=lines)
 
     def line_speed_m_per_s(self) -> float:
         """Least speed at which pass and turn-around fit the line's period; ``TrajectoryError`` if none does."""
