@@ -12,7 +12,7 @@ import typer
 from rich.console import Console
 from rich.table import Table
 
-from hil import mechanics_cli
+from hil import mechanics_cli, run_cli
 from pkxyz_ctrl.config import CONFIG_DIR, ConfigError, names
 
 app = typer.Typer(
@@ -130,6 +130,8 @@ def configs(as_json: Annotated[bool, typer.Option("--json", help="Print JSON.")]
 
 app.command("sil")(sil)
 app.command("configs")(configs)
+app.command("run")(run_cli.run)
+app.command("plant")(run_cli.plant)
 app.command("paper")(mechanics_cli.paper)
 app.command("workspace")(mechanics_cli.workspace)
 app.command("design")(mechanics_cli.design)

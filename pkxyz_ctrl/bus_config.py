@@ -16,6 +16,8 @@ class CanConfig(FrozenModel):
     interface: str = "pkxyz-sim"
     """python-can interface: "pkxyz-sim" for the simulated bus, else socketcan, slcan, gs_usb, virtual ..."""
     channel: str = "pkxyz"
+    options: dict[str, str | int | float | bool] | None = None
+    """What else python-can wants to know about this interface, by its names: ``receive_own_messages = false`` ..."""
     nominal_bitrate_bit_per_s: Annotated[int, Field(gt=0, le=1_000_000)]
     data_bitrate_bit_per_s: Annotated[int, Field(gt=0, le=8_000_000)] | None = None
     """Bit rate of the data phase of FD frames; absent on a classic bus."""

@@ -1,0 +1,136 @@
+"""``pkxyz run`` and ``pkxyz plant``: controller and plant at the machine's pace, each in a process of its own."""
+
+import json
+import sys
+from pathlib import Path
+from typing import Annotated, Any
+
+import typer
+
+from pkxyz_ctrl.config import ConfigError
+
+Scenario = Annotated[str, typer.Argument(help="A shipped scenario's name or a TOML file.")]
+Bus = Annotated[str, typer.Option(help="Name or file of the bus to meet on.")]
+Json = Annotated[bool, typer.Option("--json", help="Print JSON, and nothing else.")]
+_DEFAULT_BUS = "unix_2k"
+
+
+def run(
+    scenario: Scenario = "raster",
+    bus: Bus = _DEFAULT_BUS,
+    out: Annotated[Path | None, typer.Option(help="Folder to write; default: runs/<scenario>-wall-<n>.")] = None,
+    stage: Annotated[str | None, typer.Option(help="Name or file, instead of the scenario's.")] = None,
+    controller: Annotated[str | None, typer.Option(help="Name or file, instead of the scenario's.")] = None,
+    duration_s: Annotated[float | None, typer.Option("--seconds", help="Instead of the scenario's.")] = None,
+    as_json: Json = False,
+) -> None:
+    """Control an amplifier at rate; exit code 0 if the checks hold, 1 if not, 2 for bad input, 128 + signal if ended.
+
+    Ctrl-C, SIGTERM and errors leave the combs at 0 V. Errors of position are those of the estimate.
+    """
+    from hil.recording import RecordingError
+    from hil.run_folder import RunFolder, next_free
+    from hil.wall import LANE, require_real_bus, run_into
+    from pkxyz_ctrl.controller import StartUpError
+    from pkxyz_ctrl.design.estimator_gain import DesignError
+
+    loaded = _load(scenario, duration_s, stage=stage, controller=controller, bus=bus)
+    require_real_bus(loaded.bus)
+    folder = RunFolder(out if out is not None else next_free(Path("runs"), loaded.config.name, LANE))
+    try:
+        summary, result = run_into(folder, loaded, _tell)
+        if summary["ticks"]:
+            from hil.wall_figure import draw_wall
+
+            draw_wall(folder.recording, summary, result.lateness_us, folder.picture)
+    except (RecordingError, StartUpError, DesignError) as error:
+        print(f"pkxyz: {error}", file=sys.stderr)
+        raise typer.Exit(1) from None
+    if as_json:
+        print(json.dumps(summary | {"folder": str(folder.path)}, allow_nan=False))
+    else:
+        _show(summary, folder.path)
+    raise typer.Exit(128 + result.ended_by if result.ended_by else 0 if summary["ok"] else 1)
+
+
+def plant(
+    scenario: Annotated[str, typer.Argument(help="The scenario whose stage, plant and seed to serve.")] = "raster",
+    bus: Bus = _DEFAULT_BUS,
+    plant_config: Annotated[
+        str | None, typer.Option("--plant", help="Name or file, instead of the scenario's.")
+    ] = None,
+    stage: Annotated[str | None, typer.Option(help="Name or file, instead of the scenario's.")] = None,
+    seed: Annotated[int | None, typer.Option(help="Instead of the scenario's.")] = None,
+    truth: Annotated[
+        Path | None, typer.Option(help="File for the truth at each sample, as rows of hil.wall_plant.TRUTH.")
+    ] = None,
+    as_json: Annotated[bool, typer.Option("--json", help="Print each change as a line of JSON.")] = False,
+) -> None:
+    """Serve amplifier node and plant on a bus until Ctrl-C or SIGTERM."""
+    from hil.ending import Ended, Ending
+    from hil.scenario import load_scenario
+    from hil.wall import require_real_bus
+    from hil.wall_plant import WallPlant, WitnessedPlant
+    from pkxyz_ctrl.io.can_port import open_bus
+    from pkxyz_ctrl.io.realtime import go_real_time, settle_memory
+
+    loaded = load_scenario(scenario, seed=seed, stage=stage, plant=plant_config, bus=bus)
+    can_config = require_real_bus(loaded.bus)
+
+    def show(t_s: float, state: str, driven: bool) -> None:
+        if as_json:
+            print(json.dumps({"t_s": t_s, "state": state, "driven": driven}), flush=True)
+        else:
+            print(f"{t_s:12.6f} s  {state}{', combs driven' if driven else ', 0 V'}", flush=True)
+
+    try:
+        with Ending() as ending, open_bus(can_config, loaded.bus.name) as opened:
+            served = WallPlant(loaded.setup(), can_config, opened, show, truth)
+            _tell(go_real_time())
+            settle_memory()
+            try:
+                served.serve(ending.check)
+            finally:
+                if isinstance(served.plant, WitnessedPlant):
+                    served.plant.close()
+    except Ended:
+        pass
+    except OSError as error:
+        raise ConfigError(f"--truth: {truth}: {(error.strerror or str(error)).lower()}") from None
+
+
+def _load(scenario: str, duration_s: float | None, **instead: str | None) -> Any:
+    import dataclasses
+
+    from hil.scenario import load_scenario
+
+    loaded = load_scenario(scenario, **instead)  # type: ignore[arg-type]
+    if duration_s is None:
+        return loaded
+    if not 0 < duration_s <= 36_000:
+        raise ConfigError(f"--seconds: {duration_s:g} is not in 0..36000")
+    return dataclasses.replace(loaded, config=loaded.config.model_copy(update={"duration_s": duration_s}))
+
+
+def _tell(words: str) -> None:
+    print(words, file=sys.stderr, flush=True)
+
+
+def _show(summary: dict[str, Any], folder: Path) -> None:
+    late = summary["lateness_us"]
+    print(
+        f"{summary['scenario']} on {summary['bus']}: {summary['ticks']} ticks, {summary['missed_ticks']} missed, woken "
+        f"{late['p50']} us late in the middle, {late['p99_9']} us at p99.9, {late['max']} us at most"
+    )
+    for name in ("rms_error_nm", "hold_noise_nm"):
+        if summary[name]:
+            numbers = " / ".join(f"{value:.2f}" for value in summary[name].values())
+            print(f"{name.removesuffix('_nm').replace('_', ' ')}, by the estimate: {numbers} nm")
+    for check in summary["checks"]:
+        if check["ok"] is False:
+            print(f"check fails: {check['name']} = {check['value']}")
+    for fault in summary["faults"]:
+        print(f"fault: {fault}")
+    if summary["interrupted"]:
+        print("ended from outside: what was recorded until then is kept")
+    print(f"recording, frame log, config, summary and picture are in {folder}/")

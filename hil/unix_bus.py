@@ -1,0 +1,195 @@
+"""A CAN bus among the processes of one machine: python-can's ``can.Bus(interface="pkxyz-unix", channel=...)``.
+
+Frames, FD included, are datagrams between Unix sockets in one folder, the channel: whoever opens the channel binds a
+socket there, and a frame goes to all others. There is no wire timing and no arbitration, and a receiver that does not
+read loses frames when its queue in the kernel is full (``net.unix.max_dgram_qlen``), as CAN controllers do.
+
+Unlike over other interfaces, ``timestamp`` is when the frame was sent, in seconds of the time of day.
+"""
+
+import contextlib
+import errno
+import os
+import select
+import socket
+import struct
+import tempfile
+import time
+from itertools import count
+from pathlib import Path
+
+import can
+
+# time of day in ns, identifier with the flags of linux/can.h, length, flags of the FD frame; then the data
+_HEAD = struct.Struct("<qIBB")
+_EXTENDED, _REMOTE, _ERROR = 0x8000_0000, 0x4000_0000, 0x2000_0000
+_BIT_RATE_SWITCH, _ERROR_STATE, _FD = 0x01, 0x02, 0x04
+_LONGEST_PATH = 107  # sockaddr_un.sun_path less its closing zero
+_GONE = {errno.ECONNREFUSED, errno.ENOENT, errno.ECONNRESET, errno.ENOTCONN}
+_numbers = count(1)
+
+
+def folder_of(channel: str) -> Path:
+    """The folder that a channel means: a path as it is, a name below the user's folder for such things."""
+    if "/" in channel:
+        return Path(channel)
+    runtime = os.environ.get("XDG_RUNTIME_DIR")
+    base = Path(runtime) if runtime and os.access(runtime, os.W_OK) else Path(tempfile.gettempdir())
+    return base / f"pkxyz-unix-{os.getuid()}" / channel
+
+
+class UnixBus(can.BusABC):
+    """One participant. ``fd``: whether FD frames are carried; ``dropped`` counts frames that a full receiver lost.
+
+    ``bitrate`` and ``data_bitrate`` are taken and mean nothing.
+    """
+
+    def __init__(
+        self,
+        channel: str,
+        can_filters: can.typechecking.CanFilters | None = None,
+        fd: bool = True,
+        receive_own_messages: bool = False,
+        bitrate: int | None = None,
+        data_bitrate: int | None = None,
+    ) -> None:
+        self._folder = folder_of(str(channel))
+        self._path = self._folder / f"{os.getpid()}-{next(_numbers)}"
+        self._fd = fd
+        self._peers: list[str] = []
+        self._listed_ns = -1
+        self.dropped = 0
+        self._own: list[can.Message] | None = [] if receive_own_messages else None
+        self.channel = str(channel)
+        self.channel_info = f"pkxyz-unix {channel}"
+        if len(os.fsencode(self._path)) > _LONGEST_PATH:
+            raise can.CanInitializationError(f"channel {channel!r}: the path of its folder is too long for a socket")
+        self._socket = socket.socket(socket.AF_UNIX, socket.SOCK_DGRAM)
+        self._socket.setblocking(False)
+        try:
+            self._folder.mkdir(mode=0o700, parents=True, exist_ok=True)
+            self._path.unlink(missing_ok=True)  # of a process that had our number and was killed
+            self._socket.bind(str(self._path))
+        except OSError as error:
+            self._socket.close()
+            raise can.CanInitializationError(f"channel {channel!r}: {error.strerror or error}") from error
+        super().__init__(channel, can_filters)
+        self._can_protocol = can.CanProtocol.CAN_FD if fd else can.CanProtocol.CAN_20
+
+    def send(self, msg: can.Message, timeout: float | None = None) -> None:
+        """Send to all others; ``timeout`` is not used, as nothing here waits.
+
+        Raises CanOperationError for an FD frame where the bus was opened without, or after ``shutdown``.
+        """
+        if msg.is_fd and not self._fd:
+            raise can.CanOperationError(f"{self.channel_info}: opened without fd, cannot send an FD frame")
+        datagram = _pack(msg)
+        sender = self._socket
+        for peer in self._others():
+            try:
+                sender.sendto(datagram, peer)
+            except BlockingIOError:
+                self.dropped += 1
+            except OSError as error:
+                if error.errno not in _GONE:
+                    raise can.CanOperationError(f"{self.channel_info}: {error.strerror}", error.errno) from error
+                self._forget(peer)
+        if self._own is not None:
+            own = _unpack(datagram, self.channel)
+            own.is_rx = False
+            self._own.append(own)
+
+    def _recv_internal(self, timeout: float | None) -> tuple[can.Message | None, bool]:
+        if self._own:
+            return self._own.pop(0), False
+        receiver = self._socket
+        for attempt in range(2):
+            try:
+                message = _unpack(receiver.recv(128), self.channel)
+            except BlockingIOError:
+                if attempt == 1 or timeout == 0.0:
+                    return None, False
+                try:
+                    select.select((receiver,), (), (), timeout)
+                except (OSError, ValueError) as error:
+                    raise can.CanOperationError(f"{self.channel_info}: {error}") from error
+            except (struct.error, ValueError):
+                continue  # not one of ours: whoever can write into the folder can send anything
+            except OSError as error:
+                raise can.CanOperationError(f"{self.channel_info}: {error.strerror}", error.errno) from error
+            else:
+                if message.is_fd and not self._fd:
+                    continue  # a classic controller never sees one
+                return message, False
+        return None, False
+
+    def fileno(self) -> int:
+        """For ``select``."""
+        return self._socket.fileno()
+
+    def shutdown(self) -> None:
+        """Leave the channel."""
+        if not self._is_shutdown:
+            super().shutdown()
+            self._socket.close()
+            self._path.unlink(missing_ok=True)
+            with contextlib.suppress(OSError):
+                self._folder.rmdir()  # the last one turns off the light
+
+    def _others(self) -> list[str]:
+        """Sockets of the other participants; the folder is listed again when it has changed."""
+        try:
+            changed_ns = os.stat(self._folder).st_mtime_ns
+            # A folder's time is that of the kernel's last tick, up to 10 ms coarse: what is younger may change unseen.
+            if changed_ns != self._listed_ns:
+                settled = time.time_ns() - changed_ns > 20_000_000
+                self._listed_ns = changed_ns if settled else -1
+                mine = self._path.name
+                self._peers = [str(self._folder / name) for name in os.listdir(self._folder) if name != mine]
+        except FileNotFoundError:
+            self._peers = []
+        return self._peers
+
+    def _forget(self, peer: str) -> None:
+        """Take away what a killed process left behind."""
+        with contextlib.suppress(OSError):
+            os.unlink(peer)
+        self._peers = [other for other in self._peers if other != peer]
+
+
+def _pack(msg: can.Message) -> bytes:
+    can_id = msg.arbitration_id
+    if msg.is_extended_id:
+        can_id |= _EXTENDED
+    if msg.is_remote_frame:
+        can_id |= _REMOTE
+    if msg.is_error_frame:
+        can_id |= _ERROR
+    flags = (
+        (_FD if msg.is_fd else 0)
+        | (_BIT_RATE_SWITCH if msg.bitrate_switch else 0)
+        | (_ERROR_STATE if msg.error_state_indicator else 0)
+    )
+    return _HEAD.pack(time.time_ns(), can_id, msg.dlc, flags) + (b"" if msg.is_remote_frame else bytes(msg.data))
+
+
+def _unpack(datagram: bytes, channel: str) -> can.Message:
+    """Raises struct.error or ValueError for what is not a frame."""
+    sent_ns, can_id, length, flags = _HEAD.unpack_from(datagram)
+    data = datagram[_HEAD.size :]
+    is_remote, is_fd = bool(can_id & _REMOTE), bool(flags & _FD)
+    if length > (64 if is_fd else 8) or (len(data) != length and not is_remote):
+        raise ValueError("not a frame")
+    return can.Message(
+        timestamp=sent_ns * 1e-9,
+        arbitration_id=can_id & (0x1FFF_FFFF if can_id & _EXTENDED else 0x7FF),
+        is_extended_id=bool(can_id & _EXTENDED),
+        is_remote_frame=is_remote,
+        is_error_frame=bool(can_id & _ERROR),
+        channel=channel,
+        dlc=length,
+        data=None if is_remote else data,
+        is_fd=is_fd,
+        bitrate_switch=bool(flags & _BIT_RATE_SWITCH),
+        error_state_indicator=bool(flags & _ERROR_STATE),
+    )

@@ -1,0 +1,227 @@
+"""The wall-clock lane: the same controller and the same loop at the machine's pace, over any python-can bus."""
+
+import dataclasses
+import time
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+
+from hil.blocks import PREVIEW_ROWS
+from hil.ending import Ended, Ending
+from hil.metrics import Metrics
+from hil.recording import Recording
+from hil.run_folder import RunFolder, metadata_of, summarise
+from hil.scenario import Scenario
+from hil.setup import Setup
+from hil.wall_recorder import WallRecorder
+from pkxyz_ctrl import cycle as cycling
+from pkxyz_ctrl.bus_config import BusConfig, CanConfig
+from pkxyz_ctrl.can.frame import Frame
+from pkxyz_ctrl.config import ConfigError
+from pkxyz_ctrl.controller import Controller
+from pkxyz_ctrl.io.can_port import CanPort, open_bus
+from pkxyz_ctrl.io.clocks import TickClock, WallClock, percentile_us
+from pkxyz_ctrl.io.realtime import go_real_time, leave_real_time, settle_memory
+from pkxyz_ctrl.row import ROW, TRUTH_FIELDS
+from pkxyz_ctrl.runtime import run, start
+from pkxyz_ctrl.safety.gate import GateConfig
+
+LANE = "wall"
+_GUARDS_PER_PERIOD = 8
+_SHARES = {"p50": 0.5, "p99_9": 0.999, "max": 1.0}
+_LAST_FRAMES_S = 0.02  # 0 V and pre-operational leave even a slow adapter before it is closed
+
+
+@dataclass
+class WallResult:
+    """What is known of a run besides its rows."""
+
+    ended_by: int = 0
+    """signal that ended it, 0 if it ran to its end"""
+    elapsed_s: float = 0.0
+    ticks: int = 0
+    faults: tuple[str, ...] = ()
+    lateness_us: list[int] = dataclasses.field(default_factory=list)
+    """wake-ups by whole microseconds of lateness"""
+    refused_frames: int = 0
+
+
+def require_real_bus(bus: BusConfig) -> CanConfig:
+    """The bus's [can]. Raises ``ConfigError`` if other processes can't be reached there."""
+    if bus.can is None:
+        raise ConfigError(
+            f"bus {bus.name!r} has no [can]: nothing to control over; give another --bus, such as unix_2k"
+        )
+    if bus.can.interface == "pkxyz-sim":
+        raise ConfigError(
+            f'bus {bus.name!r} is simulated (can.interface = "pkxyz-sim") and ends with its process; '
+            "use `pkxyz sil`, or give a --bus with another interface, such as unix_2k"
+        )
+    return bus.can
+
+
+def wall_gate(gate: GateConfig) -> GateConfig:
+    """The gate for a loop that may be late: drive frames a guard apart, which ``TickClock`` keeps, not half a period.
+
+    The SYNC between two voltages, which bounds the steps of the combs, it demands as ever.
+    """
+    return dataclasses.replace(gate, spacing_min_us=gate.period_us // _GUARDS_PER_PERIOD)
+
+
+class _LoggedPort:
+    """A port whose frames go to the recorder, too."""
+
+    def __init__(self, port: CanPort, clock: WallClock, recorder: WallRecorder) -> None:
+        self._port, self._clock, self._log = port, clock, recorder.frame
+        self.unsent = port.unsent
+
+    def send(self, frame: Frame) -> None:
+        if self._port.send(frame):
+            self._log(frame, self._clock.now_us)
+
+    def receive(self, deadline_us: int) -> Frame | None:
+        frame = self._port.receive(deadline_us)
+        if frame is not None:
+            self._log(frame, self._port.last_us)
+        return frame
+
+
+class WallRig:
+    """Controller, clock and port of one run. ``close`` takes the combs to 0 V, whatever happened before."""
+
+    def __init__(self, setup: Setup, recorder: WallRecorder, ending: Ending) -> None:
+        self.setup = setup
+        self._recorder = recorder
+        self._ending = ending
+        can_config = require_real_bus(setup.bus)
+        law = setup.law
+        self._reference = setup.trajectory.sample(
+            0, setup.trajectory.duration_us // setup.bus.period_us + PREVIEW_ROWS + 1, setup.bus.period_us
+        )
+        _warm_up(law, self._reference)
+        self._bus = open_bus(can_config, setup.bus.name)
+        self.clock = WallClock()
+        self.can_port = CanPort(self._bus, self.clock, can_config.sense_deadline_us // 2)
+        self.port = _LoggedPort(self.can_port, self.clock, recorder)
+        self.controller = Controller(law, setup.bus, wall_gate(setup.gate), self.port.send)
+        for name, *_ in TRUTH_FIELDS:
+            self.controller.memory["row"][name] = np.nan  # nobody here knows it
+        self.ticks = TickClock(
+            self.clock,
+            setup.bus.period_us,
+            latest_start_us=can_config.sense_deadline_us // 2,
+            guard_us=setup.bus.period_us // _GUARDS_PER_PERIOD,
+            late_frames=self._take_late_frames,
+            leave=ending.check,
+        )
+        self._started = False
+
+    def run(self) -> None:
+        """Start the amplifier and run all ticks. Raises ``StartUpError`` and ``Ended``."""
+        self._started = True
+        start(self.clock, _Interruptible(self.port, self._ending), self.controller)
+        reference, row, take = self._reference, self.controller.row, self._recorder.row
+        run(self.ticks, self.port, self.controller, lambda tick: reference, self.setup.ticks, lambda tick: take(row))
+
+    def close(self) -> None:
+        """0 V, pre-operational, and off the bus."""
+        try:
+            if self._started:
+                self.controller.stop(self.clock.now_us)
+                time.sleep(_LAST_FRAMES_S)
+        finally:
+            self._bus.shutdown()
+
+    def _take_late_frames(self) -> None:
+        port, controller = self.port, self.controller
+        while (frame := port.receive(0)) is not None:
+            controller.receive(frame, self.clock.now_us)
+
+
+class _Interruptible:
+    """A port for the start-up, which can be ended while it waits."""
+
+    def __init__(self, port: _LoggedPort, ending: Ending) -> None:
+        self._port, self._ending = port, ending
+        self.send, self.unsent = port.send, port.unsent
+
+    def receive(self, deadline_us: int) -> Frame | None:
+        self._ending.check()
+        return self._port.receive(deadline_us)
+
+
+def _warm_up(law: Any, reference: Any) -> None:
+    """Load the compiled cycle before it is waited for."""
+    memory = cycling.new_memory()
+    for _ in range(3):
+        cycling.cycle(law, memory, reference)
+
+
+def run_into(folder: RunFolder, scenario: Scenario, say: Any) -> tuple[dict[str, Any], WallResult]:
+    """Run ``scenario`` at rate and leave everything in ``folder`` but the picture; returns the summary and the rest.
+
+    ``say`` is called with what a person should know. Raises ``ConfigError``, ``StartUpError``, ``RecordingError``.
+    """
+    can_config = require_real_bus(scenario.bus)
+    resolved = folder.write_config(scenario)
+    setup = scenario.setup()
+    result = WallResult()
+    with Ending() as ending:
+        recorder = WallRecorder(folder, metadata_of(scenario, LANE, resolved), can_config.channel.replace(" ", "_"))
+        try:
+            _run(WallRig(setup, recorder, ending), result, say)
+        except Ended as end:
+            result.ended_by = end.signal_number
+        finally:
+            recorder.close()
+    summary = summarise(
+        scenario, LANE, resolved["digest"], _figures(folder, scenario, result), interrupted=bool(result.ended_by)
+    )
+    folder.write_summary(summary)
+    return summary, result
+
+
+def _run(rig: WallRig, result: WallResult, say: Any) -> None:
+    begin_s = time.monotonic()
+    try:
+        say(go_real_time())
+        settle_memory()
+        begin_s = time.monotonic()
+        rig.run()
+    finally:
+        try:
+            rig.close()
+        finally:
+            leave_real_time()
+            result.elapsed_s = time.monotonic() - begin_s
+            result.faults = tuple(rig.controller.faults)
+            result.lateness_us = rig.ticks.lateness_us
+            result.refused_frames = rig.can_port.refused
+
+
+def _figures(folder: RunFolder, scenario: Scenario, result: WallResult) -> dict[str, Any]:
+    """Figures of the recorded rows. Nobody here knows the truth, so errors are those of the estimate."""
+    recording = Recording.open(folder.recording)
+    metrics = Metrics(scenario.trajectory, scenario.bus.period_us)
+    fields = ("mode", "reference_tick", "saturated", "reference_m", "estimate_m", "overrun", "sense_status")
+    missed = 0
+    for block in recording.blocks(fields):
+        rows = np.zeros(len(block["mode"]), ROW)
+        for name in fields:
+            rows[name] = block[name]
+        rows["position_m"] = rows["estimate_m"]
+        metrics.update(rows)
+        missed += int(rows["overrun"].sum()) + int(np.count_nonzero(rows["sense_status"] & 1))
+    result.ticks = recording.ticks
+    late = result.lateness_us
+    return metrics.figures() | {
+        "errors_are_of": "estimate",
+        "estimate_error_nm": None,
+        "missed_ticks": missed,
+        "faults": list(result.faults),
+        "bus_load": None,
+        "realtime_factor": recording.ticks * scenario.bus.period_s / result.elapsed_s if result.elapsed_s else None,
+        "refused_frames": result.refused_frames,
+        "lateness_us": {name: percentile_us(late, share) for name, share in _SHARES.items()},
+    }

@@ -1,0 +1,118 @@
+"""Amplifier node and plant at the machine's pace, behind any python-can bus: one thread that waits for frames.
+
+Time is that of the frames: a SYNC acts when it was on the bus, by its time stamp, not when this process woke up. Where
+nothing comes, alarms (heartbeats, their supervision) ring by the machine's clock. So the node's clock is the
+discrete-event clock of lockstep, pulled along.
+"""
+
+from collections.abc import Callable
+from pathlib import Path
+
+import can
+import numpy as np
+
+from hil.clock import Lockstep
+from hil.node import AmplifierNode, NmtState
+from hil.plant_on_bus import PlantOnBus
+from hil.setup import Setup
+from hil.truth import TRUTH_BYTES
+from pkxyz_ctrl.bus_config import CanConfig
+from pkxyz_ctrl.config import CONFIG_DIR
+from pkxyz_ctrl.io.can_port import CanPort
+from pkxyz_ctrl.io.clocks import WallClock
+from pkxyz_ctrl.row import TRUTH_FIELDS
+from sim.plant import Plant
+
+TRUTH = np.dtype([("t_us", "i8"), *TRUTH_FIELDS])
+"""A row of the truth: time of the sample since the process began, position, strokes and voltages at it."""
+
+_IDLE_US = 20_000  # between looks at whether to end
+_IN_FLIGHT_US = 2_000  # a frame may still come that is so much older than now
+
+
+class WitnessedPlant(PlantOnBus):
+    """A plant on the bus that writes the truth at each sample to a file of rows of ``TRUTH``."""
+
+    def __init__(self, plant: Plant, out: Path) -> None:
+        super().__init__(plant)
+        self._file = out.open("wb")
+        self._truth = self.exchange.view(np.uint8).data[:TRUTH_BYTES]
+
+    def sample(self) -> tuple[int, int, int]:
+        """Sample the sense combs now, and write down what is true."""
+        counts = super().sample()
+        self._file.write(self._now_us.to_bytes(8, "little", signed=True) + self._truth)
+        return counts
+
+    def close(self) -> None:
+        """Write the rest."""
+        self._file.close()
+
+
+class WallPlant:
+    """Node and plant of ``setup`` on ``bus``. ``on_change`` is told each NMT state and whether combs are driven."""
+
+    def __init__(
+        self,
+        setup: Setup,
+        can_config: CanConfig,
+        bus: can.BusABC,
+        on_change: Callable[[float, str, bool], object],
+        truth: Path | None = None,
+    ) -> None:
+        _warm_up(setup)
+        self.wall = WallClock()
+        self.clock = Lockstep()
+        self.plant = PlantOnBus(setup.new_plant()) if truth is None else WitnessedPlant(setup.new_plant(), truth)
+        self._port = CanPort(bus, self.wall)
+        self.node = AmplifierNode(
+            can_config.driver.node_id, self.clock, self._port.send, self.plant, CONFIG_DIR / "comb_amplifier.eds",
+            turnaround_us=can_config.turnaround_us, fd=can_config.driver.fd, protection=can_config.driver.protection,
+        )  # fmt: skip
+        self._on_change = on_change
+        self._shown = (NmtState.INITIALISING, False)
+
+    def serve(self, leave: Callable[[], object]) -> None:
+        """Serve until ``leave``, called at least every 20 ms, raises."""
+        clock, wall, port, node = self.clock, self.wall, self._port, self.node
+        node.power_on()
+        while True:
+            leave()
+            due_us = clock.next_event_us()
+            idle_us = wall.now_us + _IDLE_US
+            frame = port.receive(idle_us if due_us is None else min(idle_us, due_us))
+            if frame is not None:
+                t_us = max(clock.now_us, min(port.last_us, wall.now_us))
+                clock.run_until(t_us)
+                node.on_frame(frame, t_us)
+            elif due_us is not None and due_us <= wall.now_us:
+                clock.run_until(due_us)
+            else:
+                self._move_on()
+            self._show()
+
+    def _move_on(self) -> None:
+        """Nothing has come for a while: keep the plant from falling behind."""
+        t_us = self.wall.now_us - _IN_FLIGHT_US
+        if t_us > self.clock.now_us:
+            self.clock.run_until(t_us)
+            self.plant.advance_to(t_us)
+            self.plant.settle()
+
+    def _show(self) -> None:
+        shown = (self.node.state, any(self.node.outputs))
+        if shown != self._shown:
+            self._shown = shown
+            self._on_change(self.clock.now_us * 1e-6, shown[0].name.lower().replace("_", "-"), shown[1])
+
+
+def _warm_up(setup: Setup) -> None:
+    """Load the compiled plant before it is waited for."""
+    scratch = PlantOnBus(setup.new_plant())
+    for t_us in (0, 500, 1000):
+        scratch.advance_to(t_us)
+        scratch.drive((0, 0, 0))
+        scratch.sample()
+    scratch.advance_to(1500)
+    scratch.drive((0, 0, 0))
+    scratch.settle()

@@ -1,0 +1,152 @@
+"""Writes recording and frame log of a loop at rate in a process of its own, so that no disk delays a tick.
+
+The loop puts a row and its frames into a pipe, one write a tick. The other end outlives whatever ends the loop: it
+closes the recording when the pipe is closed, also if that is because the loop was killed.
+"""
+
+import contextlib
+import fcntl
+import os
+import signal
+import struct
+from typing import Any
+
+import numpy as np
+
+from hil.frame_log import FrameLog
+from hil.recording import RecordingError, RecordingWriter
+from hil.run_folder import RunFolder
+from pkxyz_ctrl.can.frame import Frame
+from pkxyz_ctrl.row import ROW
+
+_HEAD = struct.Struct("<BBqI")  # kind of entry, length of the data that follow, time in us, identifier
+_FRAME, _ROW = 0, 1  # a frame's kind is a bit set of its flags, shifted past the kind
+_ROW_HEAD = bytes((_ROW,))
+_PIPE_BYTES = 1 << 20  # about a second at 2 kHz
+_WAITING_MAX_BYTES = 1 << 24
+_READ_BYTES = 1 << 16
+
+
+class WallRecorder:
+    """Rows and frames on their way to disk. ``lost_bytes``: what the writer was too slow for."""
+
+    def __init__(self, folder: RunFolder, metadata: dict[str, Any], channel: str) -> None:
+        """Forks: make it before buses are opened and priorities raised."""
+        self.lost_bytes = 0
+        self._waiting: list[bytes] = []
+        reading, self._pipe = os.pipe()
+        said, saying = os.pipe()
+        with contextlib.suppress(OSError, AttributeError):
+            fcntl.fcntl(self._pipe, fcntl.F_SETPIPE_SZ, _PIPE_BYTES)  # the limit of an ordinary user may be lower
+        self._child = os.fork()
+        if self._child == 0:
+            os.close(self._pipe)
+            os.close(said)
+            _be_the_writer(reading, saying, folder, metadata, channel)
+        os.close(reading)
+        os.close(saying)
+        self._said = said
+        os.set_blocking(self._pipe, False)
+
+    def frame(self, frame: Frame, t_us: int) -> None:
+        """Note a frame that was sent or received at ``t_us``."""
+        can_id, data, is_fd, bitrate_switch, is_remote, is_extended, is_error = frame
+        flags = is_fd << 1 | bitrate_switch << 2 | is_remote << 3 | is_extended << 4 | is_error << 5
+        self._waiting.append(_HEAD.pack(_FRAME | flags, len(data), t_us, can_id) + data)
+
+    def row(self, row: memoryview) -> None:
+        """Note the row of a tick and send all that waits. Raises ``RecordingError`` if the writer has given up."""
+        self._waiting.append(_ROW_HEAD)
+        self._waiting.append(bytes(row))
+        entry = b"".join(self._waiting)
+        try:
+            written = os.write(self._pipe, entry)
+        except BlockingIOError:
+            written = 0
+        except BrokenPipeError:
+            raise RecordingError(self._last_words()) from None
+        self._waiting.clear()
+        if written < len(entry):
+            if len(entry) < _WAITING_MAX_BYTES:
+                self._waiting.append(entry[written:])
+            else:
+                self._keep_whole(entry, written)
+
+    def close(self) -> None:
+        """Send the rest, let the writer finish. Raises ``RecordingError`` if it could not write all."""
+        if self._pipe < 0:
+            return
+        os.set_blocking(self._pipe, True)
+        rest = b"".join(self._waiting)
+        with contextlib.suppress(BrokenPipeError):
+            while rest:
+                rest = rest[os.write(self._pipe, rest) :]
+        os.close(self._pipe)
+        self._pipe = -1
+        words = self._last_words()
+        os.waitpid(self._child, 0)
+        if words:
+            raise RecordingError(words)
+
+    def _keep_whole(self, entry: bytes, written: int) -> None:
+        """Give up what waits, but for the rest of the entry that is already half in the pipe."""
+        at = 0
+        while at < written:
+            at += _length_at(entry, at)
+        self.lost_bytes += len(entry) - at
+        if at > written:
+            self._waiting.append(entry[written:at])
+
+    def _last_words(self) -> str:
+        words = b""
+        if self._said >= 0:
+            while part := os.read(self._said, _READ_BYTES):
+                words += part
+            os.close(self._said)
+            self._said = -1
+        return words.decode()
+
+
+def _length_at(entries: bytes, at: int) -> int:
+    if entries[at] == _ROW:
+        return 1 + ROW.itemsize
+    return _HEAD.size + entries[at + 1]
+
+
+def _be_the_writer(reading: int, saying: int, folder: RunFolder, metadata: dict[str, Any], channel: str) -> None:
+    """Never returns. Deaf to Ctrl-C: the end of the pipe is the end."""
+    for number in (signal.SIGINT, signal.SIGTERM, signal.SIGHUP):
+        signal.signal(number, signal.SIG_IGN)
+    status = 0
+    try:
+        with RecordingWriter(folder.recording, metadata) as recording, FrameLog(folder.frames, channel) as log:
+            _write_down(reading, recording, log)
+    except (RecordingError, OSError) as error:
+        os.write(saying, str(error).encode())
+        status = 1
+    except BaseException as error:  # a fork must not return into its parent's code, whatever happens
+        os.write(saying, f"the recording was given up: {error!r}".encode())
+        status = 1
+    finally:
+        os._exit(status)
+
+
+def _write_down(reading: int, recording: RecordingWriter, log: FrameLog) -> None:
+    pending = b""
+    row = np.zeros(1, ROW)
+    row_bytes = row.view(np.uint8).data
+    while part := os.read(reading, _READ_BYTES):
+        pending += part
+        at = 0
+        while len(pending) - at >= _HEAD.size and len(pending) - at >= _length_at(pending, at):
+            end = at + _length_at(pending, at)
+            if pending[at] == _ROW:
+                row_bytes[:] = pending[at + 1 : end]
+                recording.write(row)
+            else:
+                flags, _, t_us, can_id = _HEAD.unpack_from(pending, at)
+                is_fd, switch, remote, extended, error = (bool(flags >> bit & 1) for bit in range(1, 6))
+                data = pending[at + _HEAD.size : end]
+                log.record(Frame(can_id, data, is_fd, switch, remote, extended, error), t_us)
+            at = end
+        pending = pending[at:]

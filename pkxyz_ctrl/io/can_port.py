@@ -1,0 +1,113 @@
+"""Any python-can bus as ``runtime.Port``. The only place in this package that knows python-can."""
+
+import time
+from typing import Any, Protocol
+
+import can
+
+from pkxyz_ctrl.bus_config import CanConfig
+from pkxyz_ctrl.can.frame import Frame
+from pkxyz_ctrl.config import ConfigError
+
+_STAMP_MAX_AGE_S = 1.0
+
+
+class _Time(Protocol):
+    @property
+    def now_us(self) -> int: ...
+
+
+def open_bus(config: CanConfig, name: str) -> can.BusABC:
+    """The bus that a bus config named ``name`` describes. Raises ``ConfigError`` with the interface's own words."""
+    keywords: dict[str, Any] = {"bitrate": config.nominal_bitrate_bit_per_s}
+    if config.driver.fd:
+        keywords |= {"fd": True, "data_bitrate": config.data_bitrate_bit_per_s}
+    keywords |= config.options or {}
+    try:
+        return can.Bus(channel=config.channel, interface=config.interface, **keywords)
+    except (can.CanError, OSError, ValueError, TypeError, ImportError) as error:
+        raise ConfigError(
+            f"bus {name!r}: can.interface {config.interface!r}, channel {config.channel!r}: "
+            f"{' '.join(str(error).split()) or type(error).__name__}; see [can] and [can.options] of the bus config"
+        ) from None
+
+
+def to_frame(message: can.Message) -> Frame:
+    """A message as a ``Frame``; the length that a remote frame asks for is the length of its ``data``."""
+    return Frame(
+        message.arbitration_id,
+        bytes(message.dlc) if message.is_remote_frame else bytes(message.data),
+        message.is_fd,
+        message.bitrate_switch,
+        message.is_remote_frame,
+        message.is_extended_id,
+        message.is_error_frame,
+    )
+
+
+def to_message(frame: Frame) -> can.Message:
+    """A frame as python-can sends it."""
+    return can.Message(
+        arbitration_id=frame.can_id,
+        data=None if frame.is_remote else frame.data,
+        dlc=len(frame.data),
+        is_fd=frame.is_fd,
+        bitrate_switch=frame.bitrate_switch,
+        is_remote_frame=frame.is_remote,
+        is_extended_id=frame.is_extended,
+        is_error_frame=frame.is_error,
+        is_rx=False,
+    )
+
+
+class CanPort:
+    """``runtime.Port`` on a python-can bus.
+
+    ``refused`` counts frames that the bus did not take (queue full, bus-off): they are lost, and it is for the monitors
+    to say when that is too much. ``last_us`` is the time of the frame received last, by the stamp of its interface
+    where that is a time of day, as python-can wants it, else when it was read.
+
+    ``receive`` looks again and again for ``spin_us`` before it sleeps: an answer that comes within that time, as a
+    sense frame does, is not delayed by a wake-up, some 50 us.
+    """
+
+    def __init__(self, bus: can.BusABC, clock: _Time, spin_us: int = 0) -> None:
+        self._bus = bus
+        self._clock = clock
+        self._spin_us = spin_us
+        self.refused = 0
+        self.last_us = 0
+
+    def send(self, frame: Frame) -> bool:
+        """Hand a frame to the bus; False if it was refused."""
+        try:
+            self._bus.send(to_message(frame))
+        except (can.CanError, OSError):
+            self.refused += 1
+            return False
+        return True
+
+    def receive(self, deadline_us: int) -> Frame | None:
+        """The next frame, or None once it is ``deadline_us``; one that is already there comes even after that.
+
+        A bus that cannot be read any more is silent: the monitors find that out.
+        """
+        clock, recv = self._clock, self._bus.recv
+        sleep_us = min(deadline_us, clock.now_us + self._spin_us)
+        try:
+            while (message := recv(0.0)) is None and clock.now_us < sleep_us:
+                pass
+            if message is None and clock.now_us < deadline_us:
+                message = recv((deadline_us - clock.now_us) * 1e-6)
+        except (can.CanError, OSError, ValueError):
+            return None
+        if message is None:
+            return None
+        now_us = clock.now_us
+        age_s = time.time() - message.timestamp
+        self.last_us = now_us - round(age_s * 1e6) if 0 <= age_s < _STAMP_MAX_AGE_S else now_us
+        return to_frame(message)
+
+    def unsent(self) -> int:
+        """0: python-can doesn't tell what still waits."""
+        return 0
