@@ -145,7 +145,7 @@ class Recording:
         path = Path(path)
         try:
             if path.is_file() or not journal_of(path).is_file():
-                file = pq.ParquetFile(path)
+                file = pq.ParquetFile(path, pre_buffer=False)
                 return cls(path, _metadata(file.schema_arrow, path), file, None)
             with _JournalBatches(journal_of(path)) as (schema, batches):
                 table = pa.Table.from_batches(list(batches), schema)
@@ -168,14 +168,21 @@ class Recording:
     def blocks(self, fields: Sequence[str]) -> Iterator[dict[str, NDArray[Any]]]:
         """Fields of ``ROW`` for some thousand ticks at a time, so that no recording is too long."""
         names = [name for field in fields for name in columns(field)]
-        source = self._table.to_batches() if self._file is None else self._file.iter_batches(_GROUP_ROWS, columns=names)
-        for batch in source:
+        for batch in self._groups(names):
             yield {
                 field: np.stack([batch.column(name).to_numpy() for name in columns(field)], axis=1)
                 if len(columns(field)) > 1
                 else batch.column(field).to_numpy()
                 for field in fields
             }
+
+    def _groups(self, names: list[str]) -> Iterator[pa.RecordBatch | pa.Table]:
+        """One row group at a time: pyarrow's own iterator reads ahead and keeps 150 MB of a long recording."""
+        if self._file is None:
+            yield from self._table.to_batches()
+            return
+        for group in range(self._file.num_row_groups):
+            yield self._file.read_row_group(group, columns=names, use_threads=False)
 
     def _read(self, names: Sequence[str]) -> list[NDArray[Any]]:
         known = self._table.column_names if self._file is None else self._file.schema_arrow.names
