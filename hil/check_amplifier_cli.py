@@ -1,0 +1,99 @@
+"""``pkxyz check-amplifier``: may this amplifier be enabled?"""
+
+import json
+from collections.abc import Iterator
+from contextlib import contextmanager
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated
+
+import typer
+from rich.console import Console
+from rich.markup import escape
+
+from pkxyz_ctrl.config import CONFIG_DIR, ConfigError, load
+
+if TYPE_CHECKING:
+    from hil.conformance.talker import Talker
+    from hil.conformance.verdict import Line
+    from pkxyz_ctrl.bus_config import BusConfig
+
+_screen = Console(highlight=False)
+_COLOURS = {"PASS": "green", "FAIL": "bold red", "NOT TESTED": "dim"}
+
+
+def check_amplifier(
+    bus: Annotated[str, typer.Option(help="A shipped bus's name or a TOML file.")] = "fd_5k",
+    eds: Annotated[Path | None, typer.Option(help="The amplifier's EDS; default: the shipped contract.")] = None,
+    allow_voltage: Annotated[
+        bool, typer.Option("--allow-voltage", help="Also drive a few volts; with the high voltage off, device removed.")
+    ] = False,
+    out: Annotated[Path | None, typer.Option(help="Folder for conformance.md and conformance.json.")] = None,
+    as_json: Annotated[bool, typer.Option("--json", help="Print JSON, and nothing else.")] = False,
+) -> None:
+    """Conformance run for a CANopen amplifier; exit code 0 if no line fails, 1 if one does."""
+    from hil.conformance import report
+    from hil.conformance.run import run_all
+    from pkxyz_ctrl.bus_config import BusConfig
+
+    config = load("buses", bus, BusConfig)
+    path = eds if eds is not None else CONFIG_DIR / "comb_amplifier.eds"
+    if out is not None:
+        _require_folder(out)
+    with _talker(config, path, allow_voltage) as talker:
+        lines = run_all(talker, (lambda line: None) if as_json else _show)
+        result = report.as_json(talker, path.name, lines)
+    if out is not None:
+        _save(out, "conformance.json", json.dumps(result, indent=1) + "\n")
+        _save(out, "conformance.md", report.as_markdown(result))
+    if as_json:
+        print(json.dumps(result))
+    else:
+        counts = f"{result['passed']} passed, {result['failed']} failed, {result['not_tested']} not tested"
+        _screen.print(f"{counts}. {report.conclusion(result)}", soft_wrap=True)
+    raise typer.Exit(0 if result["ok"] else 1)
+
+
+@contextmanager
+def _talker(config: "BusConfig", eds: Path, allow_voltage: bool) -> "Iterator[Talker]":
+    """On the simulated bus with node and plant, which are made here; elsewhere with whoever is there."""
+    if config.can is None or config.can.interface == "pkxyz-sim":
+        from hil.conformance.simulated import simulated_talker
+
+        yield simulated_talker(config, eds, allow_voltage=allow_voltage)
+        return
+    from hil.conformance.eds import read_eds
+    from hil.conformance.talker import Talker
+    from pkxyz_ctrl.io.can_port import CanPort, open_bus
+    from pkxyz_ctrl.io.clocks import WallClock
+
+    variables = read_eds(eds, config.can.driver.node_id)
+    clock = WallClock()
+    with open_bus(config.can, config.name) as opened:
+        port = CanPort(opened, clock)
+        yield Talker(
+            clock, port, config, variables, allow_voltage=allow_voltage, stamp_us=lambda: port.last_us
+        )  # fmt: skip
+
+
+def _show(line: "Line") -> None:
+    colour = _COLOURS[line.verdict.value]
+    name = f"{line.group}: {line.name}"
+    _screen.print(f"[{colour}]{line.verdict.value:10}[/] {escape(name):45} {escape(line.got)}", soft_wrap=True)
+    if line.verdict.value == "FAIL":
+        _screen.print(f"{'':10} {'expected':45} {escape(line.expected)}", soft_wrap=True)
+
+
+def _require_folder(out: Path) -> None:
+    try:
+        out.mkdir(parents=True, exist_ok=True)
+    except OSError as error:
+        raise ConfigError(f"{out}: cannot be made a folder: {error.strerror}; give another with --out") from None
+
+
+def _save(out: Path, name: str, text: str) -> None:
+    try:
+        (out / name).write_text(text, encoding="utf-8")
+    except OSError as error:
+        raise ConfigError(
+            f"{out / name}: cannot be written: {error.strerror}; give another folder with --out"
+        ) from None

@@ -1,0 +1,232 @@
+"""NMT, boot-up, heartbeat, frame formats: checks of how the node behaves on the network."""
+
+from itertools import pairwise
+
+from hil.conformance.talker import ZERO, Talker
+from hil.conformance.verdict import Check, DeviationError, NotTestedError, deviate_if
+from pkxyz_ctrl.can import cob_id
+from pkxyz_ctrl.can.cob_id import NmtCommand, NmtState
+
+_PERIOD_MS = 20
+_BEATS = 20
+_SYNCS = 5
+_NAMES = {state.value: state.name.lower().replace("_", "-") for state in NmtState}
+
+
+def _boot_up(talker: Talker) -> str:
+    return _one_boot_up(talker, NmtCommand.RESET_NODE)
+
+
+def _one_boot_up(talker: Talker, command: NmtCommand) -> str:
+    talker.reset()
+    begin_us, mark = talker.now_us, talker.mark()
+    boot = talker.reset(command)
+    if boot is None:
+        raise DeviationError(f"nothing within {talker.driver.boot_timeout_us / 1000:g} ms")
+    frames = [data for _, data in talker.since(mark, talker.heartbeat_id)]
+    if frames != [b"\0"]:
+        raise DeviationError("; ".join(data.hex(" ") or "no bytes" for data in frames))
+    return f"00 after {(boot[0] - begin_us) / 1000:.3g} ms"
+
+
+def _communication_reset(talker: Talker) -> str:
+    """CiA 301, 7.3.2.1.1.4: objects 0x1000 to 0x1FFF take their defaults, those of the application stay."""
+    talker.reset()
+    talker.write(0x6443, 1, 0, 1)
+    talker.write(0x1017, 0, 100, 2)
+    talker.reset(NmtCommand.RESET_COMMUNICATION)
+    heartbeat, mode = talker.read(0x1017, 0), talker.read(0x6443, 1)
+    default = next((v.default for v in talker.variables if (v.index, v.subindex) == (0x1017, 0)), None)
+    deviations = []
+    if default is not None and heartbeat.data != default:
+        deviations.append(f"0x1017:00 {heartbeat.text}, default {default.hex(' ')}")
+    if mode.data != b"\0":
+        deviations.append(f"0x6443:01 {mode.text}, but 00 had been written")
+    deviate_if(deviations)
+    return "0x1017 at its default, 0x6443:01 as written"
+
+
+def _state(talker: Talker) -> int | None:
+    """The state of the last heartbeat within a few periods; None if there is none."""
+    mark = talker.mark()
+    talker.run(5000 * _PERIOD_MS)
+    beats = talker.since(mark, talker.heartbeat_id)
+    return beats[-1][1][0] & 0x7F if beats and beats[-1][1] else None
+
+
+def _beating_node(talker: Talker) -> None:
+    talker.reset()
+    talker.write(0x1017, 0, _PERIOD_MS, 2)
+    if _state(talker) is None:
+        raise NotTestedError("no heartbeats, so no state is seen")
+
+
+def _states(talker: Talker) -> str:
+    _beating_node(talker)
+    path = (
+        (None, NmtState.PRE_OPERATIONAL),
+        (NmtCommand.START, NmtState.OPERATIONAL),
+        (NmtCommand.STOP, NmtState.STOPPED),
+        (NmtCommand.PRE_OPERATIONAL, NmtState.PRE_OPERATIONAL),
+        (NmtCommand.STOP, NmtState.STOPPED),
+        (NmtCommand.START, NmtState.OPERATIONAL),
+        (NmtCommand.PRE_OPERATIONAL, NmtState.PRE_OPERATIONAL),
+    )
+    deviations = []
+    for command, expected in path:
+        if command is not None:
+            talker.nmt(command)
+        state = _state(talker)
+        if state != expected:
+            after = command.name.lower().replace("_", "-") if command else "boot-up"
+            deviations.append(f"after {after}: {_NAMES.get(state, state) if state is not None else 'silent'}")
+    deviate_if(deviations)
+    return "boot-up, " + ", ".join(_NAMES[state] for _, state in path)
+
+
+def _addressing(talker: Talker) -> str:
+    _beating_node(talker)
+    other = talker.node_id % 127 + 1
+    deviations = []
+    for node_id, expected in ((other, NmtState.PRE_OPERATIONAL), (0, NmtState.OPERATIONAL)):
+        talker.nmt(NmtCommand.START, node_id)
+        if (state := _state(talker)) != expected:
+            deviations.append(f"start of node {node_id}: {_NAMES.get(state, state) if state is not None else 'silent'}")
+    deviate_if(deviations)
+    return f"node {other}'s start is ignored, everyone's is obeyed"
+
+
+def _sdo_by_state(talker: Talker) -> str:
+    talker.reset()
+    deviations = []
+    for command, allowed in (
+        (NmtCommand.PRE_OPERATIONAL, True),
+        (NmtCommand.START, True),
+        (NmtCommand.STOP, False),
+        (NmtCommand.PRE_OPERATIONAL, True),
+    ):
+        talker.nmt(command)
+        if talker.read(0x1000, 0).ok != allowed:
+            deviations.append(f"after {command.name.lower()}: {'no answer' if allowed else 'answered'}")
+    deviate_if(deviations)
+    return "answered in pre-operational and operational, not in stopped"
+
+
+def _pdo_by_state(talker: Talker) -> str:
+    talker.operational()
+    deviations = []
+    for command, allowed in (
+        (NmtCommand.START, True),
+        (NmtCommand.PRE_OPERATIONAL, False),
+        (NmtCommand.STOP, False),
+        (NmtCommand.START, True),
+    ):
+        talker.nmt(command)
+        mark = talker.mark()
+        for _ in range(_SYNCS):
+            talker.cycle()
+        talker.run(2000)
+        if bool(talker.since(mark, talker.sense_id)) != allowed:
+            deviations.append(f"after {command.name.lower()}: {'none' if allowed else 'sent'}")
+    deviate_if(deviations)
+    return "sense PDOs in operational only"
+
+
+def _heartbeat_period(talker: Talker) -> str:
+    talker.reset()
+    talker.write(0x1017, 0, _PERIOD_MS, 2)
+    mark = talker.mark()
+    talker.run(1000 * _PERIOD_MS * _BEATS)
+    times = [t_us for t_us, _ in talker.since(mark, talker.heartbeat_id)]
+    if len(times) < 2:
+        raise DeviationError(f"{len(times)} heartbeats in {_PERIOD_MS * _BEATS} ms")
+    gaps_ms = [(b - a) / 1000 for a, b in pairwise(times)]
+    told = f"{len(times)} heartbeats, {min(gaps_ms):.2f} to {max(gaps_ms):.2f} ms apart"
+    if max(gaps_ms) > 1.1 * _PERIOD_MS or min(gaps_ms) < 0.5 * _PERIOD_MS:
+        raise DeviationError(told)
+    return told
+
+
+def _heartbeat_in_the_loop(talker: Talker) -> str:
+    talker.operational()
+    mark = talker.mark()
+    period_us = talker.bus.period_us
+    talker.cycles(10_000 * talker.driver.node_heartbeat_period_ms // period_us)
+    times = [t_us for t_us, _ in talker.since(mark, talker.heartbeat_id)]
+    gaps_ms = [(b - a) / 1000 for a, b in pairwise(times)]
+    limit_ms = talker.driver.node_heartbeat_timeout_ms
+    if not gaps_ms or max(gaps_ms) >= limit_ms:
+        raise DeviationError(
+            f"{len(times)} heartbeats, up to {max(gaps_ms, default=0):.2f} ms apart, limit {limit_ms} ms"
+        )
+    return f"{len(times)} heartbeats, at most {max(gaps_ms):.2f} ms apart, limit {limit_ms} ms"
+
+
+def _heartbeat_off(talker: Talker) -> str:
+    _beating_node(talker)
+    talker.write(0x1017, 0, 0, 2)
+    talker.run(1000)
+    if (state := _state(talker)) is not None:
+        raise DeviationError(f"still beating, state {state}")
+    return f"silent for {5 * _PERIOD_MS} ms"
+
+
+def _formats(talker: Talker) -> str:
+    if not talker.driver.fd:
+        raise NotTestedError("classic bus")
+    talker.reset()
+    deviations = []
+    for fd in (True, False):
+        mark = talker.mark()
+        talker.send(cob_id.SDO_REQUEST_BASE + talker.node_id, bytes.fromhex("40 00 10 00 00 00 00 00"), fd=fd)
+        talker.first(cob_id.SDO_RESPONSE_BASE + talker.node_id, talker.driver.sdo_timeout_us)
+        frames = [frame for _, frame in talker.heard[mark:]]
+        asked = "FD" if fd else "classic"
+        if not frames:
+            deviations.append(f"{asked} request: no answer")
+        deviations += [f"{asked} request: a classic answer" for frame in frames if not frame.is_fd]
+    deviate_if(deviations)
+    return "both formats are heard, answers are FD"
+
+
+def _extended(talker: Talker) -> str:
+    """An identifier of 29 bits with the same number is another identifier."""
+    talker.operational()
+    mark = talker.mark()
+    talker.send(cob_id.NMT, bytes((NmtCommand.STOP, talker.node_id)), extended=True)
+    talker.send(cob_id.SDO_REQUEST_BASE + talker.node_id, bytes.fromhex("40 00 10 00 00 00 00 00"), extended=True)
+    talker.run(2000)
+    for _ in range(_SYNCS):
+        talker.cycle(talker.next_drive(ZERO))
+    deviations = []
+    if talker.since(mark, cob_id.SDO_RESPONSE_BASE + talker.node_id):
+        deviations.append("an SDO request with 29 bits was answered")
+    if not talker.since(mark, talker.sense_id):
+        deviations.append("an NMT stop with 29 bits was obeyed")
+    deviate_if(deviations)
+    return "ignored"
+
+
+_A, _B, _C = "boot-up and NMT", "heartbeat", "frames"
+CHECKS = (
+    Check(_A, "boot-up", "one frame, 00, within the boot time-out after NMT reset node", _boot_up),
+    Check(
+        _A, "communication reset", "communication objects at defaults, application objects kept", _communication_reset
+    ),
+    Check(_A, "states", "pre-operational after boot-up, then as commanded", _states),
+    Check(_A, "addressing", "commands to other nodes are ignored, those to node 0 obeyed", _addressing),
+    Check(_A, "SDO by state", "answered in pre-operational and operational, not in stopped", _sdo_by_state),
+    Check(_A, "PDO by state", "sense PDOs in operational only", _pdo_by_state),
+    Check(
+        _B,
+        "heartbeat period",
+        f"0x1017 = {_PERIOD_MS} ms: every {_PERIOD_MS // 2} to {_PERIOD_MS * 1.1:g} ms",
+        _heartbeat_period,
+    ),
+    Check(
+        _B, "heartbeat in the loop", "with SYNC at rate, never later than the driver's time-out", _heartbeat_in_the_loop
+    ),
+    Check(_B, "heartbeat off", "0x1017 = 0: none", _heartbeat_off),
+    Check(_C, "formats", "on an FD bus, FD and classic requests are heard and answers are FD", _formats),
+    Check(_C, "29-bit identifiers", "not taken for those with 11 bits", _extended),
+)

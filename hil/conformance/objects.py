@@ -1,0 +1,237 @@
+"""Identity, object dictionary and SDO: checks of what the node says about itself, in pre-operational."""
+
+from collections.abc import Iterator
+
+from hil.conformance.eds import Variable
+from hil.conformance.sdo_client import Outcome, upload_request
+from hil.conformance.talker import Talker
+from hil.conformance.verdict import Check, DeviationError, NotTestedError, deviate_if
+from pkxyz_ctrl.can.sdo import abort_text
+from pkxyz_ctrl.can.startup import configuration_steps, identity_steps
+
+_ABSENT_INDEX = 0x5FFF  # last of the manufacturer's area
+_NO_OBJECT, _NO_SUBINDEX = 0x06020000, 0x06090011
+_UNSUPPORTED, _READ_ONLY = 0x06010000, 0x06010002
+_LENGTH, _TOO_LONG, _TOO_SHORT = 0x06070010, 0x06070012, 0x06070013
+_RANGES = (0x06090030, 0x06090031, 0x06090032)
+_TOGGLE, _COMMAND = 0x05030000, 0x05040001
+_IN_USE = (0x08000022, 0x08000021, 0x08000020, 0x08000000, 0x06010000, 0x06010002, 0x06090030)
+# Values that follow the process or the single device, and are no defaults: error register and history, versions,
+# serial number, inputs and outputs, protection. The identity has a line of its own.
+_OWN_VALUES = (0x1000, 0x1001, 0x1003, 0x1009, 0x100A, 0x1018, 0x2000, 0x2001, 0x6401, 0x6411)
+
+
+def _answers(talker: Talker) -> str:
+    talker.reset()
+    outcome = talker.read(0x1000, 0)
+    if not outcome.ok:
+        raise DeviationError(f"0x1000:00: {outcome.text}")
+    return f"0x1000:00 reads {outcome.text}"
+
+
+def _identity(talker: Talker) -> str:
+    talker.reset()
+    deviations, told = [], []
+    for step in identity_steps(talker.driver):
+        outcome = talker.read(step.index, step.subindex)
+        told.append(f"{step.what} 0x{outcome.unsigned:08X}" if outcome.ok else f"{step.what}: {outcome.text}")
+        if not outcome.ok or (step.value is not None and outcome.unsigned != step.value):
+            deviations.append(f"{step.name}: {told[-1]}, expected 0x{step.value or 0:08X}")
+    deviate_if(deviations)
+    return ", ".join(told)
+
+
+def _objects_read(talker: Talker) -> str:
+    talker.reset()
+    readable = [variable for variable in talker.variables if variable.readable]
+    outcomes = ((variable, talker.read(variable.index, variable.subindex)) for variable in readable)
+    deviate_if([f"{variable.label}: {outcome.text}" for variable, outcome in outcomes if not outcome.ok])
+    return f"all {len(readable)} read"
+
+
+def _read_values(talker: Talker) -> Iterator[tuple[Variable, bytes]]:
+    """What can be read; what cannot has a line of its own."""
+    talker.reset()
+    for variable in talker.variables:
+        if variable.readable and (outcome := talker.read(variable.index, variable.subindex)).data is not None:
+            yield variable, outcome.data
+
+
+def _lengths(talker: Talker) -> str:
+    fixed = [(variable, data) for variable, data in _read_values(talker) if variable.length is not None]
+    wrong = [(variable, len(data)) for variable, data in fixed if len(data) != variable.length]
+    deviate_if([f"{variable.label}: {length} bytes, not {variable.length}" for variable, length in wrong])
+    return f"{len(fixed)} objects as long as their types"
+
+
+def _defaults(talker: Talker) -> str:
+    compared, deviations = 0, []
+    for variable, data in _read_values(talker):
+        plain_mapping = not talker.driver.protection and variable.is_pdo_parameter
+        if variable.default is None or variable.index in _OWN_VALUES or plain_mapping:
+            continue
+        compared += 1
+        if data.rstrip(b"\0") != variable.default.rstrip(b"\0"):
+            deviations.append(f"{variable.label} ({variable.name}): {data.hex(' ')}, EDS {variable.default.hex(' ')}")
+    deviate_if(deviations)
+    return f"{compared} values as the EDS says"
+
+
+def _read_only(talker: Talker) -> str:
+    tried, deviations = 0, []
+    for variable, data in list(_read_values(talker)):
+        if not variable.writable:
+            tried += 1
+            outcome = talker.write_bytes(variable.index, variable.subindex, data)
+            if outcome.abort not in (_READ_ONLY, _UNSUPPORTED):
+                deviations.append(f"{variable.label}: {outcome.text}")
+    deviate_if(deviations)
+    return f"{tried} writes refused"
+
+
+def _writable(talker: Talker) -> str:
+    tried, deviations = 0, []
+    for variable, data in list(_read_values(talker)):
+        drives = variable.index in (0x6411, 0x6444) and any(data) and not talker.allow_voltage
+        if variable.writable and not variable.is_pdo_parameter and not drives and 1 <= len(data) <= 4:
+            tried += 1
+            outcome = talker.write_bytes(variable.index, variable.subindex, data)
+            if not outcome.ok:
+                deviations.append(f"{variable.label}: {outcome.text}")
+    deviate_if(deviations)
+    return f"{tried} objects take the value that they have"
+
+
+def _configuration(talker: Talker) -> str:
+    talker.reset()
+    deviations, steps = [], configuration_steps(talker.driver)
+    for step in steps:
+        if step.write:
+            outcome = talker.write(step.index, step.subindex, step.value or 0, step.size)
+            if not outcome.ok:
+                deviations.append(f"{step.name} = 0x{step.value or 0:X}: {outcome.text}")
+        else:
+            outcome = talker.read(step.index, step.subindex)
+            if outcome.unsigned != step.value:
+                deviations.append(f"{step.name}: {outcome.text}, not 0x{step.value or 0:X}")
+    deviate_if(deviations)
+    return f"{len(steps)} transfers as they should be"
+
+
+def _mapping_in_use(talker: Talker) -> str:
+    talker.operational()
+    deviations = []
+    for index in (0x1601, 0x1A01):
+        outcome = talker.write(index, 0, 0, 1)
+        if outcome.abort not in _IN_USE:
+            deviations.append(f"0x{index:04X}:00 = 0: {outcome.text}")
+    deviate_if(deviations)
+    return "both refused"
+
+
+def _abort_for(talker: Talker, request: bytes, codes: tuple[int, ...]) -> str:
+    reply = talker.exchange(request)
+    if reply is None:
+        raise DeviationError("no answer")
+    code = int.from_bytes(reply[4:], "little")
+    if reply[0] != 0x80 or code not in codes:
+        raise DeviationError(f"abort {abort_text(code)}" if reply[0] == 0x80 else f"accepted: {reply.hex(' ')}")
+    return f"abort {abort_text(code)}"
+
+
+def _no_index(talker: Talker) -> str:
+    talker.reset()
+    return _abort_for(talker, upload_request(_ABSENT_INDEX, 0), (_NO_OBJECT,))
+
+
+def _no_subindex(talker: Talker) -> str:
+    talker.reset()
+    return _abort_for(talker, upload_request(0x1018, 0xF0), (_NO_SUBINDEX,))
+
+
+def _wrong_lengths(talker: Talker, change: int, codes: tuple[int, ...]) -> str:
+    talker.reset()
+    tried, deviations = 0, []
+    for variable in talker.variables:
+        length = (variable.length or 0) + change
+        if variable.writable and not variable.is_pdo_parameter and variable.length and 1 <= length <= 4:
+            tried += 1
+            outcome: Outcome = talker.write_bytes(variable.index, variable.subindex, bytes(length))
+            if outcome.abort not in codes:
+                deviations.append(f"{variable.label} with {length} bytes: {outcome.text}")
+    deviate_if(deviations)
+    return f"{tried} refused"
+
+
+def _too_long(talker: Talker) -> str:
+    return _wrong_lengths(talker, 1, (_TOO_LONG, _LENGTH))
+
+
+def _too_short(talker: Talker) -> str:
+    return _wrong_lengths(talker, -1, (_TOO_SHORT, _LENGTH))
+
+
+def _out_of_range(talker: Talker) -> str:
+    talker.reset()
+    tried, deviations = 0, []
+    for variable in talker.variables:
+        drives = variable.index in (0x6411, 0x6444) and not talker.allow_voltage
+        if not variable.writable or variable.is_pdo_parameter or drives:
+            continue
+        lowest, highest = variable.type_range
+        beyond = [variable.high + 1] if variable.high is not None and variable.high < highest else []
+        beyond += [variable.low - 1] if variable.low is not None and variable.low > lowest else []
+        for value in beyond:
+            tried += 1
+            outcome = talker.write_bytes(variable.index, variable.subindex, variable.bytes_of(value))
+            if outcome.abort not in _RANGES:
+                deviations.append(f"{variable.label} = {value}: {outcome.text}")
+    if not tried:
+        raise NotTestedError("the EDS gives no limits within the types")
+    deviate_if(deviations)
+    return f"{tried} values refused"
+
+
+def _toggle(talker: Talker) -> str:
+    talker.reset()
+    for variable in talker.variables:
+        if variable.length is None and variable.readable:
+            reply = talker.exchange(upload_request(variable.index, variable.subindex))
+            if reply is not None and reply[0] & 0xE2 == 0x40:
+                return _abort_for(talker, bytes((0x70,)) + bytes(7), (_TOGGLE,))
+    raise NotTestedError("no object is read in segments")
+
+
+def _command(talker: Talker) -> str:
+    talker.reset()
+    return _abort_for(talker, b"\xe0" + bytes(7), (_COMMAND,))
+
+
+def _client_abort(talker: Talker) -> str:
+    talker.reset()
+    reply = talker.exchange(bytes.fromhex("80 00 10 00 00 00 04 05"))
+    if reply is not None:
+        raise DeviationError(f"answered with {reply.hex(' ')}")
+    return "no answer"
+
+
+_A, _B, _C = "identity", "object dictionary", "SDO"
+ANSWERS = Check(_A, "answers", "0x1000 is read after NMT reset node", _answers)
+CHECKS = (
+    Check(_A, "identity", "device type, vendor and product of the bus configuration", _identity),
+    Check(_B, "objects exist", "every readable object of the EDS is read", _objects_read),
+    Check(_B, "object lengths", "as many bytes as the type in the EDS has", _lengths),
+    Check(_B, "default values", "after reset, what the EDS gives as default", _defaults),
+    Check(_B, "read-only objects", "ro and const objects refuse a write with 0x06010002", _read_only),
+    Check(_B, "writable objects", "rw objects take the value that they have", _writable),
+    Check(_B, "configuration", "all that our driver writes at the start is accepted and read back", _configuration),
+    Check(_B, "mapping in use", "a PDO in use refuses another mapping", _mapping_in_use),
+    Check(_C, "unknown index", "abort 0x06020000", _no_index),
+    Check(_C, "unknown sub-index", "abort 0x06090011", _no_subindex),
+    Check(_C, "too long", "a byte too many: abort 0x06070012 or 0x06070010", _too_long),
+    Check(_C, "too short", "a byte too few: abort 0x06070013 or 0x06070010", _too_short),
+    Check(_C, "out of range", "one beyond the EDS's limits: abort 0x06090030, 31 or 32", _out_of_range),
+    Check(_C, "toggle bit", "a segment with the wrong toggle bit: abort 0x05030000", _toggle),
+    Check(_C, "unknown command", "command specifier 7: abort 0x05040001", _command),
+    Check(_C, "client's abort", "not answered", _client_abort),
+)
