@@ -1,0 +1,129 @@
+"""How fast the lanes are, and where a tick of the lockstep lane goes."""
+
+import tempfile
+from functools import partial
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+
+from hil import lanes
+from hil.bench.closed_loop import scan
+from hil.bench.figure import Figure, once, repeated, times_of
+from hil.bench.played import Played, PlayedPort, drive_counts, recorded_frames
+from hil.bench.tick import ticks_from_python
+from hil.metrics import Metrics
+from hil.plant_on_bus import PlantOnBus
+from hil.recording import RecordingWriter
+from hil.run_folder import metadata_of
+from hil.scenario import Scenario, load_scenario, resolve
+from hil.setup import Setup
+
+REPEATS = 5
+
+
+def lockstep() -> list[Figure]:
+    """The default scenario in the lockstep lane, recording and frame log written, on one core; and its parts.
+
+    A part is measured alone on what a run gave it: the plant on the recorded voltages, the controller on the recorded
+    frames, the cycle on the recorded samples. Recording and log are the difference to a run without them, bus and node
+    what then remains. Each part alone has the caches for itself, so the remainder also holds what they cost each other.
+    """
+    scenario = load_scenario("raster")
+    setup = scenario.setup()
+    came, went = recorded_frames(setup)
+    counts = drive_counts(went, setup.gate.node_id)
+    cycle = ticks_from_python(scan())
+    seconds: dict[str, list[float]] = {k: [] for k in ("whole", "close", "bare", "controller", "plant", "cycle")}
+    with tempfile.TemporaryDirectory() as folder:
+        for _ in range(REPEATS):
+            whole_s, close_s = _recorded_run(scenario, setup, Path(folder))
+            seconds["whole"].append(whole_s)
+            seconds["close"].append(close_s)
+            seconds["bare"].append(once(partial(lanes.run, setup, "lockstep", on_block=_forget)))
+            played = Played(setup, PlayedPort(came))
+            seconds["controller"].append(once(played.run))
+            if not np.array_equal(drive_counts(played.port.sent, setup.gate.node_id)[: len(counts)], counts):
+                raise RuntimeError("the controller alone sent other voltages than in the run: not the same work")
+            plant = PlantOnBus(setup.new_plant())
+            seconds["plant"].append(once(partial(_plant_alone, plant, counts.tolist(), setup.bus.period_us)))
+            seconds["cycle"].append(once(cycle))
+    ticks = setup.ticks
+    per_tick = {
+        k: times_of(s).per(len(scan().rows) if k == "cycle" else len(counts) if k == "plant" else ticks)[0]
+        for k, s in seconds.items()
+    }
+    whole, tick_us = times_of(seconds["whole"]), per_tick["whole"]
+    shares = {
+        "bus_and_node": per_tick["bare"] - per_tick["plant"] - per_tick["controller"],
+        "driver_and_gate": per_tick["controller"] - per_tick["cycle"],
+        "cycle": per_tick["cycle"],
+        "plant": per_tick["plant"],
+        "recording_and_log": tick_us - per_tick["bare"],
+    }
+    words = {
+        "bus_and_node": "clock, wire, amplifier node, row: the remainder",
+        "driver_and_gate": "the loop itself, driver, gate, supervision",
+        "cycle": "the tick, as tick.call",
+        "plant": "a period of motion, combs, sense chain with its noise",
+        "recording_and_log": "rows to Arrow, frames to candump lines, figures",
+    }
+    return [
+        Figure("lockstep.realtime", _factor(setup, whole.best_s), "times", 8.0, "at least",
+               _factor(setup, whole.median_s),
+               f"{setup.bus.name}, start-up, recording, frame log and figures included; closing the files takes "
+               f"{min(seconds['close']) * 1e3:.0f} ms more"),
+        Figure("lockstep.tick", tick_us, "us", None, None, whole.per(ticks)[1], "the sum of the following"),
+        *(Figure(f"lockstep.{part}", part_us, "us", None, None, None, f"{part_us / tick_us:.0%}: {words[part]}")
+          for part, part_us in shares.items()),
+    ]  # fmt: skip
+
+
+def fast() -> list[Figure]:
+    """The default scenario in the fast lane: as a study runs it, without a file, and as `pkxyz sil` does, recorded."""
+    scenario = load_scenario("raster")
+    setup = scenario.setup()
+    run = partial(lanes.run, setup, "fast", on_block=_forget)
+    run()
+    bare = repeated({"fast": run}, 15)["fast"]
+    best, median = bare.per(setup.ticks)
+    with tempfile.TemporaryDirectory() as folder:
+        recorded = times_of([_recorded_run(scenario, setup, Path(folder), "fast")[0] for _ in range(REPEATS)])
+    return [
+        Figure("fast.realtime", _factor(setup, bare.best_s), "times", 50.0, "at least", _factor(setup, bare.median_s),
+               "aim 100; trajectory, cycle and plant, rows handed on"),
+        Figure("fast.realtime_recorded", _factor(setup, recorded.best_s), "times", None, None,
+               _factor(setup, recorded.median_s), "with the recording and the figures of the run"),
+        Figure("fast.tick", best, "us", None, None, median, "tick.kernel and plant.period make most of it"),
+    ]  # fmt: skip
+
+
+def _factor(setup: Setup, seconds: float) -> float:
+    return setup.ticks * setup.bus.period_s / seconds
+
+
+def _recorded_run(scenario: Scenario, setup: Setup, folder: Path, lane: str = "lockstep") -> tuple[float, float]:
+    """Processor time in s of one run as `pkxyz sil` does it, and of closing its recording."""
+    metrics = Metrics(setup.trajectory, setup.bus.period_us)
+    recording = RecordingWriter(folder / "recording.parquet", metadata_of(scenario, lane, resolve(scenario)))
+
+    def on_block(block: NDArray[np.void]) -> None:
+        recording.write(block)
+        metrics.update(block)
+
+    try:
+        run_s = once(partial(lanes.run, setup, lane, on_block=on_block, frame_log=folder / "frames.log"))
+    finally:
+        close_s = once(recording.close)
+    return run_s, close_s
+
+
+def _plant_alone(plant: PlantOnBus, counts: list[list[int]], period_us: int) -> None:
+    for k, row in enumerate(counts):
+        plant.advance_to(period_us * k)
+        plant.drive(row)
+        plant.sample()
+
+
+def _forget(block: NDArray[np.void]) -> None:
+    pass

@@ -1,0 +1,55 @@
+"""From Enter to the picture: `pkxyz sil` as a user meets it, in a new process."""
+
+import re
+import statistics
+import subprocess
+import sys
+import tempfile
+import time
+from collections import Counter
+from pathlib import Path
+
+from hil.bench.figure import Figure
+from hil.run_folder import PICTURE
+
+REPEATS = 3
+_COMMAND = "from hil.cli import main; main()"
+_LINE = re.compile(r"^import time:\s+(\d+) \|\s+\d+ \|\s+([\w.]+)$", re.MULTILINE)
+_SHOWN = 8
+
+
+def sil() -> list[Figure]:
+    """The default scenario as a command, kernels compiled already: wall time, and how much of it goes into imports."""
+    with tempfile.TemporaryDirectory() as folder:
+        _run(Path(folder) / "warm")  # compiles what is not compiled yet, and fills the file cache
+        seconds = []
+        for k in range(REPEATS):
+            begin = time.perf_counter()
+            _run(Path(folder) / f"run-{k}")
+            seconds.append(time.perf_counter() - begin)
+        by_package = _import_seconds(_run(Path(folder) / "imports", "-X", "importtime"))
+    most = ", ".join(f"{package} {s:.2f}" for package, s in by_package.most_common(_SHOWN))
+    return [
+        Figure("sil.wall", min(seconds), "s", 5.0, "at most", statistics.median(seconds),
+               f"`pkxyz sil`, new process, from Enter to the picture; {REPEATS} runs of the machine's clock"),
+        Figure("sil.imports", by_package.total(), "s", None, None, None, f"of that; by package: {most}"),
+    ]  # fmt: skip
+
+
+def _run(folder: Path, *flags: str) -> str:
+    """Run the command into ``folder``; returns what it wrote to its standard error."""
+    command = [sys.executable, *flags, "-c", _COMMAND, "sil", "--out", str(folder), "--json"]
+    done = subprocess.run(command, capture_output=True, text=True, check=False)
+    if not (folder / PICTURE).is_file():
+        raise RuntimeError(f"pkxyz sil left no picture (exit code {done.returncode}): {done.stderr[-2000:]}")
+    return done.stderr
+
+
+def _import_seconds(report: str) -> Counter[str]:
+    """Seconds of each top-level package's own modules, from the output of ``-X importtime``."""
+    seconds: Counter[str] = Counter()
+    for own_us, module in _LINE.findall(report):
+        package = module.partition(".")[0]
+        name = "standard library" if package in sys.stdlib_module_names else package
+        seconds[name] += int(own_us) * 1e-6  # type: ignore[assignment]
+    return seconds
