@@ -12,7 +12,7 @@ import typer
 from rich.console import Console
 from rich.table import Table
 
-from hil import check_amplifier_cli, mechanics_cli, run_cli
+from hil import bench_cli, check_amplifier_cli, mechanics_cli, run_cli
 from pkxyz_ctrl.config import CONFIG_DIR, ConfigError, names
 
 app = typer.Typer(
@@ -137,6 +137,7 @@ app.command("workspace")(mechanics_cli.workspace)
 app.command("design")(mechanics_cli.design)
 app.command("linearisation")(mechanics_cli.linearisation)
 app.command("check-amplifier")(check_amplifier_cli.check_amplifier)
+app.command("bench")(bench_cli.bench)
 
 
 def _run_with_progress(folder: Any, scenario: Any, lane: str, *, quiet: bool) -> dict[str, Any]:
