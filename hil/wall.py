@@ -107,11 +107,12 @@ class WallRig:
         self.controller = Controller(law, setup.bus, wall_gate(setup.gate), self.port.send)
         for name, *_ in TRUTH_FIELDS:
             self.controller.memory["row"][name] = np.nan  # nobody here knows it
+        self._guard_us = setup.bus.period_us // _GUARDS_PER_PERIOD
         self.ticks = TickClock(
             self.clock,
             setup.bus.period_us,
             latest_start_us=can_config.sense_deadline_us // 2,
-            guard_us=setup.bus.period_us // _GUARDS_PER_PERIOD,
+            guard_us=self._guard_us,
             late_frames=self._take_late_frames,
             leave=ending.check,
         )
@@ -128,6 +129,7 @@ class WallRig:
         """0 V, pre-operational, and off the bus."""
         try:
             if self._started:
+                self.clock.wait_until(self.clock.now_us + self._guard_us)  # or the gate calls it a babbling node
                 self.controller.stop(self.clock.now_us)
                 time.sleep(_LAST_FRAMES_S)
         finally:

@@ -5,6 +5,7 @@ nothing comes, alarms (heartbeats, their supervision) ring by the machine's cloc
 discrete-event clock of lockstep, pulled along.
 """
 
+import struct
 from collections.abc import Callable
 from pathlib import Path
 
@@ -23,9 +24,10 @@ from pkxyz_ctrl.io.clocks import WallClock
 from pkxyz_ctrl.row import TRUTH_FIELDS
 from sim.plant import Plant
 
-TRUTH = np.dtype([("t_us", "i8"), *TRUTH_FIELDS])
-"""A row of the truth: time of the sample since the process began, position, strokes and voltages at it."""
+TRUTH = np.dtype([("t_us", "i8"), *TRUTH_FIELDS, ("sense_count", "i4", (3,))])
+"""A row of the truth: time of the sample since the process began, position, strokes and voltages at it, counts sent."""
 
+_TRUTH_ROW = struct.Struct(f"<q{TRUTH_BYTES}s3i")
 _IDLE_US = 20_000  # between looks at whether to end
 _IN_FLIGHT_US = 2_000  # a frame may still come that is so much older than now
 
@@ -35,17 +37,17 @@ class WitnessedPlant(PlantOnBus):
 
     def __init__(self, plant: Plant, out: Path) -> None:
         super().__init__(plant)
-        self._file = out.open("wb")
-        self._truth = self.exchange.view(np.uint8).data[:TRUTH_BYTES]
+        self._file = out.open("wb", buffering=0)  # readable while it grows, and whole whatever ends the process
+        self._exchange_bytes = self.exchange.view(np.uint8).data
 
     def sample(self) -> tuple[int, int, int]:
         """Sample the sense combs now, and write down what is true."""
         counts = super().sample()
-        self._file.write(self._now_us.to_bytes(8, "little", signed=True) + self._truth)
+        self._file.write(_TRUTH_ROW.pack(self._now_us, bytes(self._exchange_bytes[:TRUTH_BYTES]), *counts))
         return counts
 
     def close(self) -> None:
-        """Write the rest."""
+        """No more truth."""
         self._file.close()
 
 
@@ -76,6 +78,7 @@ class WallPlant:
         """Serve until ``leave``, called at least every 20 ms, raises."""
         clock, wall, port, node = self.clock, self.wall, self._port, self.node
         node.power_on()
+        moved_us = 0
         while True:
             leave()
             due_us = clock.next_event_us()
@@ -85,19 +88,21 @@ class WallPlant:
                 t_us = max(clock.now_us, min(port.last_us, wall.now_us))
                 clock.run_until(t_us)
                 node.on_frame(frame, t_us)
-            elif due_us is not None and due_us <= wall.now_us:
+                self._show()
+                continue
+            if due_us is not None and due_us <= wall.now_us:
                 clock.run_until(due_us)
-            else:
+            if wall.now_us > moved_us + _IDLE_US:
+                moved_us = wall.now_us
                 self._move_on()
             self._show()
 
     def _move_on(self) -> None:
-        """Nothing has come for a while: keep the plant from falling behind."""
-        t_us = self.wall.now_us - _IN_FLIGHT_US
-        if t_us > self.clock.now_us:
-            self.clock.run_until(t_us)
-            self.plant.advance_to(t_us)
-            self.plant.settle()
+        """Where no SYNC comes, keep the plant from falling behind: it would have to catch up at the next."""
+        t_us = max(self.clock.now_us, self.wall.now_us - _IN_FLIGHT_US)
+        self.clock.run_until(t_us)
+        self.plant.advance_to(t_us)
+        self.plant.settle()
 
     def _show(self) -> None:
         shown = (self.node.state, any(self.node.outputs))

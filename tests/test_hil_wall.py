@@ -1,0 +1,266 @@
+"""Two processes and the machine's clock: controller and plant meet on Unix sockets, and one of them is ended.
+
+What the machine does in between is not known here, so nothing is asserted about its punctuality: motion is compared
+where no tick was missed, times are those of the frames.
+"""
+
+import json
+import os
+import re
+import signal
+import subprocess
+import sys
+import time
+from contextlib import contextmanager
+from pathlib import Path
+
+import can
+import numpy as np
+import pytest
+
+from hil import lanes, run_cli
+from hil.recording import Recording
+from hil.scenario import load_scenario
+from hil.unix_bus import UnixBus
+from hil.wall_plant import TRUTH
+from pkxyz_ctrl.config import CONFIG_DIR, ConfigError
+from pkxyz_ctrl.safety.modes import Mode
+
+ROOT = Path(__file__).parent.parent
+PERIOD_US = 1000
+NODE_TIMEOUT_US, HEARTBEAT_US = 50_000, 20_000
+EMCY, SDO_REPLY, SDO_REQUEST = 0x08A, 0x58A, 0x60A
+SCENARIO = """
+name = "to_and_fro"
+duration_s = 1.8
+seed = 3
+stage = "reconstructed"
+plant = "nominal"
+controller = "patient.toml"
+bus = "{bus}"
+[[reference]]
+kind = "hold"
+duration_s = 0.02
+measured = false
+[[reference]]
+kind = "move"
+to_m = [0.0, 0.0, 19.2495e-6]
+velocity_max_m_per_s = 0.1e-3
+acceleration_max_m_per_s2 = 0.02
+jerk_max_m_per_s3 = 5.0
+[[reference]]
+kind = "move"
+to_m = [3.0e-6, -2.0e-6, 19.2495e-6]
+velocity_max_m_per_s = 0.02e-3
+acceleration_max_m_per_s2 = 0.005
+jerk_max_m_per_s3 = 1.0
+"""
+
+
+@pytest.fixture(scope="module")
+def bench(tmp_path_factory):
+    """A folder with a scenario, a controller that forgives missed ticks, and a patient and an impatient bus."""
+    folder = tmp_path_factory.mktemp("wall")
+    law = (CONFIG_DIR / "controllers" / "lqg.toml").read_text(encoding="utf-8")
+    for name in ("stale", "sequence", "innovation", "saturation", "overrun", "slew"):
+        law, found = re.subn(rf"^{name}_count = \d+", f"{name}_count = -1", law, flags=re.MULTILINE)
+        assert found == 1
+    (folder / "patient.toml").write_text(law, encoding="utf-8")
+    bus = (CONFIG_DIR / "buses" / "unix_1k.toml").read_text(encoding="utf-8")
+    bus, found = re.subn(r'channel = "pkxyz"', f'channel = "{folder}/bus"', bus)
+    assert found == 1
+    bus += "node_heartbeat_timeout_ms = 900\n"
+    (folder / "quick.toml").write_text(bus, encoding="utf-8")
+    (folder / "slow.toml").write_text(bus + "controller_heartbeat_timeout_ms = 900\n", encoding="utf-8")
+    for name in ("quick", "slow"):
+        (folder / f"on_{name}.toml").write_text(SCENARIO.format(bus=f"{name}.toml"), encoding="utf-8")
+    return folder
+
+
+def started(folder, *words, stdout=subprocess.PIPE):
+    return subprocess.Popen(
+        [sys.executable, "-m", "hil.cli", *map(str, words)], cwd=folder, text=True,
+        env={**os.environ, "PYTHONPATH": str(ROOT)}, stdout=stdout, stderr=subprocess.PIPE,
+    )  # fmt: skip
+
+
+@pytest.fixture(scope="module")
+def changes(bench):
+    """Serves node and plant in a process; gives a function that waits for a state and returns all changes so far."""
+    words = ("plant", "on_slow.toml", "--bus", "slow.toml", "--truth", "truth.bin", "--json")
+    with (bench / "changes").open("wb") as out:
+        process = started(bench, *words, stdout=out)
+
+    def seen(state, driven):
+        end_s = time.monotonic() + 60
+        while True:
+            lines = [json.loads(line) for line in (bench / "changes").read_text(encoding="utf-8").splitlines()]
+            if lines and (lines[-1]["state"], lines[-1]["driven"]) == (state, driven):
+                return lines
+            assert time.monotonic() < end_s, f"the node is not {state}, driven {driven}: {lines}"
+            time.sleep(0.02)
+
+    yield seen
+    process.terminate()
+    _, err = process.communicate(timeout=60)
+    assert process.returncode == 0, err
+
+
+@contextmanager
+def controller(folder, *words):
+    """A controller in its process, which does not outlive the test."""
+    process = started(folder, "run", *words)
+    try:
+        yield process
+    finally:
+        if process.poll() is None:
+            process.kill()
+            process.communicate()
+
+
+def until_driven(bus):
+    """Wait until the observer on the bus has seen voltages for some ticks."""
+    end_s, driven = time.monotonic() + 60, 0
+    while driven < 200:
+        assert time.monotonic() < end_s, "no voltages came"
+        message = bus.recv(0.1)
+        driven += message is not None and message.arbitration_id == 0x30A and any(message.data[:6])
+
+
+def truth_of(folder, rows):
+    """The true positions (n, 3) that belong to rows of a recording, NaN where the sense frame did not come."""
+    truth = np.fromfile(folder / "truth.bin", TRUTH)
+    place = {}
+    for index, counts in enumerate(truth["sense_count"].tolist()):
+        place.setdefault(tuple(counts), []).append(index)
+    positions, last = np.full((len(rows), 3), np.nan), -1
+    for row, (counts, status) in enumerate(rows):
+        after = [index for index in place.get(tuple(counts), ()) if index > last] if status == 0 else []
+        if after:
+            last = after[0]
+            positions[row] = truth["position_m"][last]
+    return positions
+
+
+def test_trajectories_agree_with_lockstep_within_the_noise(bench, changes):
+    """Ticks 30 periods after any that was missed are compared: the stage's swing has died away by then.
+
+    Same plant, same seed. The samples' noise is drawn in order, so it is the same only until the first missed tick:
+    two independent draws differ by sqrt(2) times the noise of one, and a millisecond's jitter of 5 us at 20 um/s is
+    0.1 nm.
+    """
+    changes("pre-operational", False)
+    with controller(bench, "on_slow.toml", "--bus", "slow.toml", "--out", "agree", "--json") as run:
+        out, err = run.communicate(timeout=120)
+        assert run.returncode == 0, err
+    summary = json.loads(out)
+    assert summary["faults"] == []
+    assert "real time: " in err
+    recording = Recording.open(bench / "agree" / "recording.parquet")
+    status, overrun = recording["sense_status"], recording["overrun"]
+    position = truth_of(bench, list(zip(recording.vector("sense_count").tolist(), status, strict=True)))
+    assert summary["missed_ticks"] == overrun.sum() + (status & 1).sum()
+    assert recording.ticks == 1800
+
+    blocks = []
+    setup = load_scenario(bench / "on_slow.toml").setup()
+    lanes.run(setup, "lockstep", on_block=lambda block: blocks.append(block.copy()))
+    exact = np.concatenate(blocks)
+    exact = exact[exact["mode"] == Mode.TRACKING]
+
+    disturbed = np.convolve((overrun > 0) | (status != 0), np.ones(30))[: recording.ticks] > 0
+    tick = recording["reference_tick"]
+    usable = (tick >= 0) & (tick < len(exact)) & ~disturbed & ~np.isnan(position[:, 0])
+    assert usable.sum() > 300
+    difference_nm = 1e9 * (position[usable] - exact["position_m"][tick[usable]])
+    moving = tick[usable] > 500
+    noise_nm = 1e9 * (exact["position_m"] - exact["reference_m"])[-300:].std(axis=0)
+    assert (np.median(np.abs(difference_nm[moving]), axis=0) < 2 * noise_nm + 0.5).all()
+    assert (np.abs(difference_nm.mean(axis=0)) < 3 * noise_nm).all()
+    assert np.ptp(position[usable], axis=0).max() > 15e-6
+
+
+def test_killed_controller_leaves_0_v_within_the_heartbeat_time(bench, changes):
+    changes("pre-operational", False)
+    words = ("on_quick.toml", "--bus", "quick.toml", "--out", "killed", "--seconds", "60")
+    with controller(bench, *words) as run, UnixBus(f"{bench}/bus") as observer:
+        until_driven(observer)
+        os.kill(run.pid, signal.SIGKILL)
+        killed_s = time.time()
+        run.communicate(timeout=30)
+        emergency = next_with(observer, EMCY)
+        assert emergency.data[:2] == b"\x30\x81"  # 0x8130, life guard or heartbeat error (CiA 301, table 26)
+        assert emergency.timestamp - killed_s < 1.0
+        for comb in (1, 2, 3):
+            request = bytes((0x40, 0x11, 0x64, comb, 0, 0, 0, 0))
+            observer.send(can.Message(arbitration_id=SDO_REQUEST, data=request, is_extended_id=False))
+            reply = next_with(observer, SDO_REPLY)
+            assert reply.data[1:4] == bytes((0x11, 0x64, comb))
+            assert int.from_bytes(reply.data[4:6], "little") == 0
+    lines = changes("pre-operational", False)
+    assert lines[-2]["driven"]
+    last_us = int(np.fromfile(bench / "truth.bin", TRUTH)["t_us"][-1])
+    waited_us = 1e6 * lines[-1]["t_s"] - last_us
+    assert NODE_TIMEOUT_US - HEARTBEAT_US - 5 * PERIOD_US < waited_us <= NODE_TIMEOUT_US + PERIOD_US
+    for _ in range(100):  # the writer outlives the controller and closes the recording
+        if (bench / "killed" / "recording.parquet").is_file():
+            break
+        time.sleep(0.1)
+    killed = Recording.open(bench / "killed" / "recording.parquet")
+    assert killed.ticks > 200
+    assert (np.diff(killed["tick"]) == 1).all()
+
+
+def next_with(bus, can_id):
+    end_s = time.monotonic() + 10
+    while time.monotonic() < end_s:
+        message = bus.recv(0.1)
+        if message is not None and message.arbitration_id == can_id:
+            return message
+    raise AssertionError(f"no frame 0x{can_id:03X} came")
+
+
+def test_a_stopped_controller_goes_on_and_sigterm_ends_it_at_0_v(bench, changes):
+    """Asleep for 40 ms: missed ticks are skipped whole and counted, and with its monitor off the run goes on."""
+    changes("pre-operational", False)
+    words = ("on_slow.toml", "--bus", "slow.toml", "--out", "ended", "--seconds", "60")
+    with controller(bench, *words) as run:
+        with UnixBus(f"{bench}/bus") as observer:
+            until_driven(observer)
+            os.kill(run.pid, signal.SIGSTOP)
+            time.sleep(0.04)
+            os.kill(run.pid, signal.SIGCONT)
+            until_driven(observer)
+        run.send_signal(signal.SIGTERM)
+        out, err = run.communicate(timeout=60)
+        assert run.returncode == 128 + signal.SIGTERM, err
+    assert "ended from outside" in out
+    assert changes("pre-operational", False)[-2]["driven"]
+    ended = Recording.open(bench / "ended" / "recording.parquet")
+    overrun = ended["overrun"]
+    at = int(np.argmax(overrun))
+    assert overrun[at] >= 35
+    assert (ended["mode"][at:] >= Mode.ENABLED).all()
+    assert (ended["mode"][at:] != Mode.FAULT).all()
+    assert ended.ticks - at > 100
+    summary = json.loads((bench / "ended" / "summary.json").read_text(encoding="utf-8"))
+    assert summary["interrupted"]
+    assert summary["faults"] == []
+    assert (bench / "ended" / "report.png").stat().st_size > 10_000
+    log = list(can.LogReader(bench / "ended" / "frames.log"))
+    drives = [message for message in log if message.arbitration_id == 0x30A]
+    assert not any(drives[-1].data[:6])
+    assert log[-1].arbitration_id in (0x000, 0x70A)
+
+
+def test_bad_input_is_refused_with_one_line(bench, monkeypatch):
+    monkeypatch.chdir(bench)
+    for command, words, expected in (
+        (run_cli.run, {"bus": "fd_5k"}, "is simulated"),
+        (run_cli.plant, {"bus": "local_20k"}, "has no \\[can\\]"),
+        (run_cli.run, {"duration_s": -1.0}, "--seconds: -1"),
+        (run_cli.plant, {"bus": "unix_9k"}, "did you mean"),
+    ):
+        with pytest.raises(ConfigError, match=expected):
+            command(**words)
+    assert not (bench / "runs").exists()
