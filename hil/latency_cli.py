@@ -1,0 +1,73 @@
+"""``pkxyz latency``: how late this machine wakes the loop, and how long a cycle takes."""
+
+import json
+from pathlib import Path
+from typing import Annotated, Any
+
+import typer
+
+
+def latency(
+    period_us: Annotated[int, typer.Option(help="Period of the loop in microseconds.")] = 200,
+    seconds: Annotated[float, typer.Option(help="How long to measure.")] = 5.0,
+    out: Annotated[Path | None, typer.Option(help="PNG of the histograms to write.")] = None,
+    cyclictest: Annotated[str | None, typer.Option(help="Its path, where it is not in PATH.")] = None,
+    as_json: Annotated[bool, typer.Option("--json", help="Print JSON with the histograms, and nothing else.")] = False,
+) -> None:
+    """Run the controller at rate without a bus and show its lateness, beside cyclictest's if that is installed."""
+    from hil.latency import measure
+
+    measured = measure(period_us, seconds, cyclictest)
+    figures = measured.figures()
+    if out is not None:
+        _draw(measured, out)
+    if as_json:
+        histograms = {"lateness_us": measured.lateness_us, "cycle_us": measured.cycle_us}
+        if measured.cyclictest_us is not None:
+            histograms["cyclictest_us"] = measured.cyclictest_us
+        counts = {name: {str(us): n for us, n in enumerate(h) if n} for name, h in histograms.items()}
+        print(json.dumps(figures | {"histograms": counts}))
+    else:
+        _show(figures, out)
+    raise typer.Exit(128 + measured.ended_by if measured.ended_by else 0)
+
+
+def _show(figures: dict[str, Any], out: Path | None) -> None:
+    print(figures["real_time"])
+    print(f"{figures['ticks']} ticks of {figures['period_us']} us, {figures['missed_ticks']} missed")
+    print(f"{'us':30}{'p50':>8}{'p99':>8}{'p99.9':>8}{'max':>8}")
+    for name, words in (
+        ("lateness_us", "loop awake after the instant"),
+        ("cycle_us", "cycle, from awake to recorded"),
+        ("cyclictest_us", "cyclictest, a thread in C"),
+    ):
+        found = figures[name]
+        numbers = "".join(f"{v:8}" for v in found.values()) if found else "   not installed (package rt-tests)"
+        print(f"{words:30}{numbers}")
+    if figures["cyclictest_us"]:
+        ours, theirs = figures["lateness_us"]["p99_9"], figures["cyclictest_us"]["p99_9"]
+        print(f"p99.9 is {ours / max(theirs, 1):.2f} times cyclictest's")
+    if out is not None:
+        print(f"histograms are in {out}")
+
+
+def _draw(measured: Any, out: Path) -> None:
+    from matplotlib.backends.backend_agg import FigureCanvasAgg
+    from matplotlib.figure import Figure
+
+    from hil.wall_figure import draw_lateness
+    from pkxyz_ctrl.config import ConfigError
+
+    figure = Figure(figsize=(11, 5), dpi=120, facecolor="white", layout="constrained")
+    FigureCanvasAgg(figure)
+    histograms = {"wake-up of the loop": measured.lateness_us, "cycle": measured.cycle_us}
+    if measured.cyclictest_us is not None:
+        histograms["cyclictest at the same time"] = measured.cyclictest_us
+    plot = figure.subplots()
+    draw_lateness(plot, histograms)
+    plot.set_xlabel("1 + time  (µs)")
+    plot.set_title(f"{measured.ticks} ticks of {measured.period_us} µs, {measured.missed_ticks} missed")
+    try:
+        figure.savefig(out)
+    except (OSError, ValueError) as error:
+        raise ConfigError(f"--out: {out}: {error}") from None
