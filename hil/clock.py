@@ -1,6 +1,6 @@
 """The owner of time in lockstep: integer microseconds that move only when the scheduler moves them."""
 
-from collections.abc import Callable
+from collections.abc import Callable, Sized
 from heapq import heappop, heappush
 
 
@@ -50,6 +50,32 @@ class Lockstep:
                 self.now_us, _, fn = heappop(heap)
                 fn()
             self.now_us = t_us
+        finally:
+            self.running = False
+
+    def wait_until(self, t_us: int) -> None:
+        """Let events happen until it is ``t_us``; return at once if that is past."""
+        if t_us >= self.now_us:
+            self.run_until(t_us)
+
+    def spend(self, compute_us: int) -> None:
+        """Let ``compute_us`` pass: computing costs what one says that it costs."""
+        self.run_until(self.now_us + compute_us)
+
+    def run_while_empty(self, queue: Sized, t_us: int) -> None:
+        """Run events one by one until ``queue`` holds something or it is ``t_us``; an earlier ``t_us`` is now."""
+        if self.running:
+            raise ClockReentryError(f"asked to wait until {t_us} us from inside the event at {self.now_us} us")
+        heap = self._heap
+        self.running = True
+        try:
+            while not queue:
+                if heap and heap[0][0] <= t_us:
+                    self.now_us, _, fn = heappop(heap)
+                    fn()
+                else:
+                    self.now_us = max(self.now_us, t_us)
+                    break
         finally:
             self.running = False
 

@@ -101,7 +101,13 @@ class Endpoint:
                 wire._refuse(frame)
         if self.transmit_errors >= 128 or self.receive_errors >= 128:
             flags |= ERROR_PASSIVE
-        duration_ns = duration_ns_kernel(can_id, data, flags, wire.nominal_bitrate, wire._fast_bitrate)
+        # SYNC and heartbeats recur; process data hardly ever does
+        recurring = (can_id, data, flags) if len(data) < 3 else None
+        duration_ns = wire._durations_ns.get(recurring)
+        if duration_ns is None:
+            duration_ns = duration_ns_kernel(can_id, data, flags, wire.nominal_bitrate, wire._fast_bitrate)
+            if recurring is not None and len(wire._durations_ns) < 4096:
+                wire._durations_ns[recurring] = duration_ns
         if duration_ns < 0 or (is_fd and wire.data_bitrate is None):
             wire._refuse(frame)
         to_send = self._to_send
@@ -117,6 +123,13 @@ class Endpoint:
     def receive_nowait(self) -> tuple[Frame, int] | None:
         """The oldest received frame and its time in us, None if there is none. For endpoints without ``on_frame``."""
         return self._received.popleft() if self._received else None
+
+    def receive(self, deadline_us: int) -> Frame | None:
+        """The oldest received frame; time passes until there is one, or until ``deadline_us``, and then it is None."""
+        received = self._received
+        if not received and self._wire is not None:
+            self._wire.clock.run_while_empty(received, deadline_us)
+        return received.popleft()[0] if received else None
 
     def pending(self) -> int:
         """Number of frames queued and not yet sent, the one on the wire included."""

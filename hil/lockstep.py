@@ -18,50 +18,19 @@ from hil.setup import Setup
 from hil.truth import TRUTH_BYTES
 from hil.wire import Wire
 from pkxyz_ctrl.bus_config import CanConfig
-from pkxyz_ctrl.can.frame import Frame
 from pkxyz_ctrl.config import CONFIG_DIR, ConfigError
 from pkxyz_ctrl.controller import Controller
 from pkxyz_ctrl.row import ROW
 from pkxyz_ctrl.runtime import Port, run, start
 
 
-class SimulatedTime:
-    """``runtime.Clock`` of a simulation: waiting lets events happen, computing costs what the bus file says it costs."""
-
-    def __init__(self, clock: Lockstep) -> None:
-        self._clock = clock
-        self.wait_until = clock.run_until
-
-    @property
-    def now_us(self) -> int:
-        """Simulated time."""
-        return self._clock.now_us
-
-    def spend(self, compute_us: int) -> None:
-        """Let ``compute_us`` pass."""
-        self._clock.run_until(self._clock.now_us + compute_us)
-
-
 class WirePort:
     """``runtime.Port`` on the simulated wire, without the cost of python-can's messages."""
 
-    def __init__(self, clock: Lockstep, endpoint: Endpoint) -> None:
-        self._clock = clock
+    def __init__(self, endpoint: Endpoint) -> None:
         self.send = endpoint.send
-        self._receive_nowait = endpoint.receive_nowait
+        self.receive = endpoint.receive
         self.unsent = endpoint.pending
-
-    def receive(self, deadline_us: int) -> Frame | None:
-        """The next frame; time passes until it is there, or until ``deadline_us``."""
-        clock = self._clock
-        while (received := self._receive_nowait()) is None:
-            next_us = clock.next_event_us()
-            if next_us is None or next_us > deadline_us:
-                if clock.now_us < deadline_us:
-                    clock.run_until(deadline_us)
-                return None
-            clock.run_until(next_us)
-        return received[0]
 
 
 class LockstepRig:
@@ -69,7 +38,9 @@ class LockstepRig:
 
     def __init__(self, setup: Setup, frame_log: Path | None = None) -> None:
         if setup.bus.can is None:
-            raise ConfigError(f"bus {setup.bus.name!r} has no [can]: the lockstep lane is all about frames; use the fast lane")
+            raise ConfigError(
+                f"bus {setup.bus.name!r} has no [can]: the lockstep lane is all about frames; use the fast lane"
+            )
         can: CanConfig = setup.bus.can
         self.setup = setup
         self.clock = Lockstep()
@@ -81,21 +52,20 @@ class LockstepRig:
             turnaround_us=can.turnaround_us, fd=can.driver.fd, protection=can.driver.protection,
         )  # fmt: skip
         amplifier.on_frame = self.node.on_frame
-        self.port: Port = WirePort(self.clock, self.wire.attach("controller"))
+        self.port: Port = WirePort(self.wire.attach("controller"))
         self.controller = Controller(setup.law, setup.bus, setup.gate, self.port.send)
         self.log = FrameLog(frame_log, can.channel) if frame_log is not None else None
         if self.log is not None:
             self.log.attach(self.wire)
 
     def run(self, blocks: Blocks) -> tuple[int, float]:
-        """Start the amplifier and run all ticks; returns how many were missed, and the bus load since the first of them."""
-        time = SimulatedTime(self.clock)
+        """Start the amplifier and run all ticks; returns how many were missed, and the bus load since the first."""
         self.node.power_on()
-        start(time, self.port, self.controller)
+        start(self.clock, self.port, self.controller)
         before = self.wire.statistics()
         reference, record = _exchange_in_blocks(self, blocks)
         try:
-            missed = run(time, self.port, self.controller, reference, blocks.ticks, record)
+            missed = run(self.clock, self.port, self.controller, reference, blocks.ticks, record)
         finally:
             record.finish()
             if self.log is not None:
@@ -108,9 +78,9 @@ class _Recorder:
 
     def __init__(self, rig: LockstepRig, blocks: Blocks) -> None:
         self._blocks = blocks
-        self._rows = memoryview(blocks.rows.view(np.uint8))
+        self._rows = blocks.rows.view(np.uint8).data
         self._row = rig.controller.row[: ROW.itemsize - TRUTH_BYTES]
-        self._truth = memoryview(rig.plant.exchange.view(np.uint8))[:TRUTH_BYTES]
+        self._truth = rig.plant.exchange.view(np.uint8).data[:TRUTH_BYTES]
         self._used = 0
 
     def __call__(self, tick: int) -> None:
@@ -143,6 +113,6 @@ class _Reference:
 
 
 def _exchange_in_blocks(rig: LockstepRig, blocks: Blocks) -> tuple[_Reference, _Recorder]:
-    assert EXCHANGE.fields is not None and EXCHANGE.fields["position_m"][1] == 0  # the truth leads the exchange ...
-    assert ROW.fields is not None and ROW.fields["position_m"][1] == ROW.itemsize - TRUTH_BYTES  # ... and ends the row
+    leads, ends = (dict(d.fields or {})["position_m"][1] for d in (EXCHANGE, ROW))
+    assert (leads, ends) == (0, ROW.itemsize - TRUTH_BYTES), "the truth leads the exchange and ends the row"
     return _Reference(rig, blocks), _Recorder(rig, blocks)

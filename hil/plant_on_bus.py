@@ -4,6 +4,7 @@ from collections.abc import Sequence
 
 import numpy as np
 from numba import njit
+from numpy.typing import NDArray
 
 from hil.truth import observe
 from pkxyz_ctrl.row import TRUTH_FIELDS
@@ -23,7 +24,7 @@ EXCHANGE = np.dtype(
 
 
 @njit(cache=True)
-def _exchange(params, state, exchange) -> None:
+def _exchange(params: NDArray[np.void], state: NDArray[np.void], exchange: NDArray[np.void]) -> None:
     """What a SYNC means to the plant: move on to now, take new voltages if there are any, be sampled."""
     x = exchange[0]
     kernels.advance(params, state, x["advance_us"])
@@ -35,10 +36,11 @@ def _exchange(params, state, exchange) -> None:
 
 
 class PlantOnBus:
-    """A plant whose time 0 is the first sample: until then it stands in equilibrium at 0 V, however long the start-up takes.
+    """A plant whose time 0 is the first sample: until then it stands in equilibrium at 0 V, however long the start-up
+    takes.
 
-    ``advance_to`` and ``drive`` wait for what follows, so that the SYNC's three steps are one compiled call; whatever ends
-    otherwise (a fault that discharges the combs between two samples) is carried out as it comes.
+    ``advance_to`` and ``drive`` wait for what follows, so that the SYNC's three steps are one compiled call; whatever
+    ends otherwise (a fault that discharges the combs between two samples) is carried out as it comes.
     """
 
     def __init__(self, plant: Plant) -> None:

@@ -72,6 +72,8 @@ class Wire:
         self._free_ns = 0  # end of the latest interframe space
         self._delivering = False
         self._recovering: list[Endpoint] = []
+        self._durations_ns: dict[tuple[int, bytes, int] | None, int] = {}
+        self._impaired = False  # somebody's error counter is not 0
         self._runs = 0  # of 11 recessive bits, counted while an endpoint recovers
 
     # -- endpoints ---------------------------------------------------------------------------------------------------
@@ -189,15 +191,40 @@ class Wire:
         try:
             if self.disturbance.armed or self._nodes < 2 or self._rivals or sender._wire is None:
                 self._complete_under_faults(sender, entry, t_us)
-            else:
+            elif self._impaired:
                 self._confirm(sender, entry, t_us)
                 self._deliver(entry[2], t_us, sender)
+                self._impaired = any(e.transmit_errors or e.receive_errors or e.bus_off for e in self._endpoints)
+            else:
+                self._hand_over(sender, entry, t_us)
         finally:
             self._delivering = False
             for endpoint in self._endpoints:
                 if endpoint._to_send:
                     self._arbitrate()
                     break
+
+    def _hand_over(self, sender: Endpoint, entry: Entry, t_us: int) -> None:
+        """``_confirm`` and ``_deliver`` while nobody has seen an error, in one go: it happens three times a tick."""
+        to_send = sender._to_send
+        if to_send[0] is entry:
+            heappop(to_send)
+        else:
+            to_send.remove(entry)
+            heapify(to_send)
+        self._frames += 1
+        frame = entry[2]
+        if sender.on_sent is not None:
+            sender.on_sent(frame, t_us)
+        for endpoint in self._endpoints:
+            if endpoint is sender or endpoint.bus_off:
+                continue
+            if endpoint.on_frame is not None:
+                endpoint.on_frame(frame, t_us)
+            elif len(endpoint._received) < endpoint.queue_limit:
+                endpoint._received.append((frame, t_us))
+            else:
+                endpoint.overruns += 1
 
     def _confirm(self, sender: Endpoint, entry: Entry, t_us: int) -> None:
         to_send = sender._to_send
@@ -264,6 +291,7 @@ class Wire:
 
     def _count_error(self, senders: list[Endpoint], kind: int) -> None:
         """Destroy the frame that just ended: error frame, counters, and its retransmission when the wire is free."""
+        self._impaired = True
         delimiter_ns = self._bits_ns(ERROR_DELIMITER_BITS)
         self._free_ns += delimiter_ns
         self._busy_ns += delimiter_ns
@@ -276,6 +304,7 @@ class Wire:
         self._announce(kind | ERROR_BUS, senders[0] if senders else None)
 
     def _count_transmit_error(self, endpoint: Endpoint, kind: int) -> None:
+        self._impaired = True
         if kind != ERROR_ACK or not endpoint._is_passive():  # a node alone on its bus does not go bus-off
             endpoint.transmit_errors += 8
         if endpoint._is_passive():

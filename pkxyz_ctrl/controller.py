@@ -15,7 +15,7 @@ from pkxyz_ctrl.can.driver import AmplifierDriver, DriverState
 from pkxyz_ctrl.can.frame import Frame
 from pkxyz_ctrl.row import ROW
 from pkxyz_ctrl.safety.gate import GateConfig, TransmitGate
-from pkxyz_ctrl.safety.modes import Event, Mode
+from pkxyz_ctrl.safety.modes import Event, Mode, next_mode
 from pkxyz_ctrl.safety.trips import Trip, explain
 
 Array = NDArray[np.float64]
@@ -33,8 +33,8 @@ class StartUpError(RuntimeError):
 class Controller:
     """One stage under control.
 
-    ``send`` takes every frame that may go out. ``faults`` collects a sentence for each fault decision. ``memory`` is the
-    (1,) array of ``cycle.MEMORY`` that the cycle works on, ``row`` the bytes of its latest record.
+    ``send`` takes every frame that may go out. ``faults`` collects a sentence for each fault decision. ``memory`` is
+    the (1,) array of ``cycle.MEMORY`` that the cycle works on, ``row`` the bytes of its latest record.
     """
 
     def __init__(self, law: NDArray[np.void], bus: BusConfig, gate: GateConfig, send: Send) -> None:
@@ -48,11 +48,10 @@ class Controller:
         self.law = law
         self.memory = cycling.new_memory(Mode.BOOT)
         self._send = send
-        self._bytes = memoryview(self.memory).cast("B")
-        fields = cycling.MEMORY.fields
-        assert fields is not None
+        self._bytes = self.memory.view(np.uint8).data
+        fields = dict(cycling.MEMORY.fields or {})
         self._input_at, self._row_at, self._mode_at = (fields[name][1] for name in ("input", "row", "mode"))
-        self._drive_at = self._row_at + ROW.fields["drive_count"][1]
+        self._drive_at = self._row_at + dict(ROW.fields or {})["drive_count"][1]
         self.row = self._bytes[self._row_at : self._row_at + ROW.itemsize]
         self.mode = int(Mode.BOOT)
         self.period_us = bus.period_us
@@ -68,7 +67,8 @@ class Controller:
             self.send(frame, t_us)
 
     def dialogue(self, frame: Frame | None, t_us: int) -> bool:
-        """One step of the start-up: a frame that came, or None if none came for a while. True once the node is operational.
+        """One step of the start-up: a frame that came, or None if none came for a while. True once the node is
+        operational.
 
         Raises ``StartUpError``.
         """
@@ -107,7 +107,9 @@ class Controller:
         return driver.sense_fresh
 
     def compute(self, reference: Array, overrun: int) -> None:
-        """Run the cycle on what has come since the SYNC. ``reference`` (n, 9), ``overrun`` ticks skipped before this one."""
+        """Run the cycle on what has come since the SYNC. ``reference`` (n, 9), ``overrun`` ticks skipped before this
+        one.
+        """
         c1, c2, c3, status = self._take_sense()
         if status & 1:
             self.missing_sense += 1
@@ -123,7 +125,9 @@ class Controller:
             self._enter(mode)
 
     def finish(self, t_us: int, heartbeat_until_us: int) -> None:
-        """Send the voltages of this tick, and our heartbeat behind them if it is due and still fits before the next SYNC."""
+        """Send the voltages of this tick, and our heartbeat behind them if it is due and still fits before the next
+        SYNC.
+        """
         driver = self.driver
         self.send(driver.drive(_COUNTS.unpack_from(self._bytes, self._drive_at), t_us), t_us)
         heartbeat = driver.heartbeat_due(t_us)
@@ -148,7 +152,7 @@ class Controller:
 
     def _apply(self, event: Event) -> None:
         """Let an event of the start-up act on the mode, before there are ticks."""
-        self.mode = int(cycling.next_mode(self.mode, int(event)))
+        self.mode = int(next_mode(self.mode, int(event)))
         self.memory["mode"] = self.mode
 
     def _enter(self, mode: int) -> None:

@@ -11,7 +11,6 @@ from hil.conformance.run import CHECKS, run_all
 from hil.conformance.simulated import EDS, simulated_talker
 from hil.conformance.talker import Talker
 from hil.conformance.verdict import Line, Verdict
-from hil.lockstep import SimulatedTime
 from hil.node import AmplifierNode
 from hil.wire import Wire
 from pkxyz_ctrl.bus_config import BusConfig
@@ -158,7 +157,7 @@ def test_over_a_python_can_bus_the_lines_are_the_same() -> None:
     node.power_on()
     with can.Bus(interface="pkxyz-sim", channel="conformance", fd=True) as bus:
         talker = Talker(
-            SimulatedTime(clock), PythonCanPort(bus, clock), BUS, read_eds(EDS, 10),
+            clock, PythonCanPort(bus, clock), BUS, read_eds(EDS, 10),
             allow_voltage=True, sample_cycles=SAMPLE_CYCLES,
         )  # fmt: skip
         lines = run_all(talker)

@@ -5,7 +5,7 @@ from pathlib import Path
 from hil.clock import Lockstep
 from hil.conformance.eds import read_eds
 from hil.conformance.talker import SAMPLE_CYCLES, Talker
-from hil.lockstep import SimulatedTime, WirePort
+from hil.lockstep import WirePort
 from hil.node import AmplifierNode
 from hil.node_sense import Plant
 from hil.plant_on_bus import PlantOnBus
@@ -55,7 +55,7 @@ def simulated_talker(
         turnaround_us=can.turnaround_us, fd=can.driver.fd, protection=can.driver.protection,
     )  # fmt: skip
     amplifier.on_frame = node.on_frame
-    port = WirePort(clock, wire.attach("tester"))
+    port = WirePort(wire.attach("tester"))
     node.power_on()
     variables = read_eds(eds, can.driver.node_id)
-    return Talker(SimulatedTime(clock), port, bus, variables, allow_voltage=allow_voltage, sample_cycles=sample_cycles)
+    return Talker(clock, port, bus, variables, allow_voltage=allow_voltage, sample_cycles=sample_cycles)
