@@ -1,0 +1,187 @@
+"""Frames through python-can and back, on its own virtual bus and between Unix sockets."""
+
+import os
+import re
+import socket
+import subprocess
+import sys
+import time
+from pathlib import Path
+
+import can
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from hil.unix_bus import UnixBus, folder_of
+from pkxyz_ctrl.bus_config import BusConfig, CanConfig
+from pkxyz_ctrl.can.frame import Frame
+from pkxyz_ctrl.config import ConfigError, load
+from pkxyz_ctrl.io.can_port import CanPort, open_bus, to_frame, to_message
+from pkxyz_ctrl.io.clocks import WallClock
+
+FD_LENGTHS = [*range(9), 12, 16, 20, 24, 32, 48, 64]
+
+
+@st.composite
+def frames(draw):
+    is_extended = draw(st.booleans())
+    can_id = draw(st.integers(0, 0x1FFF_FFFF if is_extended else 0x7FF))
+    kind = draw(st.sampled_from(["data", "fd", "remote", "error"]))
+    if kind == "fd":
+        length = draw(st.sampled_from(FD_LENGTHS))
+        data = draw(st.binary(min_size=length, max_size=length))
+        return Frame(can_id, data, True, draw(st.booleans()), is_extended=is_extended)
+    if kind == "remote":
+        return Frame(can_id, bytes(draw(st.integers(0, 8))), is_remote=True, is_extended=is_extended)
+    return Frame(can_id, draw(st.binary(max_size=8)), is_extended=is_extended, is_error=kind == "error")
+
+
+@given(frames())
+def test_a_frame_survives_python_can(frame):
+    assert to_frame(to_message(frame)) == frame
+
+
+@settings(max_examples=150, deadline=None)
+@given(st.lists(frames(), min_size=1, max_size=5))
+def test_frames_cross_between_sockets_in_order_and_whole(tmp_path_factory, sent):
+    folder = tmp_path_factory.getbasetemp() / "crossing"
+    clock = WallClock()
+    with UnixBus(f"{folder}") as a, UnixBus(f"{folder}") as b, UnixBus(f"{folder}") as c:
+        out, into, third = CanPort(a, clock), CanPort(b, clock), CanPort(c, clock, spin_us=50)
+        begin_us = clock.now_us
+        assert all(out.send(frame) for frame in sent)
+        for port in (into, third):
+            for frame in sent:
+                assert port.receive(clock.now_us + 1_000_000) == frame
+                assert begin_us - 1000 <= port.last_us <= clock.now_us
+            assert port.receive(0) is None
+        assert out.receive(0) is None
+        assert out.refused == 0
+    assert not folder.exists()
+
+
+def test_waiting_ends_at_the_deadline_and_not_before(tmp_path):
+    clock = WallClock()
+    with UnixBus(f"{tmp_path}/bus") as bus:
+        for spin_us in (0, 500, 10_000):
+            port = CanPort(bus, clock, spin_us)
+            deadline_us = clock.now_us + 3000
+            assert port.receive(deadline_us) is None
+            assert clock.now_us >= deadline_us - 5  # python-can waits in seconds as a float
+        assert port.unsent() == 0
+
+
+def test_a_classic_bus_refuses_fd_frames_and_does_not_see_them(tmp_path):
+    clock = WallClock()
+    with UnixBus(f"{tmp_path}/bus", fd=False) as classic, UnixBus(f"{tmp_path}/bus") as flexible:
+        port = CanPort(classic, clock)
+        assert not port.send(Frame(0x123, bytes(12), is_fd=True))
+        assert port.refused == 1
+        fd = CanPort(flexible, clock)
+        fd.send(Frame(0x123, bytes(12), is_fd=True))
+        fd.send(Frame(0x124, b"ok"))
+        assert port.receive(clock.now_us + 100_000) == Frame(0x124, b"ok")
+
+
+def test_a_receiver_that_does_not_read_loses_the_newest_and_delays_nobody(tmp_path):
+    limit = int(Path("/proc/sys/net/unix/max_dgram_qlen").read_text(encoding="ascii"))
+    with UnixBus(f"{tmp_path}/bus") as sender, UnixBus(f"{tmp_path}/bus") as deaf, UnixBus(f"{tmp_path}/bus") as awake:
+        for n in range(2 * limit + 50):
+            sender.send(can.Message(arbitration_id=n & 0x7FF, is_extended_id=False))
+            assert awake.recv(1.0).arbitration_id == n & 0x7FF
+        kept = 0
+        while (message := deaf.recv(0)) is not None:
+            assert message.arbitration_id == kept
+            kept += 1
+        assert limit <= kept <= limit + 1
+        assert sender.dropped == 2 * limit + 50 - kept
+
+
+def test_what_a_killed_process_leaves_behind_is_cleared_away(tmp_path):
+    channel = f"{tmp_path}/bus"
+    script = "import os, sys; from hil.unix_bus import UnixBus; bus = UnixBus(sys.argv[1]); os.kill(os.getpid(), 9)"
+    done = subprocess.run([sys.executable, "-c", script, channel], check=False, env=os.environ)
+    assert done.returncode == -9
+    with UnixBus(channel) as bus, UnixBus(channel) as other:
+        assert len(list((tmp_path / "bus").iterdir())) == 3
+        bus.send(can.Message(arbitration_id=1))
+        assert other.recv(1.0) is not None
+        assert len(list((tmp_path / "bus").iterdir())) == 2
+    assert not (tmp_path / "bus").exists()
+
+
+@settings(max_examples=200, deadline=None)
+@given(st.lists(st.binary(max_size=100), max_size=5))
+def test_what_is_not_a_frame_is_passed_over(tmp_path_factory, rubbish):
+    folder = tmp_path_factory.getbasetemp() / "rubbish"
+    with UnixBus(f"{folder}") as bus, socket.socket(socket.AF_UNIX, socket.SOCK_DGRAM) as stranger:
+        path = next(str(p) for p in folder.iterdir())
+        for datagram in rubbish:
+            stranger.sendto(datagram, path)
+        for _ in rubbish:
+            message = bus.recv(0)
+            assert message is None or len(to_frame(message).data) <= 64
+        with UnixBus(f"{folder}") as friend:
+            friend.send(can.Message(arbitration_id=0x77, is_extended_id=False, data=b"real"))
+            seen = [bus.recv(0) for _ in range(len(rubbish) + 1)]
+        assert any(m is not None and m.arbitration_id == 0x77 and bytes(m.data) == b"real" for m in seen)
+
+
+def test_two_processes_meet_on_a_named_channel(tmp_path, monkeypatch):
+    monkeypatch.setenv("XDG_RUNTIME_DIR", str(tmp_path))
+    assert folder_of("lab").parent.parent == tmp_path
+    script = (
+        "import can, sys\n"
+        "with can.Bus(interface='pkxyz-unix', channel='lab', fd=True) as bus:\n"
+        "    bus.send(can.Message(arbitration_id=0x10, is_extended_id=False))\n"
+        "    m = bus.recv(20); m.arbitration_id += 1; bus.send(m)\n"
+    )
+    sent = Frame(0x20, bytes(64), True, True)
+    with (
+        can.Bus(interface="pkxyz-unix", channel="lab", fd=True) as bus,
+        subprocess.Popen([sys.executable, "-c", script], env=os.environ) as process,
+    ):
+        assert bus.recv(20).arbitration_id == 0x10
+        bus.send(to_message(sent))
+        answer = bus.recv(20)
+        assert to_frame(answer) == sent._replace(can_id=0x21)
+        assert abs(answer.timestamp - time.time()) < 5
+        assert process.wait(20) == 0
+
+
+def config(**changes) -> CanConfig:
+    can_config = load("buses", "unix_2k", BusConfig).can
+    assert can_config is not None
+    return can_config.model_copy(update=changes)
+
+
+def test_open_bus_hands_options_on_and_names_what_is_wrong(tmp_path):
+    with open_bus(config(channel=f"{tmp_path}/bus", options={"receive_own_messages": True}), "mine") as bus:
+        bus.send(can.Message(arbitration_id=5, is_extended_id=False))
+        assert bus.recv(0).arbitration_id == 5
+    for changes, words in (
+        ({"interface": "no-such"}, "no-such"),
+        ({"channel": "/" + 200 * "x"}, "too long"),
+        ({"interface": "socketcan", "channel": "no-can-9"}, "no-can-9"),
+        ({"channel": f"{tmp_path}/bus", "options": {"speed": 3}}, "speed"),
+    ):
+        with pytest.raises(ConfigError, match=re.escape(words)) as caught:
+            open_bus(config(**changes), "mine")
+        assert "bus 'mine': can.interface" in str(caught.value)
+        assert "\n" not in str(caught.value)
+
+
+def test_a_port_works_on_a_bus_of_python_can_itself():
+    clock = WallClock()
+    with (
+        open_bus(config(interface="virtual", channel="port"), "a") as a,
+        open_bus(config(interface="virtual", channel="port"), "b") as b,
+    ):
+        CanPort(a, clock).send(Frame(0x30A, bytes(8), True, True))
+        port = CanPort(b, clock)
+        assert port.receive(clock.now_us + 100_000) == Frame(0x30A, bytes(8), True, True)
+        b.shutdown()
+        assert port.receive(clock.now_us + 1000) is None
+        assert not port.send(Frame(1, b""))
+        assert port.refused == 1
