@@ -1,11 +1,13 @@
 # make sil    close the loop over the simulated bus: runs/raster-lockstep-1/ holds recording, summary and picture
 # make test   run every test, the linter and the type checker
 # make bench  measure what the docs promise and print it
+# make mutate change one thing at a time in gate, modes, monitors, comb law and codec: does a test notice? SECONDS=1200
+# make fuzz   hostile frames and broken documents: FRAMES=1000000 DOCUMENTS=10000
 # make docs   draw every figure of docs/ and fill in the generated tables
 PYTHON ?= python3
 BIN := .venv/bin
 
-.PHONY: sil test bench docs wheel clean
+.PHONY: sil test bench docs wheel clean mutate fuzz
 
 sil: .venv/.ready
 	$(BIN)/pkxyz sil
@@ -18,6 +20,15 @@ test: .venv/.ready
 
 bench: .venv/.ready
 	$(BIN)/pkxyz bench
+
+SECONDS ?= 1200
+mutate: .venv/.ready
+	$(BIN)/python tests/mutate.py --seconds $(SECONDS) --report
+
+FRAMES ?= 1000000
+DOCUMENTS ?= 10000
+fuzz: .venv/.ready
+	$(BIN)/python tests/fuzz.py --frames $(FRAMES) --documents $(DOCUMENTS)
 
 docs: .venv/.ready
 	$(BIN)/python docs/build.py

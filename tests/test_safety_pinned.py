@@ -1,0 +1,180 @@
+"""What mutation testing found that no law noticed: numbers that are contracts by themselves, written down again."""
+
+import dataclasses
+import struct
+
+import pytest
+
+from pkxyz_ctrl.can.codec import ProcessCodec
+from pkxyz_ctrl.safety.gate import PERMITTED, FrameKind, GateConfig
+from pkxyz_ctrl.safety.modes import Mode
+from pkxyz_ctrl.safety.sdo_rules import write_refusal
+from pkxyz_ctrl.safety.trips import Trip
+
+# Bits of a recording that somebody may read in years.
+TRIPS = [
+    "SENSE_STALE",
+    "SENSE_SEQUENCE",
+    "SENSE_CRC",
+    "SENSE_LENGTH",
+    "SENSE_RANGE_1",
+    "SENSE_RANGE_2",
+    "SENSE_RANGE_3",
+    "SENSE_FROZEN_1",
+    "SENSE_FROZEN_2",
+    "SENSE_FROZEN_3",
+    "INNOVATION_X",
+    "INNOVATION_Y",
+    "INNOVATION_Z",
+    "SATURATION",
+    "SLEW",
+    "OVERRUN",
+    "SOLVER",
+    "NOT_FINITE",
+    "HEARTBEAT_LOST",
+    "NODE_NOT_OPERATIONAL",
+    "NODE_REBOOTED",
+    "NODE_EMERGENCY",
+    "GATE_BLOCKED",
+    "OPERATOR",
+]
+
+
+def test_trip_bits() -> None:
+    assert {name: trip.value for name, trip in Trip.__members__.items()} == {
+        name: 1 << place for place, name in enumerate(TRIPS)
+    }
+
+
+# What may be written to the amplifier (node 10, controller 127, at most 1000 ms): objects, sub-indices, bytes, a value
+# that is permitted, and values that are not. docs/safety.md, CiA 301 and 401.
+OFF = 1 << 31
+WRITES = (
+    (0x1005, 0x1005, 0, 0, 4, 0x80, (0x81, 0x40000080, 0)),
+    (0x1016, 0x1016, 1, 1, 4, 127 << 16 | 1000, (127 << 16, 127 << 16 | 1001, 126 << 16 | 50, 50)),
+    (0x1017, 0x1017, 0, 0, 2, 1, (0,)),
+    (0x1019, 0x1019, 0, 0, 1, 240, (0, 239, 241)),
+    (0x1029, 0x1029, 1, 1, 1, 2, (1, 3)),
+    (0x1400, 0x15FF, 1, 1, 4, OFF, (0x20A, 0x40A)),
+    (0x1401, 0x1401, 2, 2, 1, 1, (0, 2, 255)),
+    (0x1600, 0x17FF, 0, 0, 1, 5, ()),
+    (0x1600, 0x17FF, 1, 64, 4, 0x64110110, ()),
+    (0x1800, 0x19FF, 1, 1, 4, 0x28A, (0x28B, 0x30A, 0x0A)),
+    (0x1800, 0x19FF, 2, 2, 1, 1, ()),
+    (0x1800, 0x19FF, 3, 3, 2, 0, ()),
+    (0x1800, 0x19FF, 5, 5, 2, 0, ()),
+    (0x1A00, 0x1BFF, 0, 0, 1, 5, ()),
+    (0x1A00, 0x1BFF, 1, 64, 4, 0x64010110, ()),
+    (0x2010, 0x2010, 0, 0, 1, 1, (0,)),
+    (0x6443, 0x6443, 1, 3, 1, 1, (0, 2)),
+    (0x6444, 0x6444, 1, 3, 4, 0, (1, 0xFFFFFFFF)),
+)
+COMMAND = {1: 0x2F, 2: 0x2B, 3: 0x27, 4: 0x23}
+
+
+def refused(index: int, subindex: int, size: int, value: int) -> bool:
+    data = struct.pack("<BHBI", COMMAND[size], index, subindex, value)
+    return write_refusal(data, 10, 127, 1000) is not None
+
+
+def test_writes_at_every_corner_and_one_step_beyond() -> None:
+    indices = sorted({row[place] + step for row in WRITES for place, step in ((0, -1), (0, 0), (1, 0), (1, 1))})
+    subindices = sorted(
+        {row[place] + step for row in WRITES for place, step in ((2, -1), (2, 0), (3, 0), (3, 1))} - {-1}
+    )
+    permitted = 0
+    for index in indices:
+        for subindex in subindices:
+            rows = [row for row in WRITES if row[0] <= index <= row[1] and row[2] <= subindex <= row[3]]
+            for size in COMMAND:
+                expected = bool(rows) and rows[0][4] == size
+                value = rows[0][5] if expected else 0
+                assert refused(index, subindex, size, value) is not expected, (hex(index), subindex, size)
+                permitted += expected
+    assert permitted > 50
+
+
+@pytest.mark.parametrize("row", WRITES, ids=lambda row: f"{row[0]:04X}-{row[2]}")
+def test_values_that_are_not_permitted(row: tuple[int, int, int, int, int, int, tuple[int, ...]]) -> None:
+    first, last, sub_first, sub_last, size, value, wrong = row
+    for index in (first, last):
+        for subindex in (sub_first, sub_last):
+            assert not refused(index, subindex, size, value)
+            for bad in wrong:
+                assert refused(index, subindex, size, bad)
+
+
+def test_values_with_more_than_one_permitted() -> None:
+    assert not refused(0x1029, 1, 1, 0)
+    assert not refused(0x1016, 1, 4, 127 << 16 | 1)
+    for cob_id in (0x30A, 0x4000030A, OFF | 0x30A, OFF):
+        assert not refused(0x1401, 1, 4, cob_id)
+    for index in (0x1400, 0x1402):
+        assert refused(index, 1, 4, 0x30A)  # only the drive PDO may have the drive PDO's identifier
+    for cob_id in (0x18A, 0x28A, 0x38A, 0x48A, 0x4000028A, OFF | 0x7FF):
+        assert not refused(0x1801, 1, 4, cob_id)
+
+
+GATE_RANGES = {
+    "count_max": (0, 32767),
+    "count_slew_max": (1, 32767),
+    "period_us": (2, 1_000_000),
+    "node_id": (1, 127),
+    "controller_node_id": (1, 127),
+    "drive_timeout_syncs": (2, 255),
+    "heartbeat_timeout_max_ms": (1, 65535),
+    "spacing_min_us": (0, 200),
+}
+
+
+@pytest.mark.parametrize("name", GATE_RANGES)
+def test_gate_config_takes_its_ranges_and_nothing_beyond(name: str) -> None:
+    low, high = GATE_RANGES[name]
+    good = GateConfig(count_max=30000, count_slew_max=500, period_us=200, node_id=10, controller_node_id=20)
+    for value in (low, high):
+        assert getattr(dataclasses.replace(good, **{name: value}), name) == value
+    for value in (low - 1, high + 1):
+        with pytest.raises(ValueError, match=name):
+            dataclasses.replace(good, **{name: value})
+
+
+def test_gate_config_defaults_are_those_of_the_wire() -> None:
+    config = GateConfig(count_max=30000, count_slew_max=500, period_us=200)
+    assert dataclasses.asdict(config) == {
+        "count_max": 30000, "count_slew_max": 500, "period_us": 200, "node_id": 10, "controller_node_id": 127,
+        "protection": True, "fd": True, "spacing_min_us": None, "drive_timeout_syncs": 5,
+        "heartbeat_timeout_max_ms": 1000,
+    }  # fmt: skip
+
+
+KINDS = "SYNC HEARTBEAT DRIVE_ZERO DRIVE SDO_READ SDO_WRITE NMT_START NMT_STOP NMT_PRE_OPERATIONAL NMT_RESET"
+ALWAYS_KINDS = {"SYNC", "HEARTBEAT", "DRIVE_ZERO", "NMT_STOP", "NMT_PRE_OPERATIONAL"}
+CONFIGURING = {"SDO_READ", "SDO_WRITE", "NMT_START", "NMT_RESET"}
+MODE_KINDS = {
+    Mode.BOOT: CONFIGURING,
+    Mode.PRE_OPERATIONAL: CONFIGURING,
+    Mode.IDLE: {"SDO_READ", "NMT_RESET"},
+    Mode.HOMING: {"SDO_READ"},
+    Mode.ENABLED: {"SDO_READ", "DRIVE"},
+    Mode.TRACKING: {"SDO_READ", "DRIVE"},
+    Mode.FAULT: {"SDO_READ", "NMT_RESET"},
+}
+
+
+def test_kinds_of_frames_are_one_bit_each() -> None:
+    """Two kinds on one bit would permit each other."""
+    names = {name: kind.value for name, kind in FrameKind.__members__.items()}
+    assert names == {name: 1 << place for place, name in enumerate(KINDS.split(" "))}
+
+
+@pytest.mark.parametrize("mode", Mode)
+def test_what_each_mode_permits(mode: Mode) -> None:
+    assert {kind.name for kind in FrameKind if kind & PERMITTED[mode]} == ALWAYS_KINDS | MODE_KINDS[mode]
+
+
+def test_identifiers_of_a_codec_have_eleven_bits() -> None:
+    for cob_id in (0, 0x7FF):
+        assert ProcessCodec(cob_id, True).decode(ProcessCodec(cob_id, True).encode((1, -2, 3), 4))[4]
+    for cob_id in (-1, 0x800):
+        with pytest.raises(ValueError, match="11 bits"):
+            ProcessCodec(cob_id, True)
