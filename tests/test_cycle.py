@@ -91,9 +91,14 @@ def test_homing_averages_only_frames_that_came():
 
 
 def test_homing_again_starts_from_nothing():
-    c = homed()
+    """The old offset is not in the strokes that the monitors see meanwhile, nor in the new one."""
+    c, analog = homed(), bus().analog
+    c.memory["tick"]["sense_zero_f"] = 1e-12
     for k in range(HOMING_TICKS):
-        c.tick(noisy(AT_REST + 100, k), event=Event.HOME if k == 0 else Event.NONE)
+        row = c.tick(noisy(AT_REST + 100, k), event=Event.HOME if k == 0 else Event.NONE)
+        if c.mode is Mode.HOMING:
+            raw_f = analog.sense_offset_f + row["sense_count"] * analog.sense_farad_per_count
+            assert row["sense_f"] == pytest.approx(raw_f, rel=1e-12)
     zero = c.memory["tick"]["sense_zero_f"][0] / bus().analog.sense_farad_per_count
     assert zero == pytest.approx(np.full(3, 100.0), abs=0.51)
 
