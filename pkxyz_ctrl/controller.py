@@ -58,6 +58,7 @@ class Controller:
         self._event = int(Event.NONE)
         self._blocked = 0
         self._take_sense = self.driver.take_sense
+        cycling.cycle(law, cycling.new_memory(Mode.BOOT), np.zeros((1, 9)))  # loaded now, not in the first tick
 
     # -- start and stop ---------------------------------------------------------------------------------------------
 
