@@ -23,6 +23,7 @@ from hil.endpoint import ErrorState
 from hil.frame_time import FrameFormatError
 from hil.wire import Wire, find_wire
 from pkxyz_ctrl.can.frame import Frame
+from pkxyz_ctrl.io.can_port import to_frame
 
 _STATES = {
     ErrorState.ACTIVE: can.BusState.ACTIVE,
@@ -30,19 +31,6 @@ _STATES = {
     ErrorState.BUS_OFF: can.BusState.ERROR,
 }
 _numbers = count(1)
-
-
-def to_frame(message: can.Message) -> Frame:
-    """What of ``message`` goes onto the wire. A remote frame's requested length is the length of its ``data``."""
-    return Frame(
-        message.arbitration_id,
-        bytes(message.dlc) if message.is_remote_frame else bytes(message.data),
-        message.is_fd,
-        message.bitrate_switch,
-        message.is_remote_frame,
-        message.is_extended_id,
-        message.is_error_frame,
-    )
 
 
 def to_message(frame: Frame, t_us: int, channel: str, is_rx: bool = True) -> can.Message:
