@@ -54,6 +54,8 @@ class Latency:
     """from awake to the drive frame handed over and the row recorded"""
     cyclictest_us: list[int] | None
     """lateness of a bare thread in C at the same time, by cyclictest; None where it is not installed"""
+    mode: int = int(Mode.IDLE)
+    """of the controller in the end; TRACKING, unless it had no time to home"""
     ended_by: int = 0
 
     def figures(self) -> dict[str, Any]:
@@ -81,7 +83,6 @@ class _Amplifier:
         self._sense = sense
         self._next = 0
         self._waiting: Frame | None = None
-        self.driven: list[Frame] = []
 
     def send(self, frame: Frame) -> None:
         if frame[0] == cob_id.SYNC:
@@ -150,6 +151,7 @@ def measure(period_us: int, seconds: float, cyclictest: str | None = None) -> La
             result.ticks = sum(watch.cycle_us)
         finally:
             leave_real_time()
+            result.mode = controller.mode
     if beside is not None:
         if result.ended_by:
             beside.terminate()

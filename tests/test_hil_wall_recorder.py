@@ -1,0 +1,173 @@
+"""The recorder's other process, and that a loop at rate neither grows nor loses a row."""
+
+import os
+import subprocess
+import sys
+import tracemalloc
+from pathlib import Path
+
+import can
+import numpy as np
+import pytest
+
+from hil.ending import Ending
+from hil.frame_log import FrameLog
+from hil.latency import measure, read_cyclictest
+from hil.recording import Recording, RecordingError
+from hil.run_folder import RunFolder, metadata_of
+from hil.scenario import load_scenario, resolve
+from hil.wall import WallRig
+from hil.wall_recorder import WallRecorder
+from pkxyz_ctrl.can.frame import Frame
+from pkxyz_ctrl.config import CONFIG_DIR, ConfigError
+from pkxyz_ctrl.row import ROW
+from pkxyz_ctrl.safety.modes import Mode
+
+ROOT = Path(__file__).parent.parent
+
+
+@pytest.fixture
+def folder(tmp_path):
+    return RunFolder(tmp_path / "run")
+
+
+def metadata(**changes):
+    scenario = load_scenario("raster", bus="unix_2k")
+    return metadata_of(scenario, "wall", resolve(scenario)) | changes
+
+
+def random_rows(count, seed=1):
+    rows = np.zeros(count, ROW)
+    rng = np.random.default_rng(seed)
+    rows["tick"] = np.arange(count)
+    for name in ("estimate_m", "voltage_v"):
+        rows[name] = rng.normal(size=(count, 3))
+    return rows
+
+
+FRAMES = (
+    Frame(0x80, b"\x01", True, True),
+    Frame(0x28A, bytes(range(8))),
+    Frame(0x1234567, bytes(64), True, is_extended=True),
+    Frame(0x7FF, b"", is_remote=True),
+)
+
+
+def test_rows_and_frames_arrive_as_if_written_here(folder, tmp_path):
+    rows = random_rows(5000)
+    recorder = WallRecorder(folder, metadata(), "bus")
+    with FrameLog(tmp_path / "here.log", "bus") as here:
+        for index in range(len(rows)):
+            frame = FRAMES[index % len(FRAMES)]
+            recorder.frame(frame, 7 * index)
+            here.record(frame, 7 * index)
+            recorder.row(rows[index : index + 1].view(np.uint8).data)
+    recorder.close()
+    recorder.close()
+    assert recorder.lost_bytes == 0
+    recording = Recording.open(folder.recording)
+    assert recording.ticks == len(rows)
+    for name in ("tick", "estimate_m", "voltage_v"):
+        assert np.array_equal(recording.vector(name), rows[name])
+    assert folder.frames.read_bytes() == (tmp_path / "here.log").read_bytes()
+    assert len(list(can.LogReader(folder.frames))) == len(rows)
+
+
+def test_a_writer_that_fails_says_why_and_stops_the_loop(folder):
+    folder.path.joinpath("frames.log").mkdir()  # cannot be opened as a file
+    recorder = WallRecorder(folder, metadata(), "bus")
+    row = random_rows(1).view(np.uint8).data
+    with pytest.raises(RecordingError, match="directory"):  # noqa: PT012: which row meets the closed pipe is not known
+        for _ in range(100_000):
+            recorder.row(row)
+    recorder.close()
+
+
+def test_rows_survive_a_kill_of_the_loop(tmp_path):
+    script = (
+        "import os, sys; from pathlib import Path; sys.path.insert(0, 'tests')\n"
+        "import numpy as np; from test_hil_wall_recorder import *\n"
+        "recorder = WallRecorder(RunFolder(Path(sys.argv[1])), metadata(), 'bus'); rows = random_rows(300)\n"
+        "for index in range(300): recorder.row(rows[index : index + 1].view(np.uint8).data)\n"
+        "os.kill(os.getpid(), 9)\n"
+    )
+    words = [sys.executable, "-c", script, str(tmp_path / "run")]
+    done = subprocess.run(
+        words, cwd=ROOT, check=False, capture_output=True, env=os.environ
+    )  # waits for the writer, too
+    assert done.returncode == -9, done.stderr
+    recording = Recording.open(tmp_path / "run" / "recording.parquet")
+    assert recording["tick"].tolist() == list(range(300))
+
+
+class Watched(WallRecorder):
+    """Notes the memory in use, as Python has it, every 250 ticks."""
+
+    def __init__(self, folder, metadata, channel):
+        super().__init__(folder, metadata, channel)
+        self.ticks = 0
+        self.in_use = np.zeros(100, np.int64)  # made before, so that noting takes no memory
+
+    def row(self, row):
+        super().row(row)
+        self.ticks += 1
+        if self.ticks % 250 == 0:
+            self.in_use[self.ticks // 250] = tracemalloc.get_traced_memory()[0]
+
+
+def test_after_warm_up_nothing_grows(tmp_path, folder):
+    """Controller, port, bus, clock and recorder, for 3000 ticks under tracemalloc: a reference kept per tick would be
+    8 bytes of each, 20 kB.
+    """
+    text = (CONFIG_DIR / "buses" / "unix_1k.toml").read_text(encoding="utf-8")
+    text = text.replace('channel = "pkxyz"', f'channel = "{tmp_path}/bus"')
+    bus = tmp_path / "bus.toml"
+    bus.write_text(text + "controller_heartbeat_timeout_ms = 900\nnode_heartbeat_timeout_ms = 900\n", encoding="utf-8")
+    scenario = load_scenario("raster", bus=str(bus))
+    scenario.config.__dict__["duration_s"] = 3.0
+    setup = scenario.setup()
+    words = [sys.executable, "-m", "hil.cli", "plant", "--bus", str(bus)]
+    env = {**os.environ, "PYTHONPATH": str(ROOT)}
+    with subprocess.Popen(words, stdout=subprocess.PIPE, stderr=subprocess.DEVNULL, text=True, env=env) as plant:
+        try:
+            assert "pre-operational" in plant.stdout.readline()
+            recorder = Watched(folder, metadata(), "bus")
+            with Ending() as ending:
+                rig = WallRig(setup, recorder, ending)
+                tracemalloc.start()
+                try:
+                    rig.run()
+                finally:
+                    tracemalloc.stop()
+                    rig.close()
+                    recorder.close()
+        finally:
+            plant.terminate()
+    in_use = recorder.in_use[4:13]  # from tick 1000 on
+    assert (in_use > 0).all()
+    assert np.ptp(in_use) < 8000, in_use
+    assert Recording.open(folder.recording).ticks == 3000
+
+
+def test_latency_counts_every_tick_and_the_controller_has_really_controlled():
+    measured = measure(2000, 0.6, "/bin/true")
+    assert measured.ticks == 300
+    assert sum(measured.cycle_us) == 300
+    assert sum(measured.lateness_us) >= 300
+    assert measured.cyclictest_us is None
+    figures = measured.figures()
+    assert 1 <= figures["cycle_us"]["p50"] < 2000
+    assert figures["lateness_us"]["p50"] <= figures["lateness_us"]["p99_9"] <= figures["lateness_us"]["max"]
+    assert measured.mode == Mode.TRACKING
+    for period_us, seconds in ((50, 1.0), (200, 0.0), (200, 61.0)):
+        with pytest.raises(ConfigError, match="is not in"):
+            measure(period_us, seconds)
+
+
+def test_cyclictest_is_read_as_it_prints():
+    text = (
+        "# Histogram\n000000 000000\n000003 000041\n000012 000002\n# Total: 000000043\n# Histogram Overflows: 00002\n"
+    )
+    counts = read_cyclictest(text)
+    assert {us: n for us, n in enumerate(counts) if n} == {3: 41, 12: 2, 1999: 2}
+    assert read_cyclictest("policy: fifo\n") is None
