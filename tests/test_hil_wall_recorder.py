@@ -77,9 +77,13 @@ def test_a_writer_that_fails_says_why_and_stops_the_loop(folder):
     folder.path.joinpath("frames.log").mkdir()  # cannot be opened as a file
     recorder = WallRecorder(folder, metadata(), "bus")
     row = random_rows(1).view(np.uint8).data
-    with pytest.raises(RecordingError, match="directory"):  # noqa: PT012: which row meets the closed pipe is not known
+
+    def go_on():  # which row meets the closed pipe is not known
         for _ in range(100_000):
             recorder.row(row)
+
+    with pytest.raises(RecordingError, match="directory"):
+        go_on()
     recorder.close()
 
 
