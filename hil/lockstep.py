@@ -3,6 +3,8 @@
 No threads, no machine clock: the same bits from run to run.
 """
 
+from collections.abc import Callable
+from functools import partial
 from pathlib import Path
 
 import numpy as np
@@ -18,6 +20,8 @@ from hil.setup import Setup
 from hil.truth import TRUTH_BYTES
 from hil.wire import Wire
 from pkxyz_ctrl.bus_config import CanConfig
+from pkxyz_ctrl.can.cob_id import SYNC
+from pkxyz_ctrl.can.frame import Frame
 from pkxyz_ctrl.config import CONFIG_DIR, ConfigError
 from pkxyz_ctrl.controller import Controller
 from pkxyz_ctrl.row import ROW
@@ -25,12 +29,24 @@ from pkxyz_ctrl.runtime import Port, run, start
 
 
 class WirePort:
-    """``runtime.Port`` on the simulated wire, without the cost of python-can's messages."""
+    """``runtime.Port`` on the simulated wire, without the cost of python-can's messages.
 
-    def __init__(self, endpoint: Endpoint) -> None:
-        self.send = endpoint.send
+    ``latency_us`` is that of a slow adapter: whatever is not a SYNC leaves so much later.
+    """
+
+    def __init__(self, endpoint: Endpoint, clock: Lockstep | None = None, latency_us: int = 0) -> None:
+        self.send: Callable[[Frame], object] = endpoint.send
         self.receive = endpoint.receive
         self.unsent = endpoint.pending
+        if clock is not None and latency_us > 0:
+
+            def send_late(frame: Frame) -> None:
+                if frame.can_id == SYNC:
+                    endpoint.send(frame)
+                else:
+                    clock.call_at(clock.now_us + latency_us, partial(endpoint.send, frame))
+
+            self.send = send_late
 
 
 class LockstepRig:
@@ -52,7 +68,8 @@ class LockstepRig:
             turnaround_us=can.turnaround_us, fd=can.driver.fd, protection=can.driver.protection,
         )  # fmt: skip
         amplifier.on_frame = self.node.on_frame
-        self.port: Port = WirePort(self.wire.attach("controller"))
+        latency_us = (setup.bus.delay_periods - 1) * setup.bus.period_us
+        self.port: Port = WirePort(self.wire.attach("controller"), self.clock, latency_us)
         self.controller = Controller(setup.law, setup.bus, setup.gate, self.port.send)
         self.log = FrameLog(frame_log, can.channel) if frame_log is not None else None
         if self.log is not None:

@@ -145,6 +145,7 @@ class Controller:
         self.faults.append(reason)
         self._blocked = int(Trip.GATE_BLOCKED)
         if frame.can_id == 0x300 + self.can.driver.node_id:
+            self.driver.revoke_drive()
             discharged = self.driver.drive((0, 0, 0), t_us)
             if self.gate.check(discharged, self.mode, t_us) is None:
                 self._send(discharged)

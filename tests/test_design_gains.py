@@ -6,6 +6,7 @@ import math
 import control
 import numpy as np
 import pytest
+import scipy.linalg
 from loop_rig import MIDDLE, bus, controller, controller_with, law, stage
 
 from pkxyz_ctrl.config import ConfigError
@@ -88,13 +89,20 @@ def test_kalman_gain_against_python_control(bus_name):
     assert phi @ designed == pytest.approx(predictor, rel=1e-6, abs=1e-6 * np.abs(predictor).max())
 
 
-def test_a_gain_that_filterpy_does_not_confirm_is_refused():
-    """A filter that believes in neither noise nor drift takes longer to settle than the check waits."""
+def test_a_gain_that_filterpy_does_not_confirm_is_refused(monkeypatch):
+    """scipy hands back a covariance that is a ten-thousandth off."""
+    solve = scipy.linalg.solve_discrete_are
+    monkeypatch.setattr(scipy.linalg, "solve_discrete_are", lambda *given: solve(*given) * (1 + 1e-4))
+    with pytest.raises(DesignError, match=r"scipy's steady state and filterpy's step from it differ by .*; check the"):
+        design_law(stage(), controller(), bus(), autostart=True)
+
+
+def test_a_filter_that_hardly_believes_in_noise_is_accepted():
+    """It takes seconds to settle, and is sound all the same."""
     weights = {"force_noise_n_per_rthz": 1e-12, "disturbance_drift_n_per_rts": 1e-10}
-    with pytest.raises(
-        DesignError, match=r"scipy and filterpy differ by .* of its largest entry; check the noise levels"
-    ):
-        design_law(stage(), controller_with(estimator=weights), bus(), autostart=True)
+    slow = design_law(stage(), controller_with(estimator=weights), bus(), autostart=True)
+    gain = slow["tick"]["estimator"]["gain"][0]
+    assert 0 < gain[0, 0] < 0.01
 
 
 @pytest.mark.parametrize("bus_name", BUSES)

@@ -44,6 +44,18 @@ def test_lockstep_equals_fast_bit_for_bit(plant, bus_name):
     assert modes == {Mode.HOMING: homing - 1, Mode.IDLE: 1, Mode.ENABLED: 1, Mode.TRACKING: ticks - homing - 1}
 
 
+def test_a_slow_adapter_is_the_same_in_both_lanes():
+    """Two periods from sample to action: frames that leave a period late, and a compiled loop that waits as long."""
+    slow_bus = bus("fd_5k").model_copy(update={"delay_periods": 2})
+    two_periods = dataclasses.replace(shortened(setup("mild"), 2500), bus=slow_bus)
+    fast, _ = rows_of(two_periods, "fast")
+    slow, over_bus = rows_of(two_periods, "lockstep")
+    assert first_difference(slow, fast) is None
+    assert over_bus.faults == ()
+    tracking = fast[fast["mode"] == Mode.TRACKING]
+    assert np.abs(tracking["position_m"] - tracking["reference_m"]).max() < 60e-9
+
+
 @pytest.mark.parametrize("lane", ["fast", "lockstep"])
 def test_one_seed_the_same_bits_another_seed_not(lane):
     once, _ = rows_of(shortened(setup("harsh"), 1500), lane)

@@ -180,6 +180,10 @@ class AmplifierDriver:
         self._drive_counter = (counter + 1) & 0xFF
         return _new_tuple(Frame, (self._drive_id, data, self._fd, self._fd, False, False, False))
 
+    def revoke_drive(self) -> None:
+        """The last drive PDO was not sent after all: its alive counter is the next one's."""
+        self._drive_counter = (self._drive_counter - 1) & 0xFF
+
     def heartbeat_due(self, t_us: int) -> Frame | None:
         """Our heartbeat if its time has come; whoever sends it says so with ``heartbeat_sent``."""
         return self._heartbeat_frame if t_us >= self._heartbeat_next_us else None
