@@ -1,0 +1,57 @@
+"""What sense noise and voltage steps leave of a held position: variances of the linear loop, solved, not simulated."""
+
+import numpy as np
+from numpy.typing import NDArray
+
+from pkxyz_ctrl.bus_config import BusConfig
+from pkxyz_ctrl.design.discrete_law import DiscreteLaw, LawError
+from pkxyz_ctrl.design.estimator_gain import measurement_noise
+from pkxyz_ctrl.design.loop_plant import LoopPlant
+from pkxyz_ctrl.design.margins import closed_loop
+from pkxyz_ctrl.design.plant_model import linearise
+from pkxyz_ctrl.stage import Stage
+
+Array = NDArray[np.float64]
+
+
+def hold_noise_m(
+    stage: Stage, bus: BusConfig, plant: LoopPlant, law: DiscreteLaw, *, noise_shaping: bool = True
+) -> Array:
+    """Standard deviation (3,) in m of the true position at the samples while the law holds the plant's point.
+
+    Sources: noise and quantisation of the sense counts, and the rounding of the drive counts, white or, with noise
+    shaping, its difference. Raises ``LawError`` for an unstable loop.
+    """
+    model = linearise(stage, plant.strokes_m)
+    sense = measurement_noise(stage, model, bus)
+    volts = stage.holding_voltages(model.position_m)
+    per_count = model.jacobian.T * (2.0 * stage.force_gain_n_per_v2 * volts * bus.analog.drive_volt_per_count)
+    rounding = per_count @ per_count.T / 12.0
+    loop = closed_loop(plant, law)
+    n, plant_n = len(loop), len(plant.a)
+    # states: the loop, and the last rounding error, which noise shaping takes back
+    a = np.zeros((n + 3, n + 3))
+    a[:n, :n] = loop
+    seen = np.zeros((n + 3, 3))
+    seen[:plant_n], seen[plant_n:n] = -plant.b @ law.d, law.b
+    rounded = np.zeros((n + 3, 3))
+    rounded[:plant_n] = plant.b
+    if noise_shaping:
+        a[:plant_n, n:] = -plant.b
+        rounded[n:] = np.eye(3)
+    covariance = _stationary(a, seen @ sense @ seen.T + rounded @ rounding @ rounded.T)
+    return np.sqrt(np.diag(covariance)[:3])
+
+
+def _stationary(a: Array, q: Array) -> Array:
+    """P = A P A^T + Q by doubling: P_2k = P_k + A^k P_k A^k^T. Indifferent to the units of the states."""
+    p, power = q, a
+    for _ in range(40):
+        step = power @ p @ power.T
+        p = p + step
+        if np.diag(step).max(initial=0.0) <= 0.0 or np.all(np.diag(step) <= 1e-12 * np.diag(p)):
+            return p
+        power = power @ power
+        if not np.isfinite(power).all():
+            break
+    raise LawError("the loop is not stable: its noise grows without bound")
