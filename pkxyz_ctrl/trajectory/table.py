@@ -9,7 +9,6 @@ from typing import Annotated, Any, Literal
 
 import numpy as np
 from pydantic import Field
-from scipy.interpolate import CubicSpline
 
 from pkxyz_ctrl.config import FrozenModel
 from pkxyz_ctrl.trajectory.motion import Array, TrajectoryError, at_rest
@@ -137,6 +136,8 @@ def _numbers(where: str, row: list[str], count: int) -> list[float]:
 
 def _spline(t_s: Array, position_m: Array) -> Pieces:
     """A cubic spline is a sequence of pieces of constant jerk."""
+    from scipy.interpolate import CubicSpline  # slow to import; no other reference has to wait for it
+
     cubic = CubicSpline(t_s, position_m, axis=0)
     j, a, v, p = cubic.c
     state = np.stack([p, v, 2 * a], axis=1)
