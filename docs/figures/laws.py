@@ -1,4 +1,4 @@
-"""Writes docs/figures/laws.png: what each part of the law is worth, on runs of the fast lane with that part taken out."""
+"""Writes docs/figures/laws.png: what each part of the law is worth, by runs of the fast lane without that part."""
 
 from dataclasses import replace
 from pathlib import Path
@@ -79,7 +79,10 @@ def draw_quantisation(figure: Figure) -> None:
     axes.axvspan(20, 772, color="#e9eef2", zorder=0)
     axes.annotate("the stage follows", (24, 6), color="#5b6770", fontsize=9)
     axes.set(
-        xlim=f, xlabel="frequency (Hz)", ylabel="voltage error (uV/rtHz)", title="Rounding to 6.1 mV counts, while holding"
+        xlim=f,
+        xlabel="frequency (Hz)",
+        ylabel="voltage error (uV/rtHz)",
+        title="Rounding to 6.1 mV counts, while holding",
     )
     axes.legend(frameon=False, fontsize=9, loc="lower right")
 
