@@ -2,7 +2,7 @@
 
 from itertools import pairwise
 
-from hil.conformance.talker import ZERO, Talker
+from hil.conformance.talker import SETTLE_US, ZERO, Talker
 from hil.conformance.verdict import Check, DeviationError, NotTestedError, deviate_if
 from pkxyz_ctrl.can import cob_id
 from pkxyz_ctrl.can.cob_id import NmtCommand, NmtState
@@ -125,7 +125,7 @@ def _pdo_by_state(talker: Talker) -> str:
         mark = talker.mark()
         for _ in range(_SYNCS):
             talker.cycle()
-        talker.run(2000)
+        talker.run(SETTLE_US)
         if bool(talker.since(mark, talker.sense_id)) != allowed:
             deviations.append(f"after {command.name.lower()}: {'none' if allowed else 'sent'}")
     deviate_if(deviations)
@@ -198,6 +198,7 @@ def _extended(talker: Talker) -> str:
     talker.run(2000)
     for _ in range(_SYNCS):
         talker.cycle(talker.next_drive(ZERO))
+    talker.run(SETTLE_US)
     deviations = []
     if talker.since(mark, cob_id.SDO_RESPONSE_BASE + talker.node_id):
         deviations.append("an SDO request with 29 bits was answered")

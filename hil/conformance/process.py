@@ -15,26 +15,23 @@ _WARM_UP = 10
 _ERROR_END_US = 400_000  # a node may hold an error for a while, so that a flickering one makes no flood
 
 
-def _sense_frames(talker: Talker) -> list[tuple[int, list[tuple[int, bytes]]]]:
-    """For each SYNC: its time, and the sense PDOs until the next one."""
+def _sense_frames(talker: Talker) -> list[bytes]:
+    """The sense PDOs after so many SYNCs at rate; when each came is the affair of the line on latency."""
     talker.operational()
     talker.cycles(_WARM_UP)
-    found = []
-    for _ in range(talker.sample_cycles):
-        mark = talker.mark()
-        begin_us = talker.cycle(talker.next_drive())
-        found.append((begin_us, talker.since(mark, talker.sense_id)))
-    return found
+    talker.run(SETTLE_US)
+    mark = talker.mark()
+    talker.cycles(talker.sample_cycles)
+    talker.run(SETTLE_US)
+    return [data for _, data in talker.since(mark, talker.sense_id)]
 
 
 def _sense_per_sync(talker: Talker) -> str:
     length = talker.sense_codec.length
-    ticks = _sense_frames(talker)
-    missing = sum(not frames for _, frames in ticks)
-    doubled = sum(len(frames) > 1 for _, frames in ticks)
-    wrong = sum(len(data) != length for _, frames in ticks for _, data in frames)
-    told = f"{len(ticks)} SYNCs: {missing} without, {doubled} with more than one, {wrong} not {length} bytes long"
-    if missing or doubled or wrong:
+    frames = _sense_frames(talker)
+    wrong = sum(len(data) != length for data in frames)
+    told = f"{talker.sample_cycles} SYNCs: {len(frames)} sense PDOs, {wrong} of them not {length} bytes long"
+    if wrong or len(frames) != talker.sample_cycles:
         raise DeviationError(told)
     return told
 
@@ -68,7 +65,7 @@ def _latency(talker: Talker) -> str:
 def _protected_sense(talker: Talker) -> list[bytes]:
     if not talker.driver.protection:
         raise NotTestedError("the bus configuration says protection = false")
-    frames = [data for _, frames in _sense_frames(talker) for _, data in frames if len(data) == 8]
+    frames = [data for data in _sense_frames(talker) if len(data) == 8]
     if len(frames) < 2:
         raise NotTestedError("no sense PDOs of 8 bytes")
     return frames

@@ -5,6 +5,7 @@ from collections.abc import Callable
 from hil.conformance import sdo_client
 from hil.conformance.eds import Variable
 from hil.conformance.sdo_client import Outcome
+from hil.conformance.verdict import DeviationError
 from pkxyz_ctrl.bus_config import BusConfig
 from pkxyz_ctrl.can import cob_id
 from pkxyz_ctrl.can.cob_id import NmtCommand
@@ -158,10 +159,11 @@ class Talker:
     # -- process data ------------------------------------------------------------------------------------------------
 
     def sync(self, data: bytes | None = None) -> int:
-        """Send SYNC, its counter one on unless ``data`` is given; when."""
+        """Send SYNC, its counter one on unless ``data`` is given; the time just before."""
+        begin_us = self.now_us  # not after: a process that is held up there would find the answer before the question
         self._sync_counter = self._sync_counter % cob_id.SYNC_COUNTER_OVERFLOW + 1
         self.send(cob_id.SYNC, bytes((self._sync_counter,)) if data is None else data)
-        return self.now_us
+        return begin_us
 
     def next_drive(self, counts: Counts = ZERO) -> bytes:
         """The next drive PDO in sequence."""
@@ -187,8 +189,11 @@ class Talker:
         return [int.from_bytes(data[:2], "little") for _, data in self.since(mark, self.emergency_id) if len(data) == 8]
 
     def outputs(self) -> Counts:
-        """0x6411 as the node tells it; -1 where it does not."""
-        a, b, c = (self.read(0x6411, comb).unsigned for comb in (1, 2, 3))
+        """0x6411 as the node tells it. Raises DeviationError if it does not."""
+        outcomes = [self.read(0x6411, comb) for comb in (1, 2, 3)]
+        if silent := next((outcome for outcome in outcomes if not outcome.ok), None):
+            raise DeviationError(f"0x6411 cannot be read: {silent.text}")
+        a, b, c = (outcome.unsigned for outcome in outcomes)
         return a, b, c
 
 
