@@ -10,7 +10,7 @@ from loop_rig import MIDDLE, bus, stage
 
 from pkxyz_ctrl.design import glover_mcfarlane as gm
 from pkxyz_ctrl.design.discrete_law import LawError, response
-from pkxyz_ctrl.design.loop_plant import loop_plant
+from pkxyz_ctrl.design.loop_plant import Perturbation, loop_plant
 from pkxyz_ctrl.design.margins import margins, spectral_radius
 
 POINTS = 1j * np.r_[-np.geomspace(1e-3, 1e4, 400)[::-1], 0.0, np.geomspace(1e-3, 1e4, 400)]
@@ -116,16 +116,32 @@ def test_the_loop_that_runs_has_the_gamma_that_was_designed(bus_name):
     assert found.gamma == pytest.approx(1.1 * found.gamma_opt)
 
 
-def test_the_default_weights_on_the_default_bus():
+@pytest.mark.parametrize("change", [{"stiffness": -0.2}, {"stiffness": 0.2}, {"mass": -0.1}, {"mass": 0.1}])
+def test_the_default_weights_bear_a_changed_stage_and_the_widest_do_not_bear_the_soft_one(change):
+    changed, plant = loop_plant(stage(), bus(), MIDDLE, Perturbation(**change)), loop_plant(stage(), bus(), MIDDLE)
+    assert 1.4 < margins(changed, gm.hinf(plant).law).mimo.peak_s < 3.5
+    widest = (gm.WIDEST_PLANE, gm.WIDEST_PLANE, gm.WIDEST_Z)
+    stable = spectral_radius(changed, gm.hinf(plant, widest).law) < 1.0
+    assert stable == (change != {"stiffness": -0.2})
+
+
+@pytest.mark.parametrize(
+    ("weights", "low_hz", "high_hz"),
+    [
+        ((gm.WEIGHT_PLANE, gm.WEIGHT_PLANE, gm.WEIGHT_Z), 150.0, 156.0),
+        ((gm.WIDEST_PLANE, gm.WIDEST_PLANE, gm.WIDEST_Z), 195.0, 205.0),
+    ],
+)
+def test_weights_on_the_default_bus(weights, low_hz, high_hz):
     """Order 24 is all the room there is; the margins are those of docs/margins.md."""
     plant = loop_plant(stage(), bus(), MIDDLE)
-    law = gm.hinf(plant).law
+    law = gm.hinf(plant, weights).law
     found = margins(plant, law)
     assert law.order == 24
     assert found.stable
     assert found.mimo.peak_s <= 2.0
     assert found.mimo.disk_margin >= 0.6
-    assert 195.0 < found.mimo.bandwidth_hz < 205.0
+    assert low_hz < found.mimo.bandwidth_hz < high_hz
 
 
 @pytest.mark.parametrize("factor", [1.0, 0.5, float("nan")])
