@@ -2,34 +2,11 @@
 
 import numpy as np
 import pytest
-from scipy.integrate import solve_ivp
 from sim_rig import config, counts, plant
 
-from sim.mechanics import acceleration
-from sim.plant import Plant
+from hil.bench.reference_motion import reference_motion
 
 PM = 1e-12
-
-
-def reference(p: Plant, drives: np.ndarray, period_us: int) -> np.ndarray:
-    """Positions (n, 3) at the end of each period: the same equations, an exponential amplifier without slew limit."""
-    par, s = plant(config()).params[0], plant(config()).state[0]
-    tau = float(p.params["amplifier_s"][0])
-    h = period_us * 1e-6
-    y, volt = np.zeros(6), np.zeros(3)
-    out = []
-    for row in drives:
-        target = row * par["volt_per_count"]
-        error = volt - target
-
-        def slope(t, y, target=target, error=error):
-            v = target + error * np.exp(-t / tau)
-            return [*y[3:], *acceleration(par, s, v * v, *y)]
-
-        y = solve_ivp(slope, (0, h), y, method="DOP853", rtol=1e-12, atol=1e-17, first_step=2e-6).y[:, -1]
-        volt = target + error * np.exp(-h / tau)
-        out.append(y[:3])
-    return np.array(out)
 
 
 def scan(n: int, period_us: int) -> np.ndarray:
@@ -47,7 +24,7 @@ def scan(n: int, period_us: int) -> np.ndarray:
 def test_within_a_picometre_over_a_scan(period_us):
     p = plant(config(amplifier_bandwidth={"corner_hz": 30e3}), period_us=period_us)
     drives = scan(100_000 // period_us, period_us)
-    truth = reference(p, drives, period_us)
+    truth = reference_motion(p.params, p.state, drives, period_us)
     ours = []
     for k, row in enumerate(drives):
         p.drive(row)
@@ -63,7 +40,7 @@ def test_a_jump_costs_less_than_a_nanometre():
     """0 to 130 V at once: how the Jacobian turns while the transient lasts is what the method leaves to its steps."""
     p = plant(config(amplifier_bandwidth={"corner_hz": 30e3}))
     drives = np.repeat([counts(130, 120, 110)], 20, axis=0)
-    truth = reference(p, drives, 200)
+    truth = reference_motion(p.params, p.state, drives, 200)
     ours = []
     for k, row in enumerate(drives):
         p.drive(row)

@@ -56,13 +56,13 @@ def measure(name: str, only: list[str]) -> list[Figure]:
     return [f for f in figures if f.name in here]
 
 
-def results(figures: list[Figure]) -> dict[str, Any]:
+def results(machine: dict[str, Any], figures: list[Figure]) -> dict[str, Any]:
     """What is printed as JSON: figures, and on what they were taken."""
-    return {"machine": machine(), "figures": [f.as_dict() for f in figures]}
+    return {"machine": machine, "figures": [f.as_dict() for f in figures]}
 
 
-def machine() -> dict[str, Any]:
-    """The class of machine, without names: architecture, cores, clock, what else was running, versions."""
+def describe_machine() -> dict[str, Any]:
+    """The class of machine, without names: architecture, cores, clock, what else is running now, versions."""
     cores = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count()
     load = round(os.getloadavg()[0], 1) if hasattr(os, "getloadavg") else None
     return {

@@ -1,0 +1,111 @@
+"""Writes the generated tables of docs/performance.md and docs/figures/performance.png from benchmarks/results.json.
+
+    python docs/figures/performance.py
+
+Each table stands between ``<!-- generated: NAME -->`` and ``<!-- end -->``.
+"""
+
+import json
+import re
+from pathlib import Path
+from typing import Any
+
+from matplotlib.backends.backend_agg import FigureCanvasAgg
+from matplotlib.figure import Figure as Picture
+
+from hil.bench.figure import Figure
+from hil.bench_cli import bound_of, in_digits
+
+ROOT = Path(__file__).parents[2]
+PAGE = ROOT / "docs" / "performance.md"
+PICTURE = Path(__file__).with_suffix(".png")
+RESULTS = ROOT / "benchmarks" / "results.json"
+
+TABLES = {
+    "speed": ("tick", "lockstep.realtime", "fast", "plant", "sil"),
+    "share": ("lockstep.tick", *(f"lockstep.{part}" for part in
+              ("bus_and_node", "driver_and_gate", "cycle", "plant", "recording_and_log"))),
+    "parts": ("controller", "driver", "gate", "codec", "wire"),
+    "floor": ("limits", "bus"),
+    "quality": ("nominal", "mild", "harsh"),
+}  # fmt: skip
+COLOURS = ("#0072b2", "#56b4e9", "#009e73", "#e69f00", "#8a8a8a")
+
+
+def read_figures(results: dict[str, Any]) -> dict[str, Figure]:
+    """Figures by name."""
+    return {f["name"]: Figure(**{k: v for k, v in f.items() if k != "met"}) for f in results["figures"]}
+
+
+def table(figures: dict[str, Figure], wanted: tuple[str, ...]) -> str:
+    """Markdown: the figures that have or begin with the wanted names."""
+    shown = [f for name, f in figures.items() if name in wanted or name.partition(".")[0] in wanted]
+    repeated = any(figure.median is not None for figure in shown)
+    heads = ("figure", *(("best", "median") if repeated else ("value",)), "", "target", "", "")
+    rule = ("---", *(("---:", "---:") if repeated else ("---:",)), "---", "---", "---", "---")
+    rows = [heads, rule]
+    for figure in shown:
+        verdict = {True: "met", False: "**missed**", None: ""}[figure.met]
+        median = ("" if figure.median is None else in_digits(figure.median),) if repeated else ()
+        value = in_digits(figure.value)
+        rows.append((figure.name, value, *median, figure.unit, bound_of(figure), verdict, figure.detail))
+    return "\n".join(f"| {' | '.join(row)} |" for row in rows)
+
+
+def machine_line(results: dict[str, Any]) -> str:
+    """On what it was measured, in a sentence."""
+    machine = results["machine"]
+    versions = ", ".join(f"{name} {machine['versions'][name]}" for name in ("python", "numpy", "numba", "scipy"))
+    clock = f" at {machine['clock_ghz']:g} GHz" if machine["clock_ghz"] else ""
+    load = "" if machine["load_average"] is None else f", with a load average of {machine['load_average']:g}"
+    return f"Measured on {machine['cores']} cores ({machine['architecture']}){clock}{load}; {versions}."
+
+
+def generated(results: dict[str, Any]) -> dict[str, str]:
+    """The blocks of the page by name."""
+    figures = read_figures(results)
+    return {"machine": machine_line(results)} | {name: table(figures, wanted) for name, wanted in TABLES.items()}
+
+
+def rewritten(page: str, results: dict[str, Any]) -> str:
+    """The page with its generated blocks filled in."""
+    for name, text in generated(results).items():
+        block = re.search(rf"<!-- generated: {name} -->\n(.*?)<!-- end -->", page, re.DOTALL)
+        if block is None:
+            raise ValueError(f"{PAGE.name} has no block named {name}")
+        page = f"{page[: block.start(1)]}{text}\n{page[block.end(1) :]}"
+    return page
+
+
+def draw(figures: dict[str, Figure]) -> None:
+    """Where the time of a tick goes, in the lane over the bus and in the compiled one."""
+    parts = [figures[name] for name in TABLES["share"][1:]]
+    fast, kernel, period = (figures[name].value for name in ("fast.tick", "tick.kernel", "plant.period"))
+    bars = {
+        "lockstep": [p.value for p in parts],
+        "fast": [0.0, 0.0, kernel, period, max(0.0, fast - kernel - period)],
+    }
+    picture = Picture(figsize=(9.0, 2.4), layout="constrained")
+    FigureCanvasAgg(picture)
+    axes = picture.add_subplot()
+    left = [0.0] * len(bars)
+    for k, (part, colour) in enumerate(zip(parts, COLOURS, strict=True)):
+        widths = [bar[k] for bar in bars.values()]
+        label = part.name.partition(".")[2].replace("_", " ")
+        axes.barh(list(bars), widths, left=left, color=colour, label=label)
+        left = [a + b for a, b in zip(left, widths, strict=True)]
+    target_us = 200.0 / (figures["lockstep.realtime"].target or 1.0)
+    axes.axvline(target_us, color="0.4", lw=1, ls=":")
+    axes.annotate("8 times real time", (target_us, -0.47), ha="center", va="bottom", fontsize=8, annotation_clip=False)
+    axes.invert_yaxis()
+    axes.set(xlabel="us of processor time a tick of 200 us")
+    axes.legend(loc="lower right", fontsize=8, frameon=False)
+    for side in ("right", "top"):
+        axes.spines[side].set_visible(False)
+    picture.savefig(PICTURE, dpi=130)
+
+
+if __name__ == "__main__":
+    found = json.loads(RESULTS.read_text(encoding="utf-8"))
+    PAGE.write_text(rewritten(PAGE.read_text(encoding="utf-8"), found), encoding="utf-8")
+    draw(read_figures(found))

@@ -1,0 +1,178 @@
+"""The measurements: what they hand out, that they refuse to measure less work, and the page made of them.
+
+No time is judged here: that would be a test of the machine.
+"""
+
+import gc
+import itertools
+import json
+import math
+import runpy
+import subprocess
+import sys
+from pathlib import Path
+
+import numpy as np
+import pytest
+from sim_rig import config, counts, plant
+
+from hil.bench import figure, quality, startup, suite, tick
+from hil.bench.closed_loop import scan
+from hil.bench.figure import Figure
+from hil.bench.reference_motion import reference_motion
+from pkxyz_ctrl.config import ConfigError
+
+ROOT = Path(__file__).parents[1]
+KEYS = {"name", "value", "unit", "target", "direction", "met", "median", "detail"}
+QUICK = ("tick", "fast", "bus", "limits", "codec", "gate", "wire")
+drawing = runpy.run_path(str(ROOT / "docs" / "figures" / "performance.py"))
+
+
+def run_bench(*arguments: str) -> subprocess.CompletedProcess[str]:
+    command = [sys.executable, "-c", "from hil.cli import main; main()", "bench", *arguments]
+    return subprocess.run(command, capture_output=True, text=True, check=False, timeout=300, cwd=ROOT)
+
+
+def test_json_of_the_command() -> None:
+    done = run_bench("--json", "--only", "limits", "--only", "codec.encode", "--only", "bus")
+    assert done.returncode == 0, done.stderr
+    assert done.stderr == ""
+    results = json.loads(done.stdout)
+    assert set(results) == {"machine", "figures"}
+    assert set(results["machine"]) == {"architecture", "cores", "clock_ghz", "load_average", "versions"}
+    assert all(set(f) == KEYS for f in results["figures"])
+    assert [f["name"] for f in results["figures"] if not f["name"].startswith("limits.")] == [
+        "codec.encode",
+        "bus.cycle",
+        "bus.room",
+    ]
+
+
+@pytest.mark.parametrize(("asked", "named"), [("nonsense", "nonsense"), ("bus.nonsense", "bus.cycle, bus.room")])
+def test_a_name_that_nothing_has_is_one_line(asked: str, named: str) -> None:
+    done = run_bench("--only", asked)
+    assert done.returncode == 2
+    assert done.stdout == ""
+    assert len(done.stderr.splitlines()) == 1
+    assert asked in done.stderr
+    assert named in done.stderr
+
+
+@pytest.mark.parametrize("name", QUICK)
+def test_figures_are_positive_and_named_after_their_measurement(name: str) -> None:
+    figures = suite.measure(name, [])
+    assert figures
+    assert len({f.name for f in figures}) == len(figures)
+    for f in figures:
+        assert f.name.startswith(f"{name}.")
+        assert 0 < f.value < math.inf
+        assert (f.target is None) == (f.direction is None) == (f.met is None)
+        assert f.detail
+        if f.unit == "us" and f.median is not None:
+            assert f.value <= f.median
+        assert json.loads(json.dumps(f.as_dict(), allow_nan=False))["met"] is f.met
+
+
+def test_all_measurements_unless_some_are_named() -> None:
+    assert suite.chosen([]) == list(suite.MEASUREMENTS)
+    assert suite.chosen(["wire", "tick.call", "tick.kernel"]) == ["tick", "wire"]  # in their own order
+    for name in ("", "Tick", "tic", "tick2.call"):
+        with pytest.raises(ConfigError, match="no such measurement"):
+            suite.chosen([name])
+
+
+def test_verdicts_state_by_state() -> None:
+    for value, direction in itertools.product((2.9, 3.0, 3.1), ("at most", "at least")):
+        expected = value <= 3.0 if direction == "at most" else value >= 3.0
+        assert Figure("a.b", value, "us", 3.0, direction).met is expected
+    assert Figure("a.b", 1.0, "us").met is None
+
+
+def test_the_targets_of_quality_are_those_of_the_shipped_scenario() -> None:
+    from hil.scenario import load_scenario
+
+    checks = load_scenario("raster").config.checks
+    assert {name: bound.max for name, bound in checks.items()} == quality._AT_MOST["nominal"]
+
+
+def test_best_and_median() -> None:
+    times = figure.times_of([3e-6, 1e-6, 2e-6, 8e-6])
+    assert times == pytest.approx((1e-6, 2.5e-6))
+    assert times.per(2) == pytest.approx((0.5, 1.25))
+
+
+def test_the_stopwatch_leaves_the_garbage_collector_as_it_was() -> None:
+    during = []
+
+    def fail() -> None:
+        during.append(gc.isenabled())
+        raise ZeroDivisionError
+
+    for enabled in (True, False):
+        (gc.enable if enabled else gc.disable)()
+        try:
+            with pytest.raises(ZeroDivisionError):
+                figure.once(fail)
+            assert gc.isenabled() is enabled
+        finally:
+            gc.enable()
+    assert during == [False, False]
+
+
+def test_a_replay_that_does_less_is_refused() -> None:
+    loop = scan()
+    memory = loop.memory.copy()
+    with pytest.raises(RuntimeError, match="not the same work"):
+        tick._verified(lambda: None, loop, memory)
+
+
+def test_the_recorded_stretch_is_the_scan_in_closed_loop() -> None:
+    loop = scan()
+    rows = loop.rows
+    np.testing.assert_array_equal(np.diff(rows["tick"]), 1)
+    np.testing.assert_array_equal(np.diff(rows["reference_tick"]), 1)
+    assert rows["tick"][0] == loop.memory["tick_index"][0]
+    assert len(rows) * loop.setup.bus.period_us == 100_000
+    error_nm = np.sqrt(((rows["position_m"] - rows["reference_m"]) ** 2).mean(axis=0)) * 1e9
+    assert np.all(error_nm > 0.2)
+    assert np.all(error_nm < 5.0)
+    assert np.ptp(rows["reference_m"][:, 0]) == pytest.approx(4.0e-6, rel=0.3)
+
+
+def test_reference_motion_stays_where_nothing_pulls() -> None:
+    p = plant(config(amplifier_bandwidth={"corner_hz": 30e3}))
+    before = p.state.tobytes()
+    np.testing.assert_allclose(reference_motion(p.params, p.state, np.zeros((3, 3), np.int32), 200), 0.0, atol=1e-15)
+    assert p.state.tobytes() == before
+
+
+def test_reference_motion_refuses_what_slews() -> None:
+    p = plant(
+        config(amplifier_bandwidth={"corner_hz": 30e3}, slew={"limit_v_per_s": 1e6})
+    )  # 5.3 V for 1 / (2 pi 30 kHz)
+    reference_motion(p.params, p.state, np.array([counts(5, 5, 5)]), 200)
+    with pytest.raises(ValueError, match="slews"):
+        reference_motion(p.params, p.state, np.array([counts(5, 5.6, 5)]), 200)
+
+
+def test_imports_are_summed_by_package() -> None:
+    report = (
+        "import time: self [us] | cumulative | imported package\n"
+        "import time:       100 |        100 |   numpy.core\n"
+        "import time:       250 |        350 | numpy\n"
+        "some warning\n"
+        "import time:        40 |         40 |     json\n"
+        "import time:         2 |          2 | _json\n"
+    )
+    assert startup._import_seconds(report) == pytest.approx({"numpy": 350e-6, "standard library": 42e-6})
+
+
+def test_the_page_shows_the_committed_results() -> None:
+    results = json.loads((ROOT / "benchmarks" / "results.json").read_text(encoding="utf-8"))
+    page = (ROOT / "docs" / "performance.md").read_text(encoding="utf-8")
+    assert drawing["rewritten"](page, results) == page
+    measured = {f["name"].partition(".")[0] for f in results["figures"]}
+    assert measured == set(suite.MEASUREMENTS)
+    for f in results["figures"]:
+        assert set(f) == KEYS
+        assert f"| {f['name']} |" in page
