@@ -161,7 +161,7 @@ def test_beyond_the_links_the_error_names_the_height() -> None:
     stage = Stage.load("reconstructed")
     reach = float(stage.geometry["link_m"][0] - 311e-6)
     stage.inverse_kinematics([0.0, 0.0, reach - 1e-9])
-    with pytest.raises(StageDomainError, match=r"z must stay below 277\.83 um"):
+    with pytest.raises(StageDomainError, match=r"z must stay between -899\.83 and 277\.83 um"):
         stage.inverse_kinematics([0.0, 0.0, reach])
 
 
