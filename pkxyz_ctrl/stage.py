@@ -85,6 +85,10 @@ class Stage:
         """dq/dx (..., 3, 3) at positions (..., 3): row i is the gradient of stroke i. Eq. 12 is its value at rest."""
         return self._at_positions(position_m, _jacobian_each, (3, 3))
 
+    def stroke_curvature(self, position_m: ArrayLike) -> Array:
+        """d2q/dx2 (..., 3, 3, 3) in 1/m, the chain first: what a constant Jacobian leaves out."""
+        return self._at_positions(position_m, _curvature_each, (3, 3, 3))
+
     def potential_energy(self, position_m: ArrayLike) -> Array:
         """Strain energy (...) in J at positions (..., 3), 0 at rest."""
         return self._at_elastic(position_m, _energy_each, ())
@@ -232,6 +236,12 @@ def _positions_each(geometry: Records, strokes: Array, out: Array) -> int:
 def _jacobian_each(geometry: Records, positions: Array, out: Array) -> None:
     for i in range(len(positions)):
         kinematics.jacobian(geometry[0], positions[i], out[i])
+
+
+@njit(cache=True)
+def _curvature_each(geometry: Records, positions: Array, out: Array) -> None:
+    for i in range(len(positions)):
+        kinematics.curvature(geometry[0], positions[i], out[i])
 
 
 @njit(cache=True)

@@ -14,7 +14,7 @@ import numpy as np
 from numba import njit
 from numpy.typing import NDArray
 
-from pkxyz_ctrl.core.kinematics import crank, jacobian, link, stroke
+from pkxyz_ctrl.core.kinematics import crank, crank_bend, jacobian, link, link_bend, stroke
 
 Array = NDArray[np.float64]
 
@@ -77,7 +77,7 @@ def stiffness(geometry: np.void, elasticity: np.void, position_m: Array, out: Ar
     """d2V/dx2 (3,3) in N/m at ``position_m``; at rest it is Eq. 19."""
     j = np.empty((3, 3))
     jacobian(geometry, position_m, j)
-    length, reach, n = geometry["crank_m"], geometry["link_m"], geometry["n"]
+    length, n = geometry["crank_m"], geometry["n"]
     k1, k2, k3 = elasticity["slider_n_per_m"], elasticity["crank_n_m_per_rad"], elasticity["link_n_m_per_rad"]
     x, y = position_m[0], position_m[1]
     z, delta, drop = link(geometry, position_m[2])
@@ -87,9 +87,9 @@ def stiffness(geometry: np.void, elasticity: np.void, position_m: Array, out: Ar
     for i in range(3):
         s, c = crank(geometry, i, x, y)
         q = stroke(geometry, i, x, y, s, c, drop)
-        across = k1 * q * length * length / c**3 + k2 * (1.0 / c**2 + math.asin(s / length) * s / c**3)
+        across = k1 * q * crank_bend(geometry, c) + k2 * (1.0 / c**2 + math.asin(s / length) * s / c**3)
         for a in range(2):
             for b in range(2):
                 out[a, b] += across * n[i, a] * n[i, b]
-        out[2, 2] += k1 * q * reach * reach / delta**3
+        out[2, 2] += k1 * q * link_bend(geometry, delta)
     out[2, 2] += k3 * (1.0 / delta**2 + _elevation_change(geometry, position_m[2], delta) * z / delta**3)

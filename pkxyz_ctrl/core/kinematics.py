@@ -131,6 +131,35 @@ def platform_force(geometry: np.void, position_m: Array, comb_force_n: Array, ou
 
 
 @njit(cache=True)
+def crank_bend(geometry: np.void, c: float) -> float:
+    """Curvature of a stroke across its direction in 1/m, L1^2 / c^3 with ``crank``'s c: along n_i n_i^T."""
+    length: float = geometry["crank_m"]
+    return length * length / c**3
+
+
+@njit(cache=True)
+def link_bend(geometry: np.void, delta: float) -> float:
+    """Curvature of every stroke along z in 1/m, L2^2 / delta^3 with ``link``'s delta."""
+    reach: float = geometry["link_m"]
+    return reach * reach / delta**3
+
+
+@njit(cache=True)
+def curvature(geometry: np.void, position_m: Array, out: Array) -> None:
+    """d2q_i/dx2 (3,3,3) in 1/m at ``position_m``, first axis the chain."""
+    n = geometry["n"]
+    _, delta, _ = link(geometry, position_m[2])
+    out[:] = 0.0
+    for i in range(3):
+        _, c = crank(geometry, i, position_m[0], position_m[1])
+        across = crank_bend(geometry, c)
+        for a in range(2):
+            for b in range(2):
+                out[i, a, b] = across * n[i, a] * n[i, b]
+        out[i, 2, 2] = link_bend(geometry, delta)
+
+
+@njit(cache=True)
 def newton_step(geometry: np.void, strokes_m: Array, position_m: Array) -> float:
     """Move ``position_m`` (3,) in place by one Newton step towards q(x) = ``strokes_m``; the size of the step in m.
 

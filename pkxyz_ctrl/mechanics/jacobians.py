@@ -70,14 +70,7 @@ def stroke_curvature_per_m(stage: Stage, position_m: ArrayLike) -> Array:
     In the plane n_i n_i^T / (L1 cos^3(theta_i)), along z L2^2 / delta^3. It is what the paper's constant Jacobian
     leaves out.
     """
-    position, s, z = _reach(stage, position_m)
-    record = stage.geometry[0]
-    n, crank, link = record["n"], record["crank_m"], record["link_m"]
-    across = crank**2 / (crank**2 - s**2) ** 1.5
-    out = np.zeros((*position.shape[:-1], 3, 3, 3))
-    out[..., :2, :2] = across[..., None, None] * (n[:, :, None] * n[:, None, :])
-    out[..., 2, 2] = (link**2 / (link**2 - z**2) ** 1.5)[..., None]
-    return out
+    return stage.stroke_curvature(position_m)
 
 
 def _reach(stage: Stage, position_m: ArrayLike) -> tuple[Array, Array, Array]:
