@@ -105,7 +105,7 @@ def _paper_table(rows: "list[Row]") -> Table:
         )
     for row in rows:
         off = [d for d in (row.difference_printed, row.difference_reconstructed) if d is not None]
-        nearest = f"{min(off, key=abs) * 100:+.2g}" if off else ""
+        nearest = f"{round(min(off, key=abs) * 100, 9):+.2g}" if off else ""  # what rounding leaves is no difference
         figures = ["" if v is None else f"{v:.6g}" for v in (row.printed, row.reconstructed)]
         verdict = f"[{_VERDICT_COLOURS[row.verdict]}]{row.verdict}[/]"
         table.add_row(
