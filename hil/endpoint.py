@@ -6,8 +6,9 @@ from enum import IntEnum
 from heapq import heappush
 from typing import TYPE_CHECKING
 
-from hil.frame_time import BIT_RATE_SWITCH, ERROR_PASSIVE, IS_EXTENDED, IS_FD, IS_REMOTE, duration_ns_kernel
+from hil.frame_time import FrameFormatError, duration_ns_kernel, frame_duration_ns, frame_flags
 from pkxyz_ctrl.can.frame import Frame
+from pkxyz_ctrl.direct_call import direct
 
 if TYPE_CHECKING:
     from hil.wire import Wire
@@ -19,6 +20,9 @@ class ErrorState(IntEnum):
     BUS_OFF = 2  # transmit counter at 256 or more
 
 
+_duration_ns = direct(duration_ns_kernel, 0, b"", 0, 0, 0)
+_REMEMBERED = 1024  # durations, and kinds of frames
+
 Entry = tuple[int, int, Frame, int]  # arbitration key, order of queueing, frame, duration_ns
 
 
@@ -27,8 +31,11 @@ class Endpoint:
 
     __slots__ = (
         "_earliest_ns",
+        "_kinds",
+        "_others",
         "_received",
         "_recovery_runs",
+        "_recurring_ns",
         "_to_send",
         "_wire",
         "auto_recover",
@@ -37,6 +44,7 @@ class Endpoint:
         "listen_only",
         "name",
         "on_frame",
+        "on_full",
         "on_sent",
         "overruns",
         "queue_limit",
@@ -51,6 +59,7 @@ class Endpoint:
         name: str,
         on_frame: Callable[[Frame, int], object] | None,
         queue_limit: int,
+        on_full: Callable[[], object] | None,
         on_sent: Callable[[Frame, int], object] | None,
         listen_only: bool,
         error_frames: bool,
@@ -61,6 +70,7 @@ class Endpoint:
         self.on_frame = on_frame
         self.on_sent = on_sent
         self.queue_limit = queue_limit
+        self.on_full = on_full
         self.listen_only = listen_only
         self.error_frames = error_frames
         self.auto_recover = auto_recover
@@ -70,6 +80,9 @@ class Endpoint:
         self.overruns = 0  # frames lost because the receive queue was full
         self.send_drops = 0  # frames refused or discarded unsent
         self._to_send: list[Entry] = []
+        self._kinds: dict[tuple[int, tuple[object, ...]], tuple[int, int]] = {}  # identifier, marks: key, flags
+        self._recurring_ns: dict[Frame, int] = {}  # durations of short frames
+        self._others: tuple[Endpoint, ...] = ()  # on the same wire
         self._received: deque[tuple[Frame, int]] = deque()
         self._earliest_ns = 0
         self._recovery_runs = 0
@@ -89,36 +102,59 @@ class Endpoint:
         Raises FrameFormatError for a frame that cannot exist on this wire, RuntimeError if detached or listen-only.
         """
         wire = self._wire
+        if wire is not None and wire._is_calm:
+            # The short way, for speed: a frame of a kind that was sent before, with nothing else on its way.
+            kind = self._kinds.get((frame[0], frame[2:]))
+            if kind is not None:
+                key, flags = kind
+                can_id, data = frame[0], frame[1]
+                if len(data) < 3:  # SYNC and heartbeats recur; process data hardly ever does
+                    duration_ns = self._recurring_ns.get(frame, 0)
+                else:
+                    duration_ns = _duration_ns(can_id, data, flags, wire.nominal_bitrate, wire._fast_bitrate)
+                if duration_ns > 0:
+                    start_ns = wire.clock.now_us * 1000
+                    if start_ns < wire._free_ns:
+                        start_ns = wire._free_ns
+                    wire._order = order = wire._order + 1
+                    entry = key, order, frame, duration_ns
+                    self._to_send.append(entry)
+                    wire._begin(self, entry, start_ns)
+                    return True
+        return self._queue(frame)
+
+    def _queue(self, frame: Frame) -> bool:
+        wire = self._wire
         if wire is None or self.listen_only:
             raise RuntimeError(f"endpoint {self.name!r} is {'listen-only' if wire else 'detached'}")
-        can_id, data, is_fd, bitrate_switch, is_remote, is_extended, is_error = frame
-        flags = (IS_FD if is_fd else 0) | (BIT_RATE_SWITCH if bitrate_switch else 0)
-        key = can_id << 21
-        if is_remote or is_extended or is_error:
-            flags |= (IS_REMOTE if is_remote else 0) | (IS_EXTENDED if is_extended else 0)
-            key = arbitration_key(frame)
-            if is_error:
-                wire._refuse(frame)
-        if self.transmit_errors >= 128 or self.receive_errors >= 128:
-            flags |= ERROR_PASSIVE
-        # SYNC and heartbeats recur; process data hardly ever does
-        recurring = (can_id, data, flags) if len(data) < 3 else None
-        duration_ns = wire._durations_ns.get(recurring)
-        if duration_ns is None:
-            duration_ns = duration_ns_kernel(can_id, data, flags, wire.nominal_bitrate, wire._fast_bitrate)
-            if recurring is not None and len(wire._durations_ns) < 4096:
-                wire._durations_ns[recurring] = duration_ns
-        if duration_ns < 0 or (is_fd and wire.data_bitrate is None):
-            wire._refuse(frame)
-        to_send = self._to_send
-        if self.bus_off or len(to_send) >= self.queue_limit:
+        is_passive = self._is_passive()
+        duration_ns = frame_duration_ns(frame, wire.nominal_bitrate, wire._fast_bitrate, is_passive)
+        if frame.is_fd and wire.data_bitrate is None:
+            raise FrameFormatError("a CAN FD frame on a classic wire (no data bit rate)")
+        if self.bus_off or len(self._to_send) >= self.queue_limit:
             self.send_drops += 1
             return False
+        key = arbitration_key(frame)
+        if len(self._kinds) < _REMEMBERED:
+            self._kinds[frame[0], frame[2:]] = key, frame_flags(frame)
+        if len(frame.data) < 3 and not is_passive and len(self._recurring_ns) < _REMEMBERED:
+            self._recurring_ns[frame] = duration_ns
         wire._order = order = wire._order + 1
-        heappush(to_send, (key, order, frame, duration_ns))
+        heappush(self._to_send, (key, order, frame, duration_ns))
         if not wire._delivering and (wire._end_us < 0 or wire.clock.now_us * 1000 <= wire._start_ns):
             wire._arbitrate()
         return True
+
+    def _overrun(self, frame: Frame, t_us: int) -> None:
+        """There is no room for a frame that has come."""
+        if self.bus_off:
+            return  # detached while the frame was delivered to the others
+        if self.on_full is not None:
+            self.on_full()
+        if len(self._received) < self.queue_limit:
+            self._received.append((frame, t_us))
+        else:
+            self.overruns += 1
 
     def receive_nowait(self) -> tuple[Frame, int] | None:
         """The oldest received frame and its time in us, None if there is none. For endpoints without ``on_frame``."""
@@ -130,6 +166,12 @@ class Endpoint:
         if not received and self._wire is not None:
             self._wire.clock.run_while_empty(received, deadline_us)
         return received.popleft()[0] if received else None
+
+    def receive_all(self) -> list[tuple[Frame, int]]:
+        """All received frames with their times, oldest first."""
+        received = list(self._received)
+        self._received.clear()
+        return received
 
     def pending(self) -> int:
         """Number of frames queued and not yet sent, the one on the wire included."""

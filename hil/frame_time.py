@@ -123,7 +123,8 @@ def duration_ns_kernel(can_id: int, data: bytes, flags: int, nominal_bitrate: in
     return int(nominal_ns + ((counts >> 16) * 1_000_000_000 + data_bitrate // 2) // data_bitrate)
 
 
-def _flags(frame: Frame, error_passive: bool) -> int:
+def frame_flags(frame: Frame, error_passive: bool = False) -> int:
+    """The flags of ``duration_ns_kernel``. Raises FrameFormatError for an error frame."""
     _, _, is_fd, bitrate_switch, is_remote, is_extended, is_error = frame
     if is_error:
         raise FrameFormatError("an error frame has no length of its own")
@@ -141,7 +142,7 @@ def frame_duration_ns(frame: Frame, nominal_bitrate: int, data_bitrate: int, err
     which an FD frame carries in its ESI bit. Raises FrameFormatError.
     """
     duration_ns: int = duration_ns_kernel(
-        frame[0], frame[1], _flags(frame, error_passive), nominal_bitrate, data_bitrate
+        frame[0], frame[1], frame_flags(frame, error_passive), nominal_bitrate, data_bitrate
     )
     if duration_ns < 0:
         raise FrameFormatError(_what_is_wrong(frame))
@@ -150,7 +151,7 @@ def frame_duration_ns(frame: Frame, nominal_bitrate: int, data_bitrate: int, err
 
 def frame_bit_counts(frame: Frame, error_passive: bool = False) -> tuple[int, int]:
     """Bits at the nominal and at the data bit rate, interframe space included. Raises FrameFormatError."""
-    counts: int = _bit_counts(frame[0], frame[1], _flags(frame, error_passive))
+    counts: int = _bit_counts(frame[0], frame[1], frame_flags(frame, error_passive))
     if counts < 0:
         raise FrameFormatError(_what_is_wrong(frame))
     return counts & 0xFFFF, counts >> 16

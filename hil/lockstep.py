@@ -91,27 +91,28 @@ class LockstepRig:
 
 
 class _Recorder:
-    """Puts the controller's row and the truth beside it into a block, a tick at a time: two copies of bytes."""
+    """Collects the controller's row and the truth beside it, a tick at a time, and puts them into a block."""
 
     def __init__(self, rig: LockstepRig, blocks: Blocks) -> None:
         self._blocks = blocks
-        self._rows = blocks.rows.view(np.uint8).data
+        self._rows = blocks.rows.view(np.uint8)
         self._row = rig.controller.row[: ROW.itemsize - TRUTH_BYTES]
         self._truth = rig.plant.exchange.view(np.uint8).data[:TRUTH_BYTES]
-        self._used = 0
+        self._waiting: list[bytes] = []
 
     def __call__(self, tick: int) -> None:
-        at = self._used * ROW.itemsize
-        middle, end = at + ROW.itemsize - TRUTH_BYTES, at + ROW.itemsize
-        self._rows[at:middle] = self._row
-        self._rows[middle:end] = self._truth
-        self._used += 1
-        if self._used == BLOCK_TICKS:
+        waiting = self._waiting
+        waiting.append(self._row.tobytes())
+        waiting.append(self._truth.tobytes())
+        if len(waiting) == 2 * BLOCK_TICKS:
             self.finish()
 
     def finish(self) -> None:
         """Hand on the rows that wait."""
-        count, self._used = self._used, 0
+        rows = np.frombuffer(b"".join(self._waiting), np.uint8)
+        count = len(self._waiting) // 2
+        self._waiting.clear()
+        self._rows[: len(rows)] = rows
         self._blocks.hand_on(count)
 
 

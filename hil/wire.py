@@ -15,7 +15,7 @@ from weakref import WeakValueDictionary
 from hil.clock import Lockstep
 from hil.disturbance import Disturbance
 from hil.endpoint import Endpoint, Entry, dominance
-from hil.frame_time import INTERFRAME_BITS, FrameFormatError, frame_bit_counts
+from hil.frame_time import INTERFRAME_BITS
 from pkxyz_ctrl.can.frame import Frame
 
 ERROR_DELIMITER_BITS = 8  # the error flags themselves, 6 + 1 bits, lie where the frame's EOF would have been
@@ -56,6 +56,7 @@ class Wire:
         self._fast_bitrate = data_bitrate or nominal_bitrate
         self._interframe_ns = self._bits_ns(INTERFRAME_BITS)
         self._endpoints: tuple[Endpoint, ...] = ()
+        self._queues: tuple[list[Entry], ...] = ()  # what each of them has to send
         self._nodes = 0  # endpoints that acknowledge
         self._order = 0
         self._frames = 0
@@ -67,13 +68,12 @@ class Wire:
         self._entry: Entry | None = None
         self._rivals: list[tuple[Endpoint, Entry]] = []  # others that send the same identifier at the same time
         self._start_ns = 0
-        self._end_ns = 0  # end of EOF
-        self._end_us = -1  # -1: idle
+        self._end_us = -1  # end of EOF; -1: idle
         self._free_ns = 0  # end of the latest interframe space
         self._delivering = False
         self._recovering: list[Endpoint] = []
-        self._durations_ns: dict[tuple[int, bytes, int] | None, int] = {}
-        self._impaired = False  # somebody's error counter is not 0
+        self._is_ordinary = False  # at least two nodes, and no error counted anywhere: a frame takes the short way
+        self._is_calm = False  # ordinary, idle and nothing queued: a frame that is sent has no rival
         self._runs = 0  # of 11 recessive bits, counted while an endpoint recovers
 
     # -- endpoints ---------------------------------------------------------------------------------------------------
@@ -84,6 +84,7 @@ class Wire:
         on_frame: Callable[[Frame, int], object] | None = None,
         queue_limit: int = 1024,
         *,
+        on_full: Callable[[], object] | None = None,
         on_sent: Callable[[Frame, int], object] | None = None,
         listen_only: bool = False,
         error_frames: bool = False,
@@ -92,18 +93,28 @@ class Wire:
         """Plug in a CAN controller.
 
         ``on_frame(frame, t_us)`` gets each frame of the others as it ends, ``on_sent`` each own one; without
-        ``on_frame`` up to ``queue_limit`` frames wait for ``receive_nowait`` (the newest is lost on overrun).
+        ``on_frame`` up to ``queue_limit`` frames wait for ``receive_nowait``. When there is no room for another,
+        ``on_full`` is called to make some; else that one is lost.
         ``listen_only`` neither acknowledges nor sends; with ``error_frames`` error frames are delivered too.
         """
         if any(other.name == name for other in self._endpoints):
             raise ValueError(f"an endpoint named {name!r} is attached already")
-        endpoint = Endpoint(self, name, on_frame, queue_limit, on_sent, listen_only, error_frames, auto_recover)
-        self._endpoints = (*self._endpoints, endpoint)
+        endpoint = Endpoint(
+            self, name, on_frame, queue_limit, on_full, on_sent, listen_only, error_frames, auto_recover
+        )
         self._nodes += not listen_only
+        self._set_endpoints((*self._endpoints, endpoint))
         return endpoint
 
+    def _set_endpoints(self, endpoints: tuple[Endpoint, ...]) -> None:
+        self._endpoints = endpoints
+        self._queues = tuple(e._to_send for e in endpoints)
+        for endpoint in endpoints:
+            endpoint._others = tuple(e for e in endpoints if e is not endpoint)
+
     def _detach(self, endpoint: Endpoint) -> None:
-        self._endpoints = tuple(e for e in self._endpoints if e is not endpoint)
+        self._set_endpoints(endpoint._others)
+        self._is_ordinary = self._is_calm = False
         self._nodes -= not (endpoint.listen_only or endpoint.bus_off)
         if endpoint in self._recovering:
             self._recovering.remove(endpoint)
@@ -154,15 +165,17 @@ class Wire:
                     tie = True
         if tie or (suspended and entry is None) or self._rivals:
             ready_ns, sender, entry = self._arbitrate_slowly(ready_ns)
-        if entry is None:
+        if sender is None or entry is None:
             self._sender, self._entry, self._end_us = None, None, -1
-            return
-        if entry is self._entry and ready_ns == self._start_ns and self._end_us >= 0:
-            return
+        elif entry is not self._entry or ready_ns != self._start_ns or self._end_us < 0:
+            self._begin(sender, entry, ready_ns)
+
+    def _begin(self, sender: Endpoint, entry: Entry, start_ns: int) -> None:
+        """Put ``entry`` on the wire at ``start_ns``, unless a better one is queued until then."""
+        self._is_calm = False
         self._sender, self._entry = sender, entry
-        self._start_ns = ready_ns
-        self._end_ns = end_ns = ready_ns + entry[3] - self._interframe_ns
-        self._end_us = end_us = -(-end_ns // 1000)
+        self._start_ns = start_ns
+        self._end_us = end_us = -((self._interframe_ns - entry[3] - start_ns) // 1000)  # rounded up
         self.clock.call_at(end_us, self._complete)
 
     def _arbitrate_slowly(self, ready_ns: int) -> tuple[int, Endpoint | None, Entry | None]:
@@ -172,6 +185,7 @@ class Wire:
         ready = [e for e in ready if e._earliest_ns <= ready_ns]
         ready.sort(key=lambda e: (e._to_send[0][0], dominance(e._to_send[0][2])))
         self._rivals = [(e, e._to_send[0]) for e in ready[1:] if e._to_send[0][0] == ready[0]._to_send[0][0]]
+        self._is_ordinary = self._is_ordinary and not self._rivals
         return (ready_ns, ready[0], ready[0]._to_send[0]) if ready else (ready_ns, None, None)
 
     def _complete(self) -> None:
@@ -180,59 +194,64 @@ class Wire:
         sender, entry = self._sender, self._entry
         if t_us != self._end_us or sender is None or entry is None:
             return  # the event of a frame that lost the arbitration later on
-        previous_free_ns = self._free_ns
+        before_ns = self._free_ns
         self._end_us = -1
         self._sender = self._entry = None
-        self._free_ns = free_ns = self._end_ns + self._interframe_ns
-        self._busy_ns += free_ns - self._start_ns
-        if self._recovering:
-            self._runs += 1 + (self._start_ns - previous_free_ns) // self._bits_ns(RECESSIVE_RUN_BITS)
+        self._free_ns = self._start_ns + entry[3]
+        self._busy_ns += entry[3]
         self._delivering = True
         try:
-            if self.disturbance.armed or self._nodes < 2 or self._rivals or sender._wire is None:
-                self._complete_under_faults(sender, entry, t_us)
-            elif self._impaired:
-                self._confirm(sender, entry, t_us)
-                self._deliver(entry[2], t_us, sender)
-                self._impaired = any(e.transmit_errors or e.receive_errors or e.bus_off for e in self._endpoints)
+            if self._is_ordinary and not self.disturbance.armed:
+                # _confirm and _deliver in one go, for speed: it happens three times a tick
+                if len(sender._to_send) == 1:
+                    sender._to_send.pop()
+                else:
+                    self._unqueue(sender, entry)
+                self._frames += 1
+                frame = entry[2]
+                if sender.on_sent is not None:
+                    sender.on_sent(frame, t_us)
+                for endpoint in sender._others:
+                    if endpoint.on_frame is not None:
+                        endpoint.on_frame(frame, t_us)
+                    elif len(endpoint._received) < endpoint.queue_limit and not endpoint.bus_off:
+                        endpoint._received.append((frame, t_us))
+                    else:
+                        endpoint._overrun(frame, t_us)
             else:
-                self._hand_over(sender, entry, t_us)
+                self._complete_out_of_the_ordinary(sender, entry, t_us, before_ns)
         finally:
             self._delivering = False
-            for endpoint in self._endpoints:
-                if endpoint._to_send:
-                    self._arbitrate()
-                    break
+            if any(self._queues):
+                self._arbitrate()
+            else:
+                self._is_calm = self._is_ordinary
 
-    def _hand_over(self, sender: Endpoint, entry: Entry, t_us: int) -> None:
-        """``_confirm`` and ``_deliver`` while nobody has seen an error, in one go: it happens three times a tick."""
+    def _complete_out_of_the_ordinary(self, sender: Endpoint, entry: Entry, t_us: int, before_ns: int) -> None:
+        """``before_ns``: since when the wire was free before this frame."""
+        if self._recovering:
+            self._runs += 1 + (self._start_ns - before_ns) // self._bits_ns(RECESSIVE_RUN_BITS)
+        if self.disturbance.armed or self._nodes < 2 or self._rivals or sender._wire is None:
+            self._complete_under_faults(sender, entry, t_us)
+        else:
+            self._confirm(sender, entry, t_us)
+            self._deliver(entry[2], t_us, sender)
+        self._is_ordinary = self._nodes >= 2 and not any(
+            e.transmit_errors or e.receive_errors or e.bus_off or e._earliest_ns > self._free_ns
+            for e in self._endpoints
+        )
+
+    @staticmethod
+    def _unqueue(sender: Endpoint, entry: Entry) -> None:
         to_send = sender._to_send
         if to_send[0] is entry:
             heappop(to_send)
         else:
             to_send.remove(entry)
             heapify(to_send)
-        self._frames += 1
-        frame = entry[2]
-        if sender.on_sent is not None:
-            sender.on_sent(frame, t_us)
-        for endpoint in self._endpoints:
-            if endpoint is sender or endpoint.bus_off:
-                continue
-            if endpoint.on_frame is not None:
-                endpoint.on_frame(frame, t_us)
-            elif len(endpoint._received) < endpoint.queue_limit:
-                endpoint._received.append((frame, t_us))
-            else:
-                endpoint.overruns += 1
 
     def _confirm(self, sender: Endpoint, entry: Entry, t_us: int) -> None:
-        to_send = sender._to_send
-        if to_send[0] is entry:
-            heappop(to_send)
-        else:
-            to_send.remove(entry)
-            heapify(to_send)
+        self._unqueue(sender, entry)
         self._frames += 1
         if sender.transmit_errors or sender.receive_errors:
             sender.transmit_errors = max(0, sender.transmit_errors - 1)
@@ -253,7 +272,7 @@ class Wire:
             elif len(endpoint._received) < endpoint.queue_limit:
                 endpoint._received.append((frame, t_us))
             else:
-                endpoint.overruns += 1
+                endpoint._overrun(frame, t_us)
 
     # -- faults ------------------------------------------------------------------------------------------------------
 
@@ -291,7 +310,7 @@ class Wire:
 
     def _count_error(self, senders: list[Endpoint], kind: int) -> None:
         """Destroy the frame that just ended: error frame, counters, and its retransmission when the wire is free."""
-        self._impaired = True
+        self._is_ordinary = False
         delimiter_ns = self._bits_ns(ERROR_DELIMITER_BITS)
         self._free_ns += delimiter_ns
         self._busy_ns += delimiter_ns
@@ -304,7 +323,7 @@ class Wire:
         self._announce(kind | ERROR_BUS, senders[0] if senders else None)
 
     def _count_transmit_error(self, endpoint: Endpoint, kind: int) -> None:
-        self._impaired = True
+        self._is_ordinary = False
         if kind != ERROR_ACK or not endpoint._is_passive():  # a node alone on its bus does not go bus-off
             endpoint.transmit_errors += 8
         if endpoint._is_passive():
@@ -358,6 +377,8 @@ class Wire:
                     listener.on_frame(frame, self.clock.now_us)
                 elif len(listener._received) < listener.queue_limit:
                     listener._received.append((frame, self.clock.now_us))
+                else:
+                    listener._overrun(frame, self.clock.now_us)
 
     # -- small change ------------------------------------------------------------------------------------------------
 
@@ -366,10 +387,6 @@ class Wire:
 
     def _has_started(self) -> bool:
         return self._end_us >= 0 and self.clock.now_us * 1000 > self._start_ns
-
-    def _refuse(self, frame: Frame) -> None:
-        frame_bit_counts(frame)  # says what is wrong
-        raise FrameFormatError("a CAN FD frame on a classic wire (no data bit rate)")
 
 
 def find_wire(channel: str) -> Wire | None:

@@ -13,6 +13,7 @@ from pkxyz_ctrl import cycle as cycling
 from pkxyz_ctrl.bus_config import BusConfig, CanConfig
 from pkxyz_ctrl.can.driver import AmplifierDriver, DriverState
 from pkxyz_ctrl.can.frame import Frame
+from pkxyz_ctrl.direct_call import direct
 from pkxyz_ctrl.row import ROW
 from pkxyz_ctrl.safety.gate import GateConfig, TransmitGate
 from pkxyz_ctrl.safety.modes import Event, Mode, next_mode
@@ -58,7 +59,9 @@ class Controller:
         self._event = int(Event.NONE)
         self._blocked = 0
         self._take_sense = self.driver.take_sense
-        cycling.cycle(law, cycling.new_memory(Mode.BOOT), np.zeros((1, 9)))  # loaded now, not in the first tick
+        self._reference: Array = np.zeros((1, 9))  # the latest that was handed in
+        self._cycle = direct(cycling.cycle, law, self.memory, self._reference)
+        self._cycle(law, cycling.new_memory(Mode.BOOT), self._reference)  # loaded now, not in the first tick
 
     # -- start and stop ---------------------------------------------------------------------------------------------
 
@@ -108,8 +111,8 @@ class Controller:
         return driver.sense_fresh
 
     def compute(self, reference: Array, overrun: int) -> None:
-        """Run the cycle on what has come since the SYNC. ``reference`` (n, 9), ``overrun`` ticks skipped before this
-        one.
+        """Run the cycle on what has come since the SYNC. ``reference`` (n, 9) float64, row after row in memory;
+        ``overrun`` ticks skipped before this one. Raises ValueError for another reference.
         """
         c1, c2, c3, status = self._take_sense()
         if status & 1:
@@ -120,7 +123,10 @@ class Controller:
             self.memory["input"]["trips"] = self._blocked
             self._blocked = 0
         self._event = 0
-        cycling.cycle(self.law, self.memory, reference)
+        if reference is not self._reference:
+            _require_rows(reference)
+            self._reference = reference
+        self._cycle(self.law, self.memory, reference)
         mode = _MODE.unpack_from(memory, self._mode_at)[0]
         if mode != self.mode:
             self._enter(mode)
@@ -165,3 +171,11 @@ class Controller:
             emergencies = "".join(f"; {e}" for e in self.driver.emergencies)
             detail = f" [{self.driver.failure}]" if self.driver.failure else ""
             self.faults.append(f"at {row['t_us'] * 1e-6:.4f} s: {reason}{detail}{emergencies}")
+
+
+def _require_rows(reference: Array) -> None:
+    """The compiled cycle doesn't look at what it is given, so it is looked at here, once for each block of rows."""
+    if reference.dtype != np.float64 or reference.ndim != 2 or reference.shape[1] != 9 or len(reference) == 0:
+        raise ValueError(f"a reference is (n, 9) float64 with n > 0, not {reference.shape} {reference.dtype}")
+    if not reference.flags.c_contiguous:
+        raise ValueError("the rows of a reference must follow one another in memory (numpy.ascontiguousarray)")

@@ -75,18 +75,29 @@ def test_all_queued_frames_pass_lowest_identifier_first_and_back_to_back(queue: 
 @given(
     plan=st.lists(st.tuples(st.integers(0, 600), st.integers(0, 2), frames), min_size=1, max_size=12).filter(
         lambda plan: len({p[2].can_id for p in plan}) == len(plan)
-    )
+    ),
+    sent_before=st.booleans(),
 )
-@settings(max_examples=150, deadline=None)
-def test_frames_queued_at_any_time_follow_the_reference_schedule(plan: list[tuple[int, int, Frame]]) -> None:
-    """Reference: whenever the wire is free, the lowest identifier among all that wait by then starts."""
+@settings(max_examples=200, deadline=None)
+def test_frames_queued_at_any_time_follow_the_reference_schedule(
+    plan: list[tuple[int, int, Frame]], sent_before: bool
+) -> None:
+    """Reference: whenever the wire is free, the lowest identifier among all that wait by then starts.
+
+    What was sent before takes a shorter way through the code, and must not take a shorter one through time.
+    """
     clock, _, _, ends = wire_with("0", "1", "2")
+    if sent_before:
+        for _, sender, frame in plan:
+            ends[sender].send(frame)
+        clock.run_until(20_000)
     log: Seen = []
-    clock_end = 20_000
+    begin_us = clock.now_us
+    plan = [(begin_us + t_us, sender, frame) for t_us, sender, frame in plan]
     listener = ends[0]._wire.attach("log", lambda frame, t_us: log.append((t_us, frame)), listen_only=True)
     for t_us, sender, frame in plan:
         clock.call_at(t_us, lambda sender=sender, frame=frame: ends[sender].send(frame))
-    clock.run_until(clock_end)
+    clock.run_until(begin_us + 20_000)
     waiting, free_ns, expected = sorted(plan, key=lambda p: p[0]), 0, []
     while waiting:
         start_ns = max(free_ns, waiting[0][0] * 1000)
@@ -179,6 +190,38 @@ def test_queues_have_limits_and_count_what_they_lose() -> None:
     assert [b.receive_nowait()[0].data for _ in range(2)] == [b"\x00", b"\x01"]
     assert b.receive_nowait() is None
     assert b.overruns == 1
+
+
+def test_a_full_queue_may_be_emptied_before_anything_is_lost() -> None:
+    clock = Lockstep()
+    wire = Wire(clock, NOMINAL)
+    a, kept = wire.attach("a"), []
+    patient = wire.attach("patient", queue_limit=2, on_full=lambda: kept.append(patient.receive_all()))
+    helpless = wire.attach("helpless", queue_limit=2, on_full=lambda: None)
+    for k in range(5):
+        a.send(Frame(k, b""))
+    clock.run_until(1000)
+    assert [[frame.can_id for frame, _ in block] for block in [*kept, patient.receive_all()]] == [[0, 1], [2, 3], [4]]
+    assert [frame.can_id for frame, _ in helpless.receive_all()] == [0, 1]
+    assert (patient.overruns, helpless.overruns) == (0, 3)
+
+
+@pytest.mark.parametrize("by_queue", [False, True])
+def test_whoever_is_unplugged_during_a_delivery_gets_no_more_of_it(by_queue: bool) -> None:
+    clock, wire, _, (a, b) = wire_with("a", "b")
+    late: Seen = []
+    c = wire.attach("c", None if by_queue else lambda frame, t_us: late.append((t_us, frame)))
+    wire.attach("d")  # so that enough of them stay
+    a.send(Frame(1, b""))
+    clock.run_until(1000)
+    assert len(late) + len(c.receive_all()) == 1
+    late.clear()
+    b.on_frame = lambda frame, t_us: c.detach()
+    a.send(Frame(1, b""))
+    clock.run_until(2000)
+    assert late == []
+    assert c.receive_all() == []
+    assert c.overruns == 0
 
 
 def test_what_a_wire_cannot_carry_is_refused_at_send() -> None:

@@ -1,0 +1,22 @@
+"""Compiled kernels called directly, for arguments whose types never change."""
+
+from collections.abc import Callable
+from typing import Any
+
+from numba import typeof
+
+
+def direct(kernel: Any, *examples: object) -> Callable[..., Any]:
+    """``kernel``, compiled for arguments of the types of ``examples``, and to be called with no others.
+
+    At each call numba looks up the types of all arguments, 0.25 us for each structured array; this leaves that out.
+    Lengths may differ, but dtype, number of dimensions and contiguity must not, and nobody checks them. With the
+    compiler off it is ``kernel`` itself.
+    """
+    if not hasattr(kernel, "get_overload"):
+        plain: Callable[..., Any] = kernel
+        return plain
+    types = tuple(typeof(example) for example in examples)
+    kernel.compile(types)
+    compiled: Callable[..., Any] = kernel.get_overload(types)
+    return compiled
