@@ -5,6 +5,7 @@ from collections.abc import Callable
 import numpy as np
 from numpy.typing import NDArray
 
+from hil.excitation import Excitation
 from pkxyz_ctrl.row import ROW
 from pkxyz_ctrl.trajectory import Trajectory
 
@@ -25,12 +26,14 @@ class Blocks:
         ticks: int,
         on_block: Callable[[NDArray[np.void]], None],
         on_progress: Callable[[int, int], None],
+        excitation: Excitation | None = None,
     ) -> None:
         self.ticks = ticks
         self.rows = np.zeros(BLOCK_TICKS, ROW)
         self.done = 0
         self._trajectory = trajectory
         self._period_us = period_us
+        self._excitation = excitation
         self._on_block = on_block
         self._on_progress = on_progress
 
@@ -39,10 +42,13 @@ class Blocks:
         return min(BLOCK_TICKS, self.ticks - self.done)
 
     def reference(self, memory: NDArray[np.void]) -> NDArray[np.float64]:
-        """Rows (n, 9) of the trajectory that the next block may need; says in ``memory`` (1,) where they begin."""
-        first = int(memory["reference_tick"][0])
+        """Rows (n, 9) of the trajectory that the next block may need, or (n, 12) with an excitation; says in
+        ``memory`` (1,) where they begin.
+        """
+        first, count = int(memory["reference_tick"][0]), BLOCK_TICKS + PREVIEW_ROWS
         memory["input"]["reference_base"] = first
-        return self._trajectory.sample(first, BLOCK_TICKS + PREVIEW_ROWS, self._period_us)
+        rows = self._trajectory.sample(first, count, self._period_us)
+        return rows if self._excitation is None else np.hstack([rows, self._excitation.sample(first, count)])
 
     def hand_on(self, count: int) -> None:
         """The first ``count`` rows are complete."""

@@ -48,7 +48,7 @@ def run(
     all. What was run before an exception (Ctrl-C) has been handed on. Raises ``ConfigError`` for a bus that the lane
     can't use and ``StartUpError`` where the amplifier doesn't start.
     """
-    blocks = Blocks(setup.trajectory, setup.bus.period_us, setup.ticks, on_block, on_progress)
+    blocks = Blocks(setup.trajectory, setup.bus.period_us, setup.ticks, on_block, on_progress, setup.excitation)
     law = setup.law
     if lane == "fast":
         plant, memory = setup.new_plant(), new_memory(Mode.IDLE)

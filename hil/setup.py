@@ -6,6 +6,7 @@ from functools import cached_property
 import numpy as np
 from numpy.typing import NDArray
 
+from hil.excitation import Excitation
 from pkxyz_ctrl.bus_config import BusConfig
 from pkxyz_ctrl.controller_config import ControllerConfig
 from pkxyz_ctrl.design.law import count_max, design_law, slew_counts
@@ -30,6 +31,8 @@ class Setup:
     trajectory: Trajectory
     duration_s: float
     seed: int
+    excitation: Excitation | None = None
+    """added to what the controller measures while it tracks"""
 
     @property
     def ticks(self) -> int:

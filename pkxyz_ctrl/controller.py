@@ -175,7 +175,9 @@ class Controller:
 
 def _require_rows(reference: Array) -> None:
     """The compiled cycle doesn't look at what it is given, so it is looked at here, once for each block of rows."""
-    if reference.dtype != np.float64 or reference.ndim != 2 or reference.shape[1] != 9 or len(reference) == 0:
-        raise ValueError(f"a reference is (n, 9) float64 with n > 0, not {reference.shape} {reference.dtype}")
+    if reference.dtype != np.float64 or reference.ndim != 2 or reference.shape[1] not in (9, 12) or len(reference) == 0:
+        raise ValueError(
+            f"a reference is (n, 9) or (n, 12) float64 with n > 0, not {reference.shape} {reference.dtype}"
+        )
     if not reference.flags.c_contiguous:
         raise ValueError("the rows of a reference must follow one another in memory (numpy.ascontiguousarray)")

@@ -62,6 +62,7 @@ MEMORY = np.dtype(
     align=True,
 )
 
+_ROW_LENGTH = 9
 _UNUSABLE = int(SenseStatus.MISSING | SenseStatus.CRC | SenseStatus.LENGTH | SenseStatus.DUPLICATE)
 _NONE, _HOME, _HOMED, _ENABLE, _TRACK, _TRIP = (
     int(e) for e in (Event.NONE, Event.HOME, Event.HOMED, Event.ENABLE, Event.TRACK, Event.TRIP)
@@ -81,10 +82,11 @@ def new_memory(mode: Mode = Mode.BOOT) -> NDArray[np.void]:
 @njit(cache=True)
 def cycle(law_array: Records, memory_array: Records, reference: Array) -> None:
     """One period. ``law_array`` (1,) of ``LAW``, ``memory_array`` (1,) of ``MEMORY``, ``reference`` (n, 9) rows of
-    the trajectory.
+    the trajectory, or (n, 12) with an excitation.
 
     Row ``reference_tick - reference_base`` is the set-point at this sample; the law looks up to three rows further.
-    Rows before the first and past the last are taken as the first and the last.
+    Rows before the first and past the last are taken as the first and the last. The excitation, in m, is added to
+    what is measured while tracking, and so passes round the loop: seen over added is the sensitivity.
     """
     law, memory = law_array[0], memory_array[0]
     _handle(law, memory, _asked(law, memory))
@@ -94,6 +96,8 @@ def cycle(law_array: Records, memory_array: Records, reference: Array) -> None:
         tick.measure(law["tick"], memory["tick"], seen["sense_count"])
         if memory["mode"] == _HOMING:
             _average(law, memory)
+        if reference.shape[1] > _ROW_LENGTH and memory["mode"] == _TRACKING:
+            _excite(memory, reference)
     tick.estimate(law["tick"], memory["tick"], usable)
     saturated = 0
     here, now, after = memory["here"], memory["now"], memory["after"]
@@ -169,11 +173,22 @@ def _average(law: np.void, memory: np.void) -> None:
 
 
 @njit(cache=True)
+def _excite(memory: np.void, reference: Array) -> None:
+    """Add the excitation of this sample to the measurement; outside the rows handed in there is none."""
+    index = memory["reference_tick"] - memory["input"]["reference_base"]
+    if 0 <= index < len(reference):
+        for i in range(3):
+            memory["tick"]["measurement_m"][i] += reference[index, _ROW_LENGTH + i]
+
+
+@njit(cache=True)
 def _reference_row(memory: np.void, reference: Array, ahead: int, out: Array) -> None:
     """Write the row (9,) of the set-point ``ahead`` ticks from this one to ``out``."""
     if memory["mode"] == _TRACKING:
         index = memory["reference_tick"] - memory["input"]["reference_base"] + ahead
-        out[:] = reference[min(max(index, 0), len(reference) - 1)]
+        index = min(max(index, 0), len(reference) - 1)
+        for i in range(_ROW_LENGTH):
+            out[i] = reference[index, i]
     else:
         out[:] = memory["setpoint"]
 

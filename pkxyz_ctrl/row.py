@@ -24,7 +24,7 @@ CONTROLLER_FIELDS = [
     ("sense_count", "i4", (3,)),
     ("drive_count", "i4", (3,)),  # goes to the combs at the next SYNC
     ("reference_m", *_VECTOR),  # set-point at the sample of this tick
-    ("measurement_m", *_VECTOR),  # position from this tick's sense frame alone
+    ("measurement_m", *_VECTOR),  # position from this tick's sense frame alone, and the excitation, if there is one
     ("estimate_m", *_VECTOR),  # filtered position at the sample of this tick
     ("estimate_m_per_s", *_VECTOR),
     ("disturbance_n", *_VECTOR),  # estimated disturbance force at the platform
