@@ -12,7 +12,7 @@ import typer
 from rich.console import Console
 from rich.table import Table
 
-from hil import bench_cli, check_amplifier_cli, latency_cli, mechanics_cli, run_cli
+from hil import bench_cli, check_amplifier_cli, latency_cli, mechanics_cli, replay_cli, run_cli
 from pkxyz_ctrl.config import CONFIG_DIR, ConfigError, names
 
 app = typer.Typer(
@@ -132,6 +132,7 @@ app.command("sil")(sil)
 app.command("configs")(configs)
 app.command("run")(run_cli.run)
 app.command("plant")(run_cli.plant)
+app.command("replay")(replay_cli.replay)
 app.command("latency")(latency_cli.latency)
 app.command("paper")(mechanics_cli.paper)
 app.command("workspace")(mechanics_cli.workspace)

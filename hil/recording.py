@@ -116,7 +116,7 @@ def recover(path: str | Path) -> None:
     part = path.with_name(path.name + ".part")
     try:
         with _JournalBatches(journal) as (schema, batches), pq.ParquetWriter(
-            part, schema, compression="zstd", compression_level=1, use_dictionary=False
+            part, schema, compression="zstd", compression_level=1, use_dictionary=False, write_page_checksum=True,
         ) as writer:  # fmt: skip
             for group in _grouped(batches):
                 writer.write_table(pa.Table.from_batches(group, schema), row_group_size=_GROUP_ROWS)
@@ -145,7 +145,7 @@ class Recording:
         path = Path(path)
         try:
             if path.is_file() or not journal_of(path).is_file():
-                file = pq.ParquetFile(path, pre_buffer=False)
+                file = pq.ParquetFile(path, pre_buffer=False, page_checksum_verification=True)
                 return cls(path, _metadata(file.schema_arrow, path), file, None)
             with _JournalBatches(journal_of(path)) as (schema, batches):
                 table = pa.Table.from_batches(list(batches), schema)
@@ -168,6 +168,7 @@ class Recording:
     def blocks(self, fields: Sequence[str]) -> Iterator[dict[str, NDArray[Any]]]:
         """Fields of ``ROW`` for some thousand ticks at a time, so that no recording is too long."""
         names = [name for field in fields for name in columns(field)]
+        self._require(names)
         for batch in self._groups(names):
             yield {
                 field: np.stack([batch.column(name).to_numpy() for name in columns(field)], axis=1)
@@ -182,17 +183,27 @@ class Recording:
             yield from self._table.to_batches()
             return
         for group in range(self._file.num_row_groups):
-            yield self._file.read_row_group(group, columns=names, use_threads=False)
+            try:
+                table = self._file.read_row_group(group, columns=names, use_threads=False)
+            except (OSError, pa.ArrowException) as error:
+                raise self._damaged(error) from None
+            yield table
 
-    def _read(self, names: Sequence[str]) -> list[NDArray[Any]]:
+    def _require(self, names: Sequence[str]) -> None:
         known = self._table.column_names if self._file is None else self._file.schema_arrow.names
         for name in names:
             if name not in known:
                 raise RecordingError(f"{self.path}: has no column {name!r}; it has: {', '.join(known)}")
+
+    def _damaged(self, error: Exception) -> RecordingError:
+        return RecordingError(f"{self.path}: is damaged: {_reason(error)}")
+
+    def _read(self, names: Sequence[str]) -> list[NDArray[Any]]:
+        self._require(names)
         try:
             table = self._table if self._file is None else self._file.read(columns=list(names))
         except (OSError, pa.ArrowException) as error:
-            raise RecordingError(f"{self.path}: is damaged: {_reason(error)}") from None
+            raise self._damaged(error) from None
         return [table.column(name).to_numpy() for name in names]
 
 

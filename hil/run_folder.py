@@ -3,12 +3,14 @@
 import importlib.metadata
 import json
 import platform
+import re
+import shutil
 import sys
 from pathlib import Path
 from typing import Any
 
 from hil.metrics import evaluate
-from hil.scenario import Scenario, resolve
+from hil.scenario import Scenario, resolve, tables
 from pkxyz_ctrl.config import ConfigError, write_toml
 
 RECORDING, FRAMES, CONFIG, SUMMARY, PICTURE = (
@@ -19,10 +21,14 @@ RECORDING, FRAMES, CONFIG, SUMMARY, PICTURE = (
     "report.png",
 )
 _OURS = {RECORDING, FRAMES, CONFIG, SUMMARY, PICTURE, RECORDING + ".journal", RECORDING + ".part"}
+_TABLE = re.compile(r"reference\.\d+\.csv")
 
 
 class RunFolder:
-    """A folder of one run, made anew: an earlier run in it is replaced, anything else is left alone and refused."""
+    """A folder of one run, made anew: an earlier run in it is replaced, anything else is left alone and refused.
+
+    Tables of the reference are copied into it (``reference.3.csv``): they are inputs that a replay needs.
+    """
 
     def __init__(self, path: Path) -> None:
         """Raises ``ConfigError`` if the folder can't be had or holds what is not a run."""
@@ -34,7 +40,7 @@ class RunFolder:
             raise ConfigError(
                 f"--out: {path}: {(error.strerror or str(error)).lower()}; give a folder that can be written"
             ) from None
-        if present - _OURS or (present and CONFIG not in present):
+        if {name for name in present - _OURS if not _TABLE.fullmatch(name)} or (present and CONFIG not in present):
             raise ConfigError(f"--out: {path}: holds files that are not a run's; give an empty or a new folder")
         try:
             for name in present:
@@ -51,6 +57,8 @@ class RunFolder:
         """Write everything that decides about the run, and return it."""
         resolved = resolve(scenario)
         try:
+            for name, table in tables(scenario).items():
+                shutil.copyfile(table, self.path / name)
             write_toml(resolved, self.config)
         except OSError as error:
             raise ConfigError(f"{self.config}: {(error.strerror or str(error)).lower()}; give another --out") from None

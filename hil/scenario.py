@@ -20,7 +20,7 @@ from pkxyz_ctrl.stage import Stage
 from pkxyz_ctrl.stage_config import StageConfig
 from pkxyz_ctrl.trajectory import Segment, Trajectory, TrajectoryError
 from pkxyz_ctrl.trajectory.check import DriveLimits, check_against
-from pkxyz_ctrl.trajectory.table import in_folder
+from pkxyz_ctrl.trajectory.table import Table, in_folder
 from sim.config import Device, PlantConfig
 
 if TYPE_CHECKING:
@@ -161,3 +161,39 @@ def resolve(scenario: Scenario) -> dict[str, Any]:
     if tables:
         data["sha256"] = tables
     return {**data, "digest": config.digest(data)}
+
+
+def table_name(n: int) -> str:
+    """What the file of table ``reference.n`` is called in a run's folder."""
+    return f"reference.{n}.csv"
+
+
+def tables(scenario: Scenario) -> dict[str, Path]:
+    """The files that the reference is read from, by their names in a run's folder."""
+    folder = scenario.source.parent
+    return {table_name(n): folder / s.file for n, s in enumerate(scenario.config.reference) if isinstance(s, Table)}
+
+
+def restore(resolved: dict[str, Any], folder: Path) -> Scenario:
+    """The scenario that ``resolve`` was given, from its plain data; ``folder`` is that of the run.
+
+    Raises ``ConfigError`` for data of another version of this program, and for a table that is not the one of then.
+    """
+    source = str(folder)
+    names = ("stage", "plant", "controller", "bus")
+    own = {key: value for key, value in resolved.items() if key not in (*names, "sha256", "digest")}
+    scenario = config.parse({**own, **{key: resolved[key]["name"] for key in names}}, ScenarioConfig, source)
+    models: dict[str, type[BaseModel]] = {
+        "stage": StageConfig, "plant": PlantConfig, "controller": ControllerConfig, "bus": BusConfig,
+    }  # fmt: skip
+    parts: dict[str, Any] = {key: config.parse(resolved[key], model, source) for key, model in models.items()}
+    held = [
+        segment.model_copy(update={"file": table_name(n)}) if isinstance(segment, Table) else segment
+        for n, segment in enumerate(scenario.reference)
+    ]
+    trajectory = Trajectory(in_folder(held, folder))
+    for n, segment in enumerate(trajectory.segments):
+        if segment.source_sha256 != resolved.get("sha256", {}).get(f"reference.{n}"):
+            raise ConfigError(f"{folder}: reference.{n}: its table is not the one of the run")
+    device = config.parse(resolved["stage"], Device, source)
+    return Scenario(folder, scenario, device=device, trajectory=trajectory, **parts)

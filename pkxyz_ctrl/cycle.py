@@ -224,6 +224,7 @@ def _write_row(law: np.void, memory: np.void, trips: int, saturated: int) -> Non
     row["tick"] = memory["tick_index"]
     row["reference_tick"] = memory["reference_tick"] if memory["mode"] == _TRACKING else -1
     row["mode"], row["trips"], row["sense_status"] = memory["mode"], trips, seen["sense_status"]
+    row["request"], row["outside_trips"] = seen["event"], seen["trips"]
     row["node_events"], row["overrun"], row["saturated"] = seen["node_events"], seen["overrun"], saturated
     row["active_set_steps"] = state["active_set_steps"]
     for i in range(3):

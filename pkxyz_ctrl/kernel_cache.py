@@ -13,7 +13,7 @@ from pathlib import Path
 
 _PACKAGES = ("pkxyz_ctrl", "hil", "sim")
 _IMPORT = re.compile(r"^from ((?:pkxyz_ctrl|hil|sim)[\w.]*) import (.*)", re.MULTILINE)
-_KEPT = 4
+_KEPT = 12  # several checkouts of one developer, a few edits each
 
 
 def choose_kernel_cache() -> None:

@@ -14,8 +14,10 @@ CONTROLLER_FIELDS = [
     ("tick", "i8"),
     ("reference_tick", "i8"),  # index into the trajectory, -1 before tracking
     ("mode", "i4"),  # safety.modes.Mode after this tick
-    ("event", "i4"),  # safety.modes.Event that this tick handled
+    ("request", "i4"),  # safety.modes.Event that was asked for from outside
+    ("event", "i4"),  # safety.modes.Event that this tick handled last: of the request, by itself, or a trip
     ("trips", "i8"),  # safety.monitors.Trip bits raised in this tick
+    ("outside_trips", "i8"),  # those of them that came from outside the cycle: the gate, an operator
     ("sense_status", "i4"),  # bits of the driver about the sense frame of this tick
     ("node_events", "i4"),
     ("overrun", "i4"),  # ticks skipped before this one

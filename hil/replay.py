@@ -1,0 +1,180 @@
+"""A recording once more through the tick: the same inputs, and every output compared bit for bit.
+
+What a tick is handed is all in its row: sense counts and status, what was seen of the node, ticks skipped, events asked
+for and trips from outside. The law is designed anew from the recorded configuration, the reference planned anew. So a
+replay that agrees says that the recording is whole and that this program is still the one that made it; one that does
+not says where the two part.
+"""
+
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass, field, replace
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+
+from hil.blocks import PREVIEW_ROWS
+from hil.recording import Recording, RecordingError
+from hil.run_folder import versions
+from hil.scenario import Scenario, resolve, restore
+from pkxyz_ctrl import cycle as cycling
+from pkxyz_ctrl.controller_config import ControllerConfig
+from pkxyz_ctrl.direct_call import direct
+from pkxyz_ctrl.row import CONTROLLER_FIELDS, ROW, columns
+from pkxyz_ctrl.safety.modes import Mode
+
+Rows = NDArray[np.void]
+
+_INPUTS = {  # of the cycle, by the row's name for them
+    "request": "event", "sense_status": "sense_status", "node_events": "node_events", "overrun": "overrun",
+    "sense_count": "sense_count", "outside_trips": "trips",
+}  # fmt: skip
+_FIELDS = tuple(str(entry[0]) for entry in CONTROLLER_FIELDS)
+_FLOW = (
+    "t_us", "tick", "sense_f", "measurement_m", "innovation_m", "estimate_m", "estimate_m_per_s", "disturbance_n",
+    "reference_tick", "reference_m", "demand_n", "force_n", "slack_n", "active_set_steps", "saturated", "drive_count",
+    "voltage_v",
+)  # fmt: skip
+_COMPARED = (*_FLOW, *(name for name in _FIELDS if name not in _FLOW and name not in _INPUTS))
+"""Fields in the order in which a tick computes them, so that a cause is named before its consequences."""
+
+
+@dataclass
+class Difference:
+    """One signal that did not come out as recorded."""
+
+    signal: str
+    """name of the column"""
+    tick: int
+    """the first one"""
+    t_us: int
+    recorded: float
+    """there"""
+    replayed: float
+    ticks: int
+    """in how many ticks it differs"""
+
+
+@dataclass
+class Replay:
+    """What came of it."""
+
+    ticks: int = 0
+    differences: list[Difference] = field(default_factory=list)
+    """the first one first; signals that differ from the same tick on in the order of computation"""
+    notes: list[str] = field(default_factory=list)
+    """what a difference may come from"""
+
+    @property
+    def identical(self) -> bool:
+        """Whether every bit came out as recorded."""
+        return not self.differences
+
+
+def replay(
+    path: Path,
+    controller: ControllerConfig | None = None,
+    on_progress: Callable[[int, int], None] = lambda done, total: None,
+) -> Replay:
+    """Replay the recording at ``path``; with a ``ControllerConfig``, as if that had been in command.
+
+    Raises ``RecordingError`` for one that can't be read or lacks rows, and ``ConfigError`` for a configuration that
+    this program doesn't know.
+    """
+    recording = Recording.open(path)
+    scenario = _scenario(recording, path.parent)
+    if controller is not None:
+        scenario = replace(scenario, controller=controller)
+    found: dict[str, Difference] = {}
+    result = Replay(notes=_notes(recording, scenario))
+    player = _Player(scenario)
+    for recorded in _blocks(recording):
+        replayed = player.play(recorded)
+        for name in _COMPARED:
+            _compare(name, recorded, replayed, found)
+        result.ticks += len(recorded)
+        on_progress(result.ticks, recording.ticks)
+    order = {column: n for n, column in enumerate(c for name in _COMPARED for c in columns(name))}
+    result.differences = sorted(found.values(), key=lambda d: (d.tick, order[d.signal]))
+    return result
+
+
+class _Player:
+    """A cycle in the state in which the first tick of every run finds it: the node operational, nothing known."""
+
+    def __init__(self, scenario: Scenario) -> None:
+        setup = scenario.setup()
+        self._law = setup.law
+        self._memory = cycling.new_memory(Mode.IDLE)
+        self._trajectory, self._period_us = scenario.trajectory, scenario.bus.period_us
+        self._cycle = direct(cycling.cycle, self._law, self._memory, np.zeros((1, 9)))
+
+    def play(self, recorded: Rows) -> Rows:
+        """The rows (n,) that the inputs of these rows (n,), which follow those of the last call, lead to."""
+        law, memory, cycle = self._law, self._memory, self._cycle
+        replayed = np.zeros(len(recorded), ROW)
+        inputs = np.zeros(len(recorded), cycling.INPUT)
+        for row_name, name in _INPUTS.items():
+            inputs[name] = recorded[row_name]
+        first = int(memory["reference_tick"][0])
+        inputs["reference_base"] = first
+        reference = self._trajectory.sample(first, len(recorded) + PREVIEW_ROWS, self._period_us)
+        seen, row = memory["input"], memory["row"]
+        for n in range(len(recorded)):
+            seen[0] = inputs[n]
+            cycle(law, memory, reference)
+            replayed[n] = row[0]
+        return replayed
+
+
+def _scenario(recording: Recording, folder: Path) -> Scenario:
+    try:
+        return restore(recording.metadata["config"], folder)
+    except KeyError as error:
+        raise RecordingError(f"{recording.path}: its metadata lack {error}: not a recording of a run") from None
+
+
+def _blocks(recording: Recording) -> Iterator[Rows]:
+    """Rows with what the controller recorded. Raises ``RecordingError`` where ticks are missing."""
+    expected = 0
+    for block in recording.blocks(_FIELDS):
+        rows = np.zeros(len(block["tick"]), ROW)
+        for name in _FIELDS:
+            rows[name] = block[name]
+        missing = np.flatnonzero(rows["tick"] != expected + np.arange(len(rows)))
+        if len(missing):
+            at = int(missing[0])
+            raise RecordingError(
+                f"{recording.path}: row {expected + at} is of tick {rows['tick'][at]}: rows are missing, and what came "
+                "after them cannot be replayed"
+            )
+        expected += len(rows)
+        yield rows
+
+
+def _compare(name: str, recorded: Rows, replayed: Rows, found: dict[str, Difference]) -> None:
+    """Note in ``found`` which columns of a field differ in a bit."""
+    left, right = (np.ascontiguousarray(rows[name]).reshape(len(rows), -1) for rows in (recorded, replayed))
+    bits = np.dtype(f"u{left.dtype.itemsize}")
+    for n, column in enumerate(columns(name)):
+        at = np.flatnonzero(left[:, n].view(bits) != right[:, n].view(bits))
+        if column in found:
+            found[column].ticks += len(at)
+        elif len(at):
+            k = int(at[0])
+            first = replayed[k]
+            found[column] = Difference(
+                column, int(first["tick"]), int(first["t_us"]), left[k, n].item(), right[k, n].item(), len(at)
+            )
+
+
+def _notes(recording: Recording, scenario: Scenario) -> list[str]:
+    """In what the program of then was another one."""
+    notes = []
+    if resolve(scenario)["digest"] != recording.metadata.get("digest"):
+        notes.append("the configuration is not the recorded one")
+    now = versions()
+    for package, version in recording.metadata.get("versions", {}).items():
+        if now.get(package) != version:
+            notes.append(f"{package} was {version}, is {now.get(package, 'not installed')}")
+    return notes

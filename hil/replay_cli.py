@@ -1,0 +1,99 @@
+"""``pkxyz replay``: is this recording what the program would do again?"""
+
+import dataclasses
+import json
+import math
+import sys
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated
+
+import typer
+from rich.console import Console
+from rich.table import Table
+
+if TYPE_CHECKING:
+    from hil.replay import Replay
+    from pkxyz_ctrl.controller_config import ControllerConfig
+
+_screen = Console(highlight=False)
+_notes = Console(stderr=True, highlight=False)
+_SHOWN = 8
+
+
+def replay(
+    folder: Annotated[Path, typer.Argument(metavar="RUN_FOLDER", help="What a run left, of any lane.")],
+    controller: Annotated[
+        str | None, typer.Option(help="Name or file, instead of the recorded one: where would it act differently?")
+    ] = None,
+    as_json: Annotated[bool, typer.Option("--json", help="Print JSON, and nothing else.")] = False,
+) -> None:
+    """Put a recording through the tick again; exit code 0 if it agrees in every bit, 1 if not, 2 for bad input."""
+    from hil.recording import RecordingError
+    from hil.run_folder import RECORDING
+    from pkxyz_ctrl.config import load
+    from pkxyz_ctrl.controller_config import ControllerConfig
+    from pkxyz_ctrl.design.estimator_gain import DesignError
+
+    other = None if controller is None else load("controllers", controller, ControllerConfig)
+    try:
+        result = _with_progress(folder / RECORDING, other, quiet=as_json)
+    except (RecordingError, DesignError) as error:
+        print(f"pkxyz: {error}", file=sys.stderr)
+        raise typer.Exit(2) from None
+    if as_json:
+        print(json.dumps(_plain(result, folder), allow_nan=False))
+    else:
+        _show(result)
+    raise typer.Exit(0 if result.identical else 1)
+
+
+def _with_progress(path: Path, controller: "ControllerConfig | None", *, quiet: bool) -> "Replay":
+    from hil.replay import replay as played
+
+    if quiet or not _notes.is_terminal:
+        return played(path, controller)
+    from rich.progress import Progress
+
+    with Progress(console=_notes, transient=True) as progress:
+        task = progress.add_task(f"replaying {path.parent.name}", total=None)
+        return played(path, controller, lambda done, total: progress.update(task, completed=done, total=total))
+
+
+def _plain(result: "Replay", folder: Path) -> dict[str, object]:
+    def number(value: float) -> float | str:
+        return value if math.isfinite(value) else str(value)
+
+    found = [
+        {**dataclasses.asdict(d), "recorded": number(d.recorded), "replayed": number(d.replayed)}
+        for d in result.differences
+    ]
+    return {
+        "folder": str(folder),
+        "ticks": result.ticks,
+        "identical": result.identical,
+        "first_difference": found[0] if found else None,
+        "differences": found,
+        "notes": result.notes,
+    }
+
+
+def _show(result: "Replay") -> None:
+    if result.identical:
+        _screen.print(f"{result.ticks} ticks replayed, identical in every bit")
+    else:
+        first = result.differences[0]
+        _screen.print(
+            f"first difference: tick {first.tick}, at {first.t_us * 1e-6:.6f} s, {first.signal}: recorded "
+            f"{first.recorded!r}, replayed {first.replayed!r}",
+            soft_wrap=True,
+        )
+        table = Table(box=None, pad_edge=False, header_style="dim")
+        for heading in ("signal", "from tick", "ticks", "recorded", "replayed"):
+            table.add_column(heading, justify="left" if heading == "signal" else "right")
+        for d in result.differences[:_SHOWN]:
+            table.add_row(d.signal, str(d.tick), str(d.ticks), f"{d.recorded:.9g}", f"{d.replayed:.9g}")
+        _screen.print(table)
+        left = len(result.differences) - _SHOWN
+        _screen.print(f"{f'and {left} signals more; ' if left > 0 else ''}{result.ticks} ticks replayed")
+    for note in result.notes:
+        _screen.print(f"note: {note}", soft_wrap=True)

@@ -1,0 +1,208 @@
+"""Replay: every input of a tick is in its row, so the same bits come out; and whatever was altered is named."""
+
+import dataclasses
+import json
+
+import numpy as np
+import pytest
+from hypothesis import HealthCheck, given, settings
+from hypothesis import strategies as st
+from loop_rig import Cycle, counts_at
+from test_hil_cli import pkxyz
+from typer.testing import CliRunner
+
+from hil.cli import app
+from hil.recording import Recording, RecordingError, RecordingWriter, journal_of
+from hil.replay import replay
+from hil.run_folder import RunFolder, metadata_of
+from hil.scenario import load_scenario, resolve, restore
+from hil.sil import run_into
+from pkxyz_ctrl.config import load, names
+from pkxyz_ctrl.controller_config import ControllerConfig
+from pkxyz_ctrl.row import CONTROLLER_FIELDS, ROW, columns
+from pkxyz_ctrl.safety.modes import Event, Mode
+
+INPUTS = {"request", "sense_status", "node_events", "overrun", "outside_trips", "sense_count"}
+CASES = [
+    ("raster", "lockstep", {"plant": "harsh"}),
+    ("raster", "fast", {"plant": "mild", "bus": "classic_2k"}),
+    ("raster", "fast", {"bus": "local_20k"}),
+    ("raster", "fast", {"controller": "open_loop"}),
+    ("path", "lockstep", {}),
+]
+
+
+def scenario_of(name, duration_s=0.5, **changes):
+    loaded = load_scenario(name, **changes)
+    return dataclasses.replace(loaded, config=loaded.config.model_copy(update={"duration_s": duration_s}))
+
+
+def rows_of(path):
+    recording = Recording.open(path)
+    rows = np.zeros(recording.ticks, ROW)
+    for name in ROW.names:
+        rows[name] = recording.vector(name)
+    return rows, recording.metadata
+
+
+def written(folder, rows, metadata):
+    folder.mkdir(exist_ok=True)
+    with RecordingWriter(folder / "recording.parquet", metadata) as writer:
+        writer.write(rows)
+    return folder / "recording.parquet"
+
+
+@pytest.fixture(scope="module")
+def run(tmp_path_factory):
+    """The folder of 0.5 s of the default scenario in the fast lane, its rows and metadata."""
+    folder = RunFolder(tmp_path_factory.mktemp("replay") / "run")
+    run_into(folder, scenario_of("raster"), "fast", lambda done, total: None)
+    return folder.path, *rows_of(folder.recording)
+
+
+@pytest.mark.parametrize(("name", "lane", "changes"), CASES)
+def test_a_run_of_either_lane_replays_bit_for_bit(tmp_path, name, lane, changes):
+    scenario = scenario_of(name, **changes)
+    folder = RunFolder(tmp_path / "run")
+    run_into(folder, scenario, lane, lambda done, total: None)
+    result = replay(folder.recording)
+    assert result.differences == []
+    assert result.notes == []
+    assert result.ticks == round(0.5e6 / scenario.bus.period_us)
+    assert (Recording.open(folder.recording)["mode"] == Mode.TRACKING).mean() > 0.8
+
+
+@pytest.mark.parametrize("name", names("scenarios"))
+def test_a_scenario_comes_back_from_what_it_was_resolved_to(tmp_path, name):
+    scenario = load_scenario(name)
+    folder = RunFolder(tmp_path / "run")
+    resolved = folder.write_config(scenario)
+    back = restore(json.loads(json.dumps(resolved)), folder.path)
+    assert resolve(back) == resolved
+    assert back.device == scenario.device
+    first, second = (s.trajectory.sample(0, 3000, 333) for s in (scenario, back))
+    assert first.tobytes() == second.tobytes()
+
+
+TROUBLE = st.fixed_dictionaries(
+    {"tick": st.integers(0, 400)},
+    optional={
+        "status": st.integers(0, 31),
+        "event": st.sampled_from([int(e) for e in Event]),
+        "trips": st.sampled_from([0, 1 << 22, 1 << 23]),
+        "node_events": st.sampled_from([0, 0, 0, 1, 8]),
+        "overrun": st.integers(0, 12),
+        "jump_m": st.floats(-3e-6, 3e-6),
+    },
+)
+
+
+@settings(max_examples=20, deadline=None, suppress_health_check=[HealthCheck.function_scoped_fixture])
+@given(st.lists(TROUBLE, max_size=8), st.integers(0, 2**32 - 1))
+def test_whatever_happened_to_the_controller_is_in_the_recording(tmp_path, troubles, seed):
+    """Requests in any mode, trips from outside, lost ticks, bad frames: the rows of a cycle fed by hand replay."""
+    scenario = scenario_of("raster")
+    cycle = Cycle(scenario.setup().law, scenario.trajectory.sample(0, 1000, scenario.bus.period_us))
+    noise = np.random.default_rng(seed).normal(scale=2e-9, size=(420, 3))
+    at = {trouble["tick"]: trouble for trouble in troubles}
+    rows = np.zeros(420, ROW)
+    for tick in range(420):
+        trouble = dict(at.get(tick, {}))
+        trouble.pop("tick", None)
+        stroke_m = noise[tick] + trouble.pop("jump_m", 0.0)
+        rows[tick] = cycle.tick(counts_at(stroke_m), **trouble)
+    resolved = resolve(scenario)
+    result = replay(written(tmp_path / "by_hand", rows, metadata_of(scenario, "fast", resolved)))
+    assert result.differences == []
+    assert result.ticks == 420
+
+
+@settings(max_examples=15, deadline=None, suppress_health_check=[HealthCheck.function_scoped_fixture])
+@given(st.data())
+def test_one_altered_bit_of_an_output_is_named_by_tick_and_signal(run, tmp_path, data):
+    _, rows, metadata = run
+    name = data.draw(st.sampled_from([n for n, *_ in CONTROLLER_FIELDS if n not in INPUTS | {"tick"}]))
+    tick = data.draw(st.integers(0, len(rows) - 1))
+    altered = rows.copy()
+    values = altered[name].reshape(len(rows), -1)
+    which = data.draw(st.integers(0, values.shape[1] - 1))
+    bytes_ = values[tick, which : which + 1].copy()
+    bytes_.view(np.uint8)[data.draw(st.integers(0, bytes_.itemsize - 1))] ^= 1 << data.draw(st.integers(0, 7))
+    values[tick, which] = bytes_[0]
+    altered[name] = values.reshape(altered[name].shape)
+    result = replay(written(tmp_path / "altered", altered, metadata))
+    assert [(d.signal, d.tick, d.ticks) for d in result.differences] == [(columns(name)[which], tick, 1)]
+    assert result.differences[0].t_us == tick * 200
+
+
+def test_one_altered_input_is_named_by_what_it_leads_to(run, tmp_path):
+    _, rows, metadata = run
+    altered = rows.copy()
+    altered["sense_count"][1200, 1] += 1
+    first = replay(written(tmp_path / "altered", altered, metadata)).differences[0]
+    assert (first.tick, first.signal) == (1200, "sense_2_f")
+    assert first.replayed - first.recorded == pytest.approx(68e-18, rel=1e-6)
+
+
+def test_one_altered_gain_is_named_by_the_first_signal_that_it_moves(run, tmp_path):
+    """The regulator's: the estimate agrees until the first force that it shapes, in the first tick with one."""
+    folder, rows, metadata = run
+    altered = json.loads(json.dumps(metadata))
+    altered["config"]["controller"]["regulator"]["position_error_m"] *= 1 + 1e-9
+    result = replay(written(tmp_path / "altered", rows, altered))
+    first = result.differences[0]
+    assert first.signal.startswith("demand_")
+    assert rows["mode"][first.tick] in (Mode.ENABLED, Mode.TRACKING)
+    assert abs(first.replayed - first.recorded) < 1e-6 * abs(first.recorded)
+    assert result.notes == ["the configuration is not the recorded one"]
+    assert not any(d.tick < first.tick for d in result.differences)
+    other = replay(folder / "recording.parquet", load("controllers", "open_loop", ControllerConfig))
+    assert other.differences[0].signal.startswith("demand_")
+
+
+def test_a_recording_that_was_cut_off_replays_as_far_as_it_goes(run, tmp_path):
+    _, rows, metadata = run
+    writer = RecordingWriter(tmp_path / "recording.parquet", metadata)
+    writer.write(rows)
+    assert journal_of(tmp_path / "recording.parquet").is_file()  # never closed, as if killed
+    result = replay(tmp_path / "recording.parquet")
+    assert result.identical
+    assert result.ticks == 2048
+
+
+def test_rows_that_are_missing_are_no_difference_but_an_error(run, tmp_path):
+    _, rows, metadata = run
+    with pytest.raises(RecordingError, match="row 700 is of tick 701: rows are missing"):
+        replay(written(tmp_path / "gap", np.delete(rows, 700), metadata))
+
+
+def test_a_table_is_kept_with_the_run_and_may_not_change(tmp_path):
+    folder = RunFolder(tmp_path / "run")
+    run_into(folder, scenario_of("path"), "fast", lambda done, total: None)
+    (table,) = folder.path.glob("reference.*.csv")
+    assert RunFolder(folder.path).path.is_dir()  # still taken for a run, and replaced
+    run_into(RunFolder(folder.path), scenario_of("path"), "fast", lambda done, total: None)
+    text = table.read_text(encoding="utf-8").rstrip()
+    table.write_text(text + "0\n", encoding="utf-8")
+    with pytest.raises(ValueError, match="its table is not the one of the run"):
+        replay(folder.recording)
+
+
+def test_the_command(run, tmp_path):
+    folder, rows, metadata = run
+    call = CliRunner().invoke
+    same = call(app, ["replay", str(folder)])
+    assert (same.exit_code, same.stdout) == (0, "2500 ticks replayed, identical in every bit\n")
+    altered = rows.copy()
+    altered["voltage_v"][2000, 2] += 1e-9
+    changed = written(tmp_path / "altered", altered, metadata).parent
+    told = call(app, ["replay", str(changed), "--json"])
+    assert told.exit_code == 1
+    first = json.loads(told.stdout)["first_difference"]
+    assert (first["signal"], first["tick"], first["ticks"]) == ("voltage_3_v", 2000, 1)
+    shown = call(app, ["replay", str(changed)])
+    assert shown.exit_code == 1
+    assert shown.stdout.startswith("first difference: tick 2000, at 0.400000 s, voltage_3_v: recorded ")
+    missing = pkxyz("replay", "nowhere", cwd=tmp_path)
+    assert missing.returncode == 2
+    assert missing.stderr == "pkxyz: nowhere/recording.parquet: no such recording\n"
