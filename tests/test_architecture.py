@@ -30,6 +30,7 @@ ALLOWED: dict[str, tuple[str, ...]] = {
     "pkxyz_ctrl.runtime": ("pkxyz_ctrl.controller", "pkxyz_ctrl.can.frame", "numpy", *VALUES),
     "pkxyz_ctrl.controller": (
         *("pkxyz_ctrl.cycle", "pkxyz_ctrl.row", "pkxyz_ctrl.bus_config", "pkxyz_ctrl.can", "pkxyz_ctrl.safety"),
+        "pkxyz_ctrl.direct_call",
         *("numpy", *VALUES),
     ),
     "sim": (*NUMBERS, *VALUES, "scipy", "pydantic", "tomllib", "pathlib"),
