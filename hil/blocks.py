@@ -12,8 +12,9 @@ from pkxyz_ctrl.trajectory import Trajectory
 BLOCK_TICKS = 4096
 """0.8 s at 5 kHz; bounds the memory of a run and what a killed one loses."""
 
-PREVIEW_ROWS = 4
-"""Rows of the reference that the law may look at past its own: two periods of delay, and an interval after them."""
+PREVIEW_ROWS = 25
+"""Rows of the reference that the law may look at past its own: two periods of delay, the longest horizon of a plan, and
+the intervals after them."""
 
 
 class Blocks:

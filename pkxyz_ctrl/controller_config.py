@@ -1,10 +1,11 @@
 """What someone may tune: the law's weights, limits, monitors. Gains are computed from these at start-up."""
 
-from typing import Annotated, Literal
+from typing import Annotated, Self
 
-from pydantic import Field
+from pydantic import Field, model_validator
 
 from pkxyz_ctrl.config import FrozenModel
+from pkxyz_ctrl.law_config import LAWS, SECTIONS, Hinf, Irc, Linear, PiNotch
 
 Positive = Annotated[float, Field(gt=0)]
 
@@ -19,7 +20,9 @@ class EstimatorConfig(FrozenModel):
 
 
 class RegulatorConfig(FrozenModel):
-    """Bryson weights of the linear-quadratic regulator: deviations that are equally unwelcome."""
+    """Bryson weights of the linear-quadratic regulator: deviations that are equally unwelcome. And
+    the authority, which limits the feedback of every law.
+    """
 
     position_error_m: Positive
     velocity_error_m_per_s: Positive
@@ -64,8 +67,10 @@ class ControllerConfig(FrozenModel):
     """One controller."""
 
     name: Annotated[str, Field(min_length=1)]
-    law: Literal["lqg", "open_loop"]
-    """lqg: Kalman filter and state feedback; open_loop: feed-forward alone."""
+    law: LAWS
+    """lqg: Kalman filter and state feedback; open_loop: feed-forward alone;
+    pi_notch, irc, hinf: linear laws, designed; linear: one of the user's own.
+    """
     operating_strokes_m: tuple[float, float, float]
     """Strokes about which gains are designed; the energy gradient and the kinematics are exact everywhere."""
     homing_s: Annotated[float, Field(gt=0, le=10)]
@@ -74,3 +79,17 @@ class ControllerConfig(FrozenModel):
     regulator: RegulatorConfig
     limits: DriveLimitsConfig
     monitors: MonitorConfig
+    pi_notch: PiNotch | None = None
+    irc: Irc | None = None
+    hinf: Hinf | None = None
+    linear: Linear | None = None
+
+    @model_validator(mode="after")
+    def _section_of_this_law_alone(self) -> Self:
+        for name in SECTIONS:
+            given = getattr(self, name) is not None
+            if given and name != self.law:
+                raise ValueError(f'section [{name}] belongs to law = "{name}", not to "{self.law}"; remove it')
+            if not given and name == self.law:
+                raise ValueError(f'law = "{name}" needs a section [{name}]; add it')
+        return self

@@ -52,6 +52,7 @@ MEMORY = np.dtype(
         ("here", "f8", (9,)),  # rows of the reference: at this sample ...
         ("now", "f8", (9,)),  # ... and where this tick's force begins and ends to act
         ("after", "f8", (9,)),
+        ("later", "f8", (9,)),  # ... and a period after that
         ("tick_index", "i8"),
         ("reference_tick", "i8"),
         ("mode", "i4"),
@@ -84,10 +85,17 @@ def cycle(law_array: Records, memory_array: Records, reference: Array) -> None:
     """One period. ``law_array`` (1,) of ``LAW``, ``memory_array`` (1,) of ``MEMORY``, ``reference`` (n, 9) rows of
     the trajectory, or (n, 12) with an excitation.
 
-    Row ``reference_tick - reference_base`` is the set-point at this sample; the law looks up to three rows further.
+    Row ``reference_tick - reference_base`` is the set-point at this sample; the law looks up to four rows further.
     Rows before the first and past the last are taken as the first and the last. The excitation, in m, is added to
     what is measured while tracking, and so passes round the loop: seen over added is the sensitivity.
     """
+    observe(law_array, memory_array, reference)
+    respond(law_array, memory_array)
+
+
+@njit(cache=True)
+def observe(law_array: Records, memory_array: Records, reference: Array) -> None:
+    """First part of the period: event and mode, measurement, estimate, the rows of the reference that count."""
     law, memory = law_array[0], memory_array[0]
     _handle(law, memory, _asked(law, memory))
     seen = memory["input"]
@@ -99,16 +107,23 @@ def cycle(law_array: Records, memory_array: Records, reference: Array) -> None:
         if reference.shape[1] > _ROW_LENGTH and memory["mode"] == _TRACKING:
             _excite(memory, reference)
     tick.estimate(law["tick"], memory["tick"], usable)
-    saturated = 0
-    here, now, after = memory["here"], memory["now"], memory["after"]
-    _reference_row(memory, reference, 0, here)
+    delay = law["tick"]["delay_periods"]
+    reference_row(memory, reference, 0, memory["here"])
+    reference_row(memory, reference, delay, memory["now"])
+    reference_row(memory, reference, delay + 1, memory["after"])
+    reference_row(memory, reference, delay + 2, memory["later"])
+
+
+@njit(cache=True)
+def respond(law_array: Records, memory_array: Records) -> None:
+    """Second part: law and voltages, monitors, record. A plan made between the two stands in ``memory["tick"]``."""
+    law, memory = law_array[0], memory_array[0]
+    state, seen, saturated = memory["tick"], memory["input"], 0
     if LOOP_CLOSED[memory["mode"]] != 0:
-        delay = law["tick"]["delay_periods"]
-        _reference_row(memory, reference, delay, now)
-        _reference_row(memory, reference, delay + 1, after)
-        saturated = 1 if tick.act(law["tick"], memory["tick"], here, now, after) else 0
+        here, now, after, later = memory["here"], memory["now"], memory["after"], memory["later"]
+        saturated = 1 if tick.act(law["tick"], state, here, now, after, later) else 0
     else:
-        tick.rest(memory["tick"])
+        tick.rest(state)
     trips = _monitor(law, memory, saturated)
     _write_row(law, memory, trips, saturated)
     if memory["mode"] == _TRACKING:
@@ -116,6 +131,7 @@ def cycle(law_array: Records, memory_array: Records, reference: Array) -> None:
     memory["tick_index"] += 1
     seen["event"] = _NONE
     seen["trips"] = 0
+    state["plan_known"] = state["solver_iterations"] = 0
 
 
 @njit(cache=True)
@@ -182,7 +198,7 @@ def _excite(memory: np.void, reference: Array) -> None:
 
 
 @njit(cache=True)
-def _reference_row(memory: np.void, reference: Array, ahead: int, out: Array) -> None:
+def reference_row(memory: np.void, reference: Array, ahead: int, out: Array) -> None:
     """Write the row (9,) of the set-point ``ahead`` ticks from this one to ``out``."""
     if memory["mode"] == _TRACKING:
         index = memory["reference_tick"] - memory["input"]["reference_base"] + ahead
@@ -199,7 +215,8 @@ def _monitor(law: np.void, memory: np.void, saturated: int) -> int:
     seen, state, obs = memory["input"], memory["tick"], memory["observation"]
     obs["mode"], obs["sense_status"] = memory["mode"], seen["sense_status"]
     obs["node_events"], obs["overrun"] = seen["node_events"], seen["overrun"]
-    obs["saturated"], obs["solver_ok"] = saturated, 1
+    obs["saturated"] = saturated
+    obs["solver_ok"] = 0 if law["tick"]["kind"] == tick.PREDICTIVE and state["plan_known"] == 0 else 1
     obs["finite"] = 1 if tick.is_finite(state) else 0
     for i in range(3):
         obs["sense_count"][i] = seen["sense_count"][i]
@@ -227,6 +244,7 @@ def _write_row(law: np.void, memory: np.void, trips: int, saturated: int) -> Non
     row["request"], row["outside_trips"] = seen["event"], seen["trips"]
     row["node_events"], row["overrun"], row["saturated"] = seen["node_events"], seen["overrun"], saturated
     row["active_set_steps"] = state["active_set_steps"]
+    row["solver_iterations"] = state["solver_iterations"]
     for i in range(3):
         row["sense_count"][i] = seen["sense_count"][i]
         row["drive_count"][i] = state["count"][0, i]

@@ -23,6 +23,7 @@ CONTROLLER_FIELDS = [
     ("overrun", "i4"),  # ticks skipped before this one
     ("saturated", "i4"),  # 1 where a comb force met a bound
     ("active_set_steps", "i4"),
+    ("solver_iterations", "i4"),  # of the predictive law's solver; 0 without one, negative if its answer was not used
     ("sense_count", "i4", (3,)),
     ("drive_count", "i4", (3,)),  # goes to the combs at the next SYNC
     ("reference_m", *_VECTOR),  # set-point at the sample of this tick

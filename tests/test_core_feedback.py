@@ -108,7 +108,7 @@ def test_feedforward_is_the_inverse_dynamics_of_the_plant(strokes_m, motion):
     velocity, wanted = motion[:3] * 1e-3, motion[3:] * 1.0
     row = np.concatenate([stage().forward_kinematics(strokes_m), velocity, wanted])
     law, memory = on_the_reference(row)
-    assert not tick.act(law, memory, row, row, row)
+    assert not tick.act(law, memory, row, row, row, row)
     p = plant(config())
     volt2 = memory["force_n"] / law["drive"]["force_gain_n_per_v2"]
     got = np.array(acceleration(p.params[0], p.state[0], volt2, *row[:3], *velocity))
@@ -135,7 +135,7 @@ def test_feedforward_alone_draws_the_reference():
     def motion(t, state):
         row = reference(t)
         law, memory = on_the_reference(row)
-        assert not tick.act(law, memory, row, row, row)
+        assert not tick.act(law, memory, row, row, row, row)
         volt2 = memory["force_n"] / law["drive"]["force_gain_n_per_v2"]
         return np.concatenate([state[3:], acceleration(p.params[0], p.state[0], volt2, *state)])
 

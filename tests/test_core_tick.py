@@ -127,7 +127,7 @@ def test_saturation_is_told_and_slack_is_what_is_missing():
         row = np.concatenate([at, np.zeros(6)])
         memory["estimate"]["ahead"][:] = row - np.r_[law["estimator"]["operating_point_m"], np.zeros(6)]
         memory["feedforward_known"] = 0
-        assert bool(tick.act(law, memory, row, row, row)) is expected
+        assert bool(tick.act(law, memory, row, row, row, row)) is expected
         given_n = stage().jacobian(at).T @ memory["force_n"]
         assert memory["demand_n"] == pytest.approx(given_n + memory["slack_n"], rel=1e-12)
         assert bool(np.abs(memory["slack_n"]).max() > 1e-9) is expected

@@ -113,7 +113,8 @@ def test_a_device_that_cannot_be_is_refused():
 @given(st.floats(3.0, 12.0), st.floats(0.0, 300e-6), st.floats(0.4, 1.0), st.integers(0, 2))
 def test_margins_of_one_axis_are_those_of_python_control(margin_db, integral_time_s, damping, i):
     """Uncoupled at the centre of the workspace, so an axis is a loop with one input: of order 9."""
-    a_law = pi_notch(plant(), MASS, PiNotch(margin_db, integral_time_s, damping))
+    config = PiNotch(gain_margin_db=margin_db, integral_time_s=integral_time_s, notch_damping=damping)
+    a_law = pi_notch(plant(), MASS, config)
     found = margins(plant(), a_law).axes[i]
     axis, rows = plant().axis(i), slice(5 * i, 5 * i + 5)
     k = control.ss(a_law.a[rows, rows], a_law.b[rows, i], a_law.c[i, rows], a_law.d[i, i], plant().period_s)
@@ -254,7 +255,7 @@ def test_the_linear_equivalent_is_what_the_tick_does(delay_periods, strokes_m):
         y = rng.normal(size=3) * 1e-9
         memory["measurement_m"][:] = at + y
         tick.estimate(numbers, memory, True)
-        assert not tick.act(numbers, memory, row, row, row)
+        assert not tick.act(numbers, memory, row, row, row, row)
         asked.append(memory["demand_n"] - holding)
         linear.append(-(expected.c @ state + expected.d @ y))
         state = expected.a @ state + expected.b @ y

@@ -169,6 +169,7 @@ def test_every_column_of_the_row_is_alive():
     """No field of the record stays 0 through a scan, but those that tell of trouble."""
     rows, _ = rows_of(setup("harsh"), "lockstep")
     quiet = {"trips", "request", "outside_trips", "sense_status", "node_events", "overrun", "saturated", "slack_n"}
+    quiet |= {"solver_iterations"}  # of another law
     for name in ROW.names:
         alive = bool(np.any(rows[name]))
         assert alive or name in quiet, name

@@ -1,11 +1,11 @@
 """The force that the law asks for: feed-forward along the reference plus state feedback about it, compiled.
 
-    w = grad V(r_f) + C v_f + m a_f  -  g [ K_x (x - r) + K_v (v - r') + d ]
+    w = grad V(r_f) + C v_f + m a_f  -  g [ h + K_x (x - r) + K_v (v - r') + d ]
 
 r, r' are the reference (as ``sampled_target`` sees it) at the instant the force begins to act (one period after the
 sample), x, v, d the estimate predicted for it; r_f, v_f, a_f are the reference at the middle of the interval in which
-it acts, as the amplifier lets it act. Combs only pull, so at rest there is no force to take away: the feedback's
-authority g rises from 0 to 1 with the least of the forces that hold r.
+it acts, as the amplifier lets it act; h makes up for its being held. Combs only pull, so at rest there is no force to
+take away: the feedback's authority g rises from 0 to 1 with the least of the forces that hold r.
 """
 
 import numpy as np
@@ -51,6 +51,17 @@ def add_motion(feedback: np.void, row: Array, out: Array) -> None:
         out[i] += mass * row[6 + i]
         for k in range(3):
             out[i] += damping[i, k] * row[3 + k]
+
+
+@njit(cache=True)
+def add_held_share(feedforward_n: Array, last_n: Array, next_n: Array, share: float, out: Array) -> None:
+    """Subtract share times h = (next - 2 present + last) / 24 from ``out`` (3,): feed-forward forces at mid-interval.
+
+    Held for a period T, a sinusoidal force at angular frequency w moves a mass less than the smooth one by 1 + (w T)^2
+    / 24 at the samples; the second difference gives that back, without phase, up to terms of fourth order.
+    """
+    for i in range(3):
+        out[i] -= share * (next_n[i] - 2.0 * feedforward_n[i] + last_n[i]) / 24.0
 
 
 @njit(cache=True)

@@ -1,10 +1,11 @@
 """Any linear feedback law as a state-space system about the reference, compiled.
 
-    w = -(C x + D e),   x+ = A x + B e + U s,   e = y - r
+    w = -(C x + D e),   x+ = A x + B e + U s,   e = y - (r - tau v)
 
-e is the measured position less the reference at the sample (m), w a force at the platform (N) that joins the feed-
-forward and acts ``delay_periods`` later, s what the combs could not give of the last demand (N): U unwinds
-integrators.
+e is the measured position less the reference as a sensor of delay tau sees it (m), w a force at the platform (N) that
+joins the feed-forward and acts ``delay_periods`` later. s is the part of w that the stage does not get, because
+authority g is below 1 or combs are at their limits, s = (1 - g) w + slack (N): A - U C is stable, so nothing winds up
+and the law takes over without a jump.
 """
 
 import numpy as np
@@ -32,36 +33,42 @@ LINEAR_STATE = np.dtype(
         ("x", "f8", (ORDER_MAX,)),
         ("next", "f8", (ORDER_MAX,)),
         ("error_m", "f8", (3,)),
+        ("w_n", "f8", (3,)),
     ],
     align=True,
 )
 
 
 @njit(cache=True)
-def add_feedback(linear: np.void, state: np.void, seen_m: Array, reference: Array, share: float, out: Array) -> None:
+def add_feedback(
+    linear: np.void, state: np.void, seen_m: Array, reference: Array, sense_delay_s: float, share: float, out: Array
+) -> None:
     """Add share times w to ``out`` (3,) for the position seen (3,) and the reference row (9,) of the same sample."""
     order, error = linear["order"], state["error_m"]
     for i in range(3):
-        error[i] = seen_m[i] - reference[i]
+        error[i] = seen_m[i] - (reference[i] - sense_delay_s * reference[3 + i])
     for i in range(3):
         total = 0.0
         for k in range(order):
             total += linear["c"][i, k] * state["x"][k]
         for k in range(3):
             total += linear["d"][i, k] * error[k]
+        state["w_n"][i] = -total
         out[i] -= share * total
 
 
 @njit(cache=True)
-def advance(linear: np.void, state: np.void, slack_n: Array) -> None:
-    """Time update with the error of ``add_feedback`` and the slack (3,) of this tick."""
-    order, x, following = linear["order"], state["x"], state["next"]
+def advance(linear: np.void, state: np.void, slack_n: Array, share: float) -> None:
+    """Time update with error and force of ``add_feedback``, and the slack (3,) and the authority of this tick."""
+    order, x, following, w = linear["order"], state["x"], state["next"], state["w_n"]
     for i in range(order):
         total = 0.0
         for k in range(order):
             total += linear["a"][i, k] * x[k]
         for k in range(3):
-            total += linear["b"][i, k] * state["error_m"][k] + linear["unwind"][i, k] * slack_n[k]
+            total += linear["b"][i, k] * state["error_m"][k] + linear["unwind"][i, k] * (
+                slack_n[k] + (1.0 - share) * w[k]
+            )
         following[i] = total
     for i in range(order):
         x[i] = following[i]

@@ -13,7 +13,7 @@ import numpy as np
 from numba import njit
 from numpy.typing import NDArray
 
-from pkxyz_ctrl.core import allocation, feedback, kinematics, linear_law, voltage
+from pkxyz_ctrl.core import allocation, feedback, kinematics, linear_law, predictive, voltage
 from pkxyz_ctrl.core import estimator as filtering
 from pkxyz_ctrl.core.elasticity import ELASTICITY, energy_gradient
 from pkxyz_ctrl.core.linear3 import inverse3, multiply3_transposed
@@ -39,15 +39,16 @@ LAW = np.dtype(
         ("feedback", feedback.FEEDBACK),
         ("linear", linear_law.LINEAR_LAW),
         ("drive", voltage.DRIVE),
-        ("kind", "i4"),  # OPEN_LOOP, STATE_FEEDBACK or LINEAR
+        ("predictive", predictive.PREDICTIVE),
+        ("kind", "i4"),  # OPEN_LOOP, STATE_FEEDBACK, LINEAR or PREDICTIVE
         ("delay_periods", "i4"),  # periods from a sample to the start of the action that it causes: 1 or 2
     ],
     align=True,
 )
 
-OPEN_LOOP, STATE_FEEDBACK, LINEAR = 0, 1, 2
-"""What feeds back: nothing, the filter's state through gains, or a linear law of the user's choice on what was
-measured.
+OPEN_LOOP, STATE_FEEDBACK, LINEAR, PREDICTIVE = 0, 1, 2, 3
+"""What feeds back: nothing, the filter's state through gains, a linear law of the user's choice on what was measured,
+or a plan that somebody made from the estimate; without one the filter's state as before.
 """
 
 DELAY_MAX = 2
@@ -58,6 +59,7 @@ SCRATCH = np.dtype(
         ("inverse", "f8", (3, 3)),
         ("state", "f8", (9,)),
         ("row", "f8", (9,)),
+        ("next_n", "f8", (3,)),
         ("position_m", "f8", (3,)),
         ("w_n", "f8", (3,)),
         ("w_change_n", "f8", (3,)),
@@ -79,6 +81,9 @@ MEMORY = np.dtype(
         ("measurement_m", "f8", (3,)),
         ("seen_m", "f8", (3,)),  # the measurement, or the estimate in its place
         ("linear", linear_law.LINEAR_STATE),
+        ("plan_n", "f8", (3,)),  # force at the platform that a plan adds to the feed-forward of this tick
+        ("plan_known", "i4"),
+        ("solver_iterations", "i4"),  # of this tick's plan; 0 without one, negative if it was not used
         ("count", "i4", (DELAY_MAX + 1, 3)),  # counts commanded, newest first
         ("carry_v", "f8", (3,)),
         ("demand_n", "f8", (3,)),
@@ -136,30 +141,44 @@ def estimate(law: np.void, memory: np.void, has_measurement: bool) -> None:
 
 
 @njit(cache=True)
-def act(law: np.void, memory: np.void, here: Array, now: Array, after: Array) -> bool:
-    """Law, allocation and voltages for the reference rows (9,) at the sample, and at the start and the end of the
-    interval of action.
+def act(law: np.void, memory: np.void, here: Array, now: Array, after: Array, later: Array) -> bool:
+    """Law, allocation and voltages for the reference rows (9,) at the sample, at the start and the end of the interval
+    of action, and a period after that.
 
     Writes demand, comb forces, slack and the new counts. Returns whether a comb force met a limit.
     """
     geometry, gains, drive, scratch = law["geometry"], law["feedback"], law["drive"], memory["scratch"]
     demand, force, count = memory["demand_n"], memory["force_n"], memory["count"]
     j, inverse, row, given = scratch["jacobian"], scratch["inverse"], scratch["row"], scratch["w_n"]
+    following = scratch["next_n"]
+    feedback.ahead(gains, after, later, row)
+    feedforward(law, row, following)
     feedback.ahead(gains, now, after, row)
     kinematics.jacobian(geometry, row[0:3], j)
     inverse3(j, inverse)
     energy_gradient(geometry, law["elasticity"], row[0:3], demand)
     share = feedback.authority(gains, inverse, demand)
     feedback.add_motion(gains, row, demand)
-    last = memory["feedforward_n"] if memory["feedforward_known"] != 0 else demand
-    feedback.sampled_target(gains, now, demand, last, row)
-    memory["feedforward_n"][:] = demand
+    last, before = memory["feedforward_n"], scratch["w_n"]
+    if memory["feedforward_known"] == 0:
+        last[:] = demand
+        following[:] = demand
+    before[:] = last
+    feedback.sampled_target(gains, now, demand, before, row)
+    last[:] = demand
     memory["feedforward_known"] = 1
+    feedback.add_held_share(last, before, following, share, demand)
     kind, origin = law["kind"], law["estimator"]["operating_point_m"]
     if kind == STATE_FEEDBACK:
         feedback.add_feedback(gains, origin, memory["estimate"]["ahead"], row, share, demand)
     elif kind == LINEAR:
-        linear_law.add_feedback(law["linear"], memory["linear"], memory["seen_m"], here, share, demand)
+        tau = law["estimator"]["sense_delay_s"]
+        linear_law.add_feedback(law["linear"], memory["linear"], memory["seen_m"], here, tau, share, demand)
+    elif kind == PREDICTIVE and memory["plan_known"] != 0:
+        for i in range(3):
+            demand[i] += share * memory["plan_n"][i]
+    elif kind == PREDICTIVE:
+        feedback.add_feedback(gains, origin, memory["estimate"]["ahead"], row, share, demand)
     _push(memory)
     voltage.force_limits(drive, count[1], scratch["lower_n"], scratch["upper_n"])
     memory["active_set_steps"] = allocation.allocate(j, inverse, demand, scratch["lower_n"], scratch["upper_n"], force)
@@ -168,8 +187,15 @@ def act(law: np.void, memory: np.void, here: Array, now: Array, after: Array) ->
     for i in range(3):
         memory["slack_n"][i] = demand[i] - given[i]
     if kind == LINEAR:
-        linear_law.advance(law["linear"], memory["linear"], memory["slack_n"])
+        linear_law.advance(law["linear"], memory["linear"], memory["slack_n"], share)
     return memory["active_set_steps"] > 1
+
+
+@njit(cache=True)
+def feedforward(law: np.void, row: Array, out: Array) -> None:
+    """Force (3,) at the platform that moves the stage along a reference row (9,): grad V + C v + m a."""
+    energy_gradient(law["geometry"], law["elasticity"], row[0:3], out)
+    feedback.add_motion(law["feedback"], row, out)
 
 
 @njit(cache=True)

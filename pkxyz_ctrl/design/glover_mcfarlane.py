@@ -12,7 +12,6 @@ changes no infinity norm: gamma holds for the loop that runs, and nothing is app
 """
 
 import math
-from dataclasses import dataclass
 from typing import NamedTuple
 
 import control
@@ -22,6 +21,7 @@ from numpy.typing import NDArray
 
 from pkxyz_ctrl.design.discrete_law import DiscreteLaw, LawError, discretise, siso, stack
 from pkxyz_ctrl.design.loop_plant import LoopPlant
+from pkxyz_ctrl.law_config import ShapingWeight
 
 Array = NDArray[np.float64]
 
@@ -68,28 +68,12 @@ def _riccati(a: Array, b: Array, c: Array, d: Array) -> tuple[Array, Array]:
     return x, z
 
 
-@dataclass(frozen=True)
-class ShapingWeight:
-    """W(s) = K (w_i / s) (1 + 2 zeta s / w_z + (s / w_z)^2) / (1 + s / w_l) of an axis, K being its stiffness: what the
-    open loop shall look like before the synthesis makes it stable. An integrator, zeros near the resonance, a lag.
-    """
-
-    integral_hz: float
-    """w_i / 2 pi: where the shaped plant's gain would pass 1 if it were an integrator alone"""
-    zeros_hz: float
-    """w_z / 2 pi"""
-    zeros_damping: float
-    """zeta"""
-    lag_hz: float
-    """w_l / 2 pi"""
-
-
 # All searched on fd_5k: the widest |S| < -3 dB with Ms <= 2, a disk margin of 0.6 and 1.5 nm of hold noise.
-WEIGHT_PLANE = ShapingWeight(739.0, 718.0, 0.18, 26900.0)
-WEIGHT_Z = ShapingWeight(424.0, 701.0, 0.042, 7850.0)
+WEIGHT_PLANE = ShapingWeight(integral_hz=739.0, zeros_hz=718.0, zeros_damping=0.18, lag_hz=26900.0)
+WEIGHT_Z = ShapingWeight(integral_hz=424.0, zeros_hz=701.0, zeros_damping=0.042, lag_hz=7850.0)
 """... and robust where stiffness is 20 %, mass 10 % or a comb 10 % off (Ms 3.4 at worst): the default"""
-WIDEST_PLANE = ShapingWeight(749.0, 623.0, 0.123, 11800.0)
-WIDEST_Z = ShapingWeight(767.0, 773.0, 0.103, 13600.0)
+WIDEST_PLANE = ShapingWeight(integral_hz=749.0, zeros_hz=623.0, zeros_damping=0.123, lag_hz=11800.0)
+WIDEST_Z = ShapingWeight(integral_hz=767.0, zeros_hz=773.0, zeros_damping=0.103, lag_hz=13600.0)
 """... for the stage as drawn only"""
 
 
@@ -120,8 +104,6 @@ def hinf(
 
 
 def _weight(weight: ShapingWeight, stiffness_n_per_m: float) -> control.StateSpace:
-    if min(weight.integral_hz, weight.zeros_hz, weight.zeros_damping, weight.lag_hz) <= 0.0:
-        raise LawError(f"the numbers of a shaping weight must be positive: {weight}")
     integral, zeros, lag = (2.0 * math.pi * f for f in (weight.integral_hz, weight.zeros_hz, weight.lag_hz))
     shape = np.array([1.0 / zeros**2, 2.0 * weight.zeros_damping / zeros, 1.0])
     return siso(control.tf(stiffness_n_per_m * integral * shape, [1.0 / lag, 1.0, 0.0]))

@@ -12,7 +12,6 @@ leaves.
 """
 
 import math
-from dataclasses import dataclass
 
 import control
 import numpy as np
@@ -22,22 +21,9 @@ from numpy.typing import NDArray
 from pkxyz_ctrl.design.discrete_law import DiscreteLaw, LawError, discretise, siso, stack
 from pkxyz_ctrl.design.gain_margin import radius
 from pkxyz_ctrl.design.loop_plant import LoopPlant
+from pkxyz_ctrl.law_config import Irc
 
 Array = NDArray[np.float64]
-
-
-@dataclass(frozen=True)
-class Irc:
-    """What may be tuned."""
-
-    feedthrough: float = 3.0
-    """-D times the stiffness, above 1, or there are no zeros below the resonance. The literature has 2 for a loop
-    without delay; then the damping alone has used up a gain margin of 6 dB
-    """
-    gain_margin_db: float = 6.0
-    """of damping and tracking together, at the stage"""
-    integral_time_s: float = 100e-6
-    """t_i: proportional over integral gain of the tracking law"""
 
 
 def irc(plant: LoopPlant, config: Irc | None = None) -> DiscreteLaw:

@@ -9,17 +9,25 @@ from numpy.typing import NDArray
 from pkxyz_ctrl import cycle
 from pkxyz_ctrl.bus_config import BusConfig
 from pkxyz_ctrl.config import ConfigError
-from pkxyz_ctrl.controller_config import ControllerConfig
-from pkxyz_ctrl.core.tick import OPEN_LOOP, STATE_FEEDBACK
+from pkxyz_ctrl.controller_config import ControllerConfig, RegulatorConfig
+from pkxyz_ctrl.core.tick import LINEAR, OPEN_LOOP, PREDICTIVE, STATE_FEEDBACK
+from pkxyz_ctrl.design.chosen_law import chosen_law, unwinding
+from pkxyz_ctrl.design.discrete_law import LawError
 from pkxyz_ctrl.design.estimator_gain import kalman_gain, measurement_matrix, measurement_noise, process_noise
+from pkxyz_ctrl.design.loop_plant import loop_plant
 from pkxyz_ctrl.design.plant_model import LinearStage, SampledStage, linearise, sample
 from pkxyz_ctrl.design.regulator import regulator_gain
+from pkxyz_ctrl.law_config import Mpc
 from pkxyz_ctrl.stage import Stage
+
+KINDS = {"open_loop": OPEN_LOOP, "lqg": STATE_FEEDBACK, "mpc": PREDICTIVE}
+"""What the tick calls the laws that are not linear ones."""
 
 
 def design_law(stage: Stage, controller: ControllerConfig, bus: BusConfig, *, autostart: bool) -> NDArray[np.void]:
     """One-element array of ``cycle.LAW``, read-only. Raises ``ConfigError`` for limits that contradict each other and
-    ``DesignError`` where a cross-check of the gains fails."""
+    for a law that would not be stable with this stage and bus, ``DesignError`` where a cross-check of the gains fails.
+    """
     _check_limits(stage, controller, bus)
     model = linearise(stage, np.array(controller.operating_strokes_m))
     sampled = sample(model, bus.period_s, amplifier_time_constant_s(stage))
@@ -29,7 +37,11 @@ def design_law(stage: Stage, controller: ControllerConfig, bus: BusConfig, *, au
     _fill_feedback(law["tick"]["feedback"], stage, controller, bus, model, sampled)
     _fill_drive(law["tick"]["drive"], stage, controller, bus)
     _fill_monitors(law["limits"], controller, bus)
-    law["tick"]["kind"] = {"open_loop": OPEN_LOOP, "lqg": STATE_FEEDBACK}[controller.law]
+    if controller.law in KINDS:
+        law["tick"]["kind"] = KINDS[controller.law]
+    else:
+        law["tick"]["kind"] = LINEAR
+        _fill_linear(law["tick"]["linear"], stage, controller, bus)
     law["tick"]["delay_periods"] = bus.delay_periods
     law["period_us"] = bus.period_us
     law["homing_ticks"] = max(1, round(controller.homing_s / bus.period_s))
@@ -99,6 +111,24 @@ def _fill_feedback(
     law["period_s"] = bus.period_s
     law["lead_s"] = 0.5 * bus.period_s + amplifier_time_constant_s(stage)
     law["authority_force_n"] = controller.regulator.authority_force_n
+
+
+def _fill_linear(record: Any, stage: Stage, controller: ControllerConfig, bus: BusConfig) -> None:
+    try:
+        law, _ = chosen_law(stage, controller, bus)
+        unwind = unwinding(law, loop_plant(stage, bus, controller.operating_strokes_m))
+    except LawError as error:
+        raise ConfigError(f"controller {controller.name!r}: law {controller.law!r}: {error}") from error
+    n = law.order
+    record["a"][:, :n, :n], record["b"][:, :n], record["c"][:, :, :n] = law.a, law.b, law.c
+    record["d"], record["unwind"][:, :n], record["order"] = law.d, unwind, n
+
+
+def _fill_predictive(record: Any, mpc: Mpc, regulator: RegulatorConfig) -> None:
+    record["position_weight"] = (regulator.force_n / regulator.position_error_m) ** 2
+    record["velocity_weight"] = (regulator.force_n / regulator.velocity_error_m_per_s) ** 2
+    for name, value in mpc.model_dump().items():
+        record[name] = value
 
 
 def _fill_drive(law: Any, stage: Stage, controller: ControllerConfig, bus: BusConfig) -> None:

@@ -7,7 +7,6 @@ The gain is what leaves the gain margin on the sampled, delayed plant.
 """
 
 import math
-from dataclasses import dataclass
 
 import control
 import numpy as np
@@ -16,21 +15,9 @@ from numpy.typing import NDArray
 from pkxyz_ctrl.design.discrete_law import DiscreteLaw, LawError, discretise, siso, stack
 from pkxyz_ctrl.design.gain_margin import gain_for_margin
 from pkxyz_ctrl.design.loop_plant import LoopPlant
+from pkxyz_ctrl.law_config import PiNotch
 
 Array = NDArray[np.float64]
-
-
-@dataclass(frozen=True)
-class PiNotch:
-    """What may be tuned."""
-
-    gain_margin_db: float = 6.0
-    integral_time_s: float = 200e-6
-    """t_i: proportional over integral gain. Little, as the loop ends below the resonance"""
-    notch_damping: float = 0.7
-    """zeta of the notches' poles: how wide they are"""
-    quality_factor: float = 20.0
-    """of the modes that the notches' zeros stand on"""
 
 
 def pi_notch(plant: LoopPlant, mass_kg: float, config: PiNotch | None = None) -> DiscreteLaw:

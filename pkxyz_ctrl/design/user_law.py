@@ -31,6 +31,14 @@ def user_law(
     Raises ``LawError``, and ``UnstableLawError`` where the loop would not be stable.
     """
     law = discrete_law(system, plant.period_s, method)
+    return law, require_robust(law, plant, delay_margin_s)
+
+
+def require_robust(law: DiscreteLaw, plant: LoopPlant, delay_margin_s: float | None = None) -> Margins:
+    """The margins of a law that is stable on the plant, and with ``delay_margin_s`` (a quarter of a period) more delay.
+
+    Raises ``UnstableLawError`` for another.
+    """
     found = margins(plant, law)
     if not found.stable:
         raise UnstableLawError(
@@ -44,7 +52,7 @@ def user_law(
                 f"refused: axis {name} bears {axis.delay_margin_s * 1e6:.1f} us of additional delay, and "
                 f"{needed * 1e6:.1f} us are asked for; lower the gain or the bandwidth"
             )
-    return law, found
+    return found
 
 
 def discrete_law(system: control.lti.LTI, period_s: float, method: str = "tustin") -> DiscreteLaw:
@@ -59,11 +67,11 @@ def discrete_law(system: control.lti.LTI, period_s: float, method: str = "tustin
     if size == (1, 1):
         axis = _sampled(siso(system), period_s, method)
         return stack(period_s, [axis, axis, axis])
-    sampled = _sampled(_state_space(system), period_s, method)
+    sampled = _sampled(state_space(system), period_s, method)
     return DiscreteLaw(period_s, sampled.A, sampled.B, sampled.C, sampled.D)
 
 
-def _state_space(system: control.lti.LTI) -> control.StateSpace:
+def state_space(system: control.lti.LTI) -> control.StateSpace:
     """A 3 x 3 system as state space, entry by entry, as python-control converts matrices of transfer functions only
     with slycot.
     """
