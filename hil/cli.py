@@ -12,7 +12,9 @@ import typer
 from rich.console import Console
 from rich.table import Table
 
-from hil import bench_cli, check_amplifier_cli, latency_cli, mechanics_cli, replay_cli, run_cli
+from hil import (
+    bench_cli, check_amplifier_cli, latency_cli, margins_cli, mechanics_cli, replay_cli, run_cli,
+)  # fmt: skip
 from pkxyz_ctrl.config import CONFIG_DIR, ConfigError, names
 
 app = typer.Typer(
@@ -25,7 +27,7 @@ app = typer.Typer(
 _screen = Console(highlight=False)
 _notes = Console(stderr=True, highlight=False)
 
-KINDS = ("scenarios", "stages", "plants", "controllers", "buses")
+KINDS = ("scenarios", "stages", "plants", "controllers", "buses", "tolerances")
 """Folders of configs/, as ``pkxyz configs`` lists them."""
 
 
@@ -134,6 +136,7 @@ app.command("run")(run_cli.run)
 app.command("plant")(run_cli.plant)
 app.command("replay")(replay_cli.replay)
 app.command("latency")(latency_cli.latency)
+app.command("margins")(margins_cli.margins)
 app.command("paper")(mechanics_cli.paper)
 app.command("workspace")(mechanics_cli.workspace)
 app.command("design")(mechanics_cli.design)

@@ -8,12 +8,13 @@ from numpy.typing import NDArray
 
 from hil.excitation import Excitation
 from pkxyz_ctrl.bus_config import BusConfig
+from pkxyz_ctrl.config import load
 from pkxyz_ctrl.controller_config import ControllerConfig
 from pkxyz_ctrl.design.law import count_max, design_law, slew_counts
 from pkxyz_ctrl.safety.gate import GateConfig
 from pkxyz_ctrl.stage import Stage
 from pkxyz_ctrl.stage_config import StageConfig
-from pkxyz_ctrl.trajectory import Trajectory
+from pkxyz_ctrl.trajectory import Hold, Trajectory
 from sim.config import Device, PlantConfig
 from sim.plant import Plant
 
@@ -71,3 +72,19 @@ class Setup:
             sense_scale_f_per_count=self.bus.analog.sense_farad_per_count,
             sense_offset_f=self.bus.analog.sense_offset_f,
         )
+
+
+def bare_setup(stage: str, plant: str, controller: ControllerConfig, bus: BusConfig, seed: int) -> Setup:
+    """A run at rest, of no length, for whoever puts a trajectory of their own into it; stage and plant by name or
+    file. Raises ``ConfigError``.
+    """
+    return Setup(
+        stage=load("stages", stage, StageConfig),
+        device=load("stages", stage, Device),
+        plant=load("plants", plant, PlantConfig),
+        controller=controller,
+        bus=bus,
+        trajectory=Trajectory([Hold(kind="hold", duration_s=bus.period_s)]),
+        duration_s=bus.period_s,
+        seed=seed,
+    )

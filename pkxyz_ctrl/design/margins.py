@@ -12,7 +12,7 @@ measurement. For the MIMO system the norm is the structured one, the factors of 
 
 import math
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 import scipy.linalg
@@ -108,7 +108,8 @@ def frequency_grid_hz(plant: LoopPlant, law: DiscreteLaw, points: int = 600) -> 
     poles = poles[poles.imag > 1.0]
     near = (poles.imag[:, None] + np.abs(poles.real)[:, None] * around).ravel()
     grid = np.concatenate([np.geomspace(0.5, nyquist, points), near])
-    return np.unique(grid[(grid >= 0.5) & (grid <= nyquist)])
+    grid = np.unique(grid[(grid >= 0.5) & (grid <= nyquist)])
+    return grid[np.diff(grid, prepend=0.0) > 1e-6 * grid]  # poles that are the same twice are one
 
 
 def margins(plant: LoopPlant, law: DiscreteLaw) -> Margins:
@@ -118,14 +119,31 @@ def margins(plant: LoopPlant, law: DiscreteLaw) -> Margins:
         axis = AxisMargins(math.inf, math.inf, 0.0, 0.0, 1.0, 1.0, 0.0, 0.0)
         return Margins(False, radius, (axis, axis, axis), Sensitivities(math.inf, math.inf, 0.0, 0.0))
     grid = loop_response(plant, law, frequency_grid_hz(plant, law))
+    found = margins_of_response(grid, lambda f: loop_response(plant, law, np.array([f])).s[0])
+    return replace(found, spectral_radius=radius)
 
-    def sensitivity(frequency_hz: float) -> Complex:
-        return loop_response(plant, law, np.array([frequency_hz])).s[0]
+
+def margins_of_response(grid: LoopResponse, sensitivity: Callable[[float], Complex]) -> Margins:
+    """Margins of a stable loop from its response on a grid, and S (3,3) as a function of a frequency in Hz, with which
+    what the grid shows is refined. The spectral radius is left open (NaN).
+    """
 
     def of_axis(i: int) -> AxisMargins:
         return axis_margins(grid.frequency_hz, grid.s[:, i, i], lambda f: complex(sensitivity(f)[i, i]))
 
-    return Margins(True, radius, (of_axis(0), of_axis(1), of_axis(2)), _mimo(grid, sensitivity))
+    return Margins(True, math.nan, (of_axis(0), of_axis(1), of_axis(2)), _mimo(grid, sensitivity))
+
+
+def peak_sensitivity(plant: LoopPlant, law: DiscreteLaw) -> float:
+    """Ms of the MIMO system alone, as ``margins`` has it; infinite for an unstable loop. For searches over many."""
+    if not spectral_radius(plant, law) < 1.0:
+        return math.inf
+    grid = loop_response(plant, law, frequency_grid_hz(plant, law, 300))
+
+    def largest(f: float) -> float:
+        return float(np.linalg.norm(loop_response(plant, law, np.array([f])).s[0], 2))
+
+    return _peak(grid.frequency_hz, np.linalg.norm(grid.s, 2, axis=(1, 2)), largest)
 
 
 def axis_margins(grid_hz: Array, s: Complex, sensitivity: Callable[[float], complex]) -> AxisMargins:

@@ -1,0 +1,240 @@
+"""``pkxyz margins``: how far a law is from instability, computed, over changed plants, and measured while it runs."""
+
+import json
+import math
+from collections.abc import Iterator
+from contextlib import contextmanager
+from enum import StrEnum
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, Any
+
+import typer
+from rich.console import Console
+from rich.table import Table
+
+from pkxyz_ctrl.config import ConfigError, load
+
+if TYPE_CHECKING:
+    from collections.abc import Callable
+
+    from hil.loop_margins import Agreement, ChangedPlants, Loop
+    from hil.measured_loop import MeasuredLoop
+    from pkxyz_ctrl.design.margins import Margins, Sensitivities
+
+_screen = Console(highlight=False)
+_notes = Console(stderr=True, highlight=False)
+
+
+class Lane(StrEnum):
+    """In which lane the loop runs while it is measured."""
+
+    FAST = "fast"
+    LOCKSTEP = "lockstep"
+
+
+class Tones(StrEnum):
+    """What is added to the measurement."""
+
+    MULTISINE = "multisine"
+    STEPPED = "stepped"
+
+
+def margins(
+    controller: Annotated[str, typer.Option(help="Name or file.")] = "lqg",
+    stage: Annotated[str, typer.Option(help="Name or file.")] = "reconstructed",
+    bus: Annotated[str, typer.Option(help="Name or file.")] = "fd_5k",
+    at_um: Annotated[
+        tuple[float, float, float] | None,
+        typer.Option("--at", metavar="Q1 Q2 Q3", help="Strokes in um; default: mid-workspace."),
+    ] = None,
+    perturbed: Annotated[bool, typer.Option("--perturbed", help="Also Ms over the changed plants.")] = False,
+    tolerances: Annotated[str, typer.Option(help="Name or file of what changes, for --perturbed.")] = "wide",
+    measured: Annotated[bool, typer.Option("--measured", help="Also measure by exciting the running loop.")] = False,
+    lane: Annotated[Lane, typer.Option(help="Where to measure.")] = Lane.FAST,
+    tones: Annotated[
+        Tones, typer.Option(help="All tones at once, or one after another (20 of them).")
+    ] = Tones.MULTISINE,
+    plant: Annotated[str, typer.Option(help="Name or file of the plant that is measured.")] = "nominal",
+    amplitude_nm: Annotated[float, typer.Option(min=0.1, max=100.0, help="Of each tone.")] = 5.0,
+    periods: Annotated[int, typer.Option(min=3, max=1000, help="Of one second, measured on each axis.")] = 6,
+    seed: Annotated[int, typer.Option(min=0, help="Of the noise and of the tones' phases.")] = 1,
+    out: Annotated[Path | None, typer.Option(help="Folder for margins.json, bode.png and nyquist.png.")] = None,
+    as_json: Annotated[bool, typer.Option("--json", help="Print JSON, and nothing else.")] = False,
+) -> None:
+    """Loop, sensitivity and complementary sensitivity, per axis and MIMO, exact at the samples, delays included.
+
+    Exit code 0 if every loop is stable and, on the nominal plant, what was measured agrees with what was computed; 1 if
+    not; 2 for bad input.
+    """
+    import numpy as np
+
+    from hil.loop_margins import Loop, agreement, as_data, over_changed_plants
+    from pkxyz_ctrl.bus_config import BusConfig
+    from pkxyz_ctrl.controller_config import ControllerConfig
+    from pkxyz_ctrl.design.law import design_law
+    from pkxyz_ctrl.design.tolerances import Tolerances
+    from pkxyz_ctrl.stage import Stage
+
+    device, on_bus = Stage.load(stage), load("buses", bus, BusConfig)
+    config = load("controllers", controller, ControllerConfig)
+    wide = load("tolerances", tolerances, Tolerances)
+    strokes = np.full(3, 12.5e-6) if at_um is None else np.array(at_um) * 1e-6
+    with _one_line_errors():
+        loop = Loop(device, on_bus, design_law(device, config, on_bus, autostart=True))
+        computed = loop.margins(strokes)
+        data: dict[str, Any] = {
+            "controller": config.name, "stage": device.config.name, "bus": on_bus.name,
+            "strokes_um": [float(q) * 1e6 for q in strokes], "computed": as_data(computed),
+        }  # fmt: skip
+        changed = None
+        if perturbed:
+            with _progress("changed plants", quiet=as_json) as tell:
+                changed = over_changed_plants(loop, wide.cases(), tell)
+            data["perturbed"] = _changed_data(changed, wide.name)
+        response = compared = None
+        if measured:
+            with _progress("exciting the loop", quiet=as_json) as tell:
+                response = _measure(
+                    stage, plant, config, on_bus, strokes, lane, tones, amplitude_nm, periods, seed, tell
+                )
+            compared = agreement(response, loop.response(strokes, response.frequency_hz), periods)
+            data["measured"] = as_data(response.margins()) | {
+                "lane": lane.value, "plant": plant, "seed": seed, "tones": len(response.frequency_hz),
+                "amplitude_nm": amplitude_nm, "periods": periods,
+                "agreement": vars(compared) | {"holds": compared.holds},
+            }  # fmt: skip
+    if out is not None:
+        _write(out, data, loop, strokes, changed, response)
+    if as_json:
+        print(json.dumps(data, allow_nan=False))
+    else:
+        _show(data, computed, changed, response, compared)
+    stable = computed.stable and (changed is None or math.isfinite(changed.worst[1]))
+    agrees = compared is None or compared.holds or plant != "nominal"
+    raise typer.Exit(0 if stable and agrees else 1)
+
+
+@contextmanager
+def _one_line_errors() -> "Iterator[None]":
+    from hil.measured_loop import MeasurementError
+    from pkxyz_ctrl.design.discrete_law import LawError
+    from pkxyz_ctrl.design.estimator_gain import DesignError
+    from pkxyz_ctrl.stage import StageDomainError
+
+    try:
+        yield
+    except (LawError, DesignError, StageDomainError, MeasurementError) as error:
+        raise ConfigError(str(error)) from None
+
+
+@contextmanager
+def _progress(words: str, *, quiet: bool) -> "Iterator[Callable[[int, int], None]]":
+    from rich.progress import BarColumn, Progress, TextColumn, TimeRemainingColumn
+
+    columns = (TextColumn("{task.description}"), BarColumn(), TimeRemainingColumn())
+    with Progress(*columns, console=_notes, transient=True, disable=quiet or not _notes.is_terminal) as progress:
+        task = progress.add_task(words, total=None)
+        yield lambda done, total: progress.update(task, completed=done, total=total)
+
+
+def _measure(
+    stage: str, plant: str, config: Any, bus: Any, strokes: Any, lane: Lane, kind: Tones, amplitude_nm: float,
+    periods: int, seed: int, tell: "Callable[[int, int], None]",
+) -> "MeasuredLoop":  # fmt: skip
+    from hil.excitation import excitation, tones
+    from hil.measured_loop import at_point, measure
+    from hil.setup import bare_setup
+
+    if lane is Lane.LOCKSTEP and bus.can is None:
+        raise ConfigError(f"bus {bus.name!r} has no [can] and carries no frames; measure with --lane fast")
+    stepped = kind is Tones.STEPPED
+    seconds = 0.1 if stepped else 1.0  # a tone alone needs no such resolution
+    period_ticks = round(seconds / bus.period_s)
+    added = excitation(
+        kind.value, tones(period_ticks, 20 if stepped else 120, 1 if stepped else 5), period_ticks=period_ticks,
+        periods=periods, amplitude_m=amplitude_nm * 1e-9, first_tick=0, seed=seed,
+    )  # fmt: skip
+    return measure(at_point(bare_setup(stage, plant, config, bus, seed), strokes, added), lane.value, tell)
+
+
+def _changed_data(changed: "ChangedPlants", tolerances: str) -> dict[str, Any]:
+    worst, peak = changed.worst
+    finite = [p if math.isfinite(p) else None for p in changed.peak_s]
+    return {
+        "tolerances": tolerances,
+        "plants": len(finite),
+        "unstable": finite.count(None),
+        "worst": {"plant": worst.name, "peak_s": peak if math.isfinite(peak) else None},
+        "peak_s": dict(zip((case.name for case in changed.cases), finite, strict=True)),
+    }
+
+
+def _write(
+    out: Path, data: dict[str, Any], loop: "Loop", strokes: Any, changed: "ChangedPlants | None",
+    measured: "MeasuredLoop | None",
+) -> None:  # fmt: skip
+    import numpy as np
+
+    from hil.margins_figures import draw_bode, draw_nyquist
+
+    try:
+        out.mkdir(parents=True, exist_ok=True)
+        (out / "margins.json").write_text(json.dumps(data, indent=2, allow_nan=False) + "\n", encoding="utf-8")
+    except OSError as error:
+        raise ConfigError(f"--out: {out}: {(error.strerror or str(error)).lower()}; give another folder") from None
+    f = np.unique(np.r_[np.geomspace(5.0, 0.4999 / loop.bus.period_s, 700), np.linspace(450.0, 950.0, 500)])
+    f = f[f < 0.5 / loop.bus.period_s]
+    # those at the point itself: at the others they look alike
+    cases = (
+        [] if changed is None else [c for c in changed.cases if np.array_equal(c.strokes_m, changed.cases[0].strokes_m)]
+    )
+    others = [loop.response(c.strokes_m, f, c.perturbation) for c in cases]
+    title = f"{data['controller']} on {data['bus']}"
+    draw_bode(out / "bode.png", title, loop.response(strokes, f), others, measured)
+    draw_nyquist(out / "nyquist.png", title, loop.response(strokes, f), others, measured)
+
+
+_COLUMNS = ("", "Ms", "Mt", "disk", "-3 dB (Hz)", "gain", "phase (deg)", "delay (us)")
+"""Peaks of S and T, disk margin, where |S| passes -3 dB, and the margins of gain, phase and delay."""
+
+
+def _show(
+    data: dict[str, Any], computed: "Margins", changed: "ChangedPlants | None", measured: "MeasuredLoop | None",
+    compared: "Agreement | None",
+) -> None:  # fmt: skip
+    strokes = " / ".join(f"{q:g}" for q in data["strokes_um"])
+    _screen.print(f"{data['controller']} on {data['bus']}, strokes {strokes} um")
+    if not computed.stable:
+        _screen.print(f"[bold red]unstable[/]: spectral radius {computed.spectral_radius:.4f}")
+    table = Table(box=None, pad_edge=False, header_style="dim")
+    for n, heading in enumerate(_COLUMNS):
+        table.add_column(heading, justify="right" if n else "left", no_wrap=True)
+    _rows(table, computed, "")
+    if measured is not None:
+        _rows(table, measured.margins(), ", measured")
+    _screen.print(table)
+    if changed is not None:
+        worst, peak = changed.worst
+        unstable = sum(not math.isfinite(p) for p in changed.peak_s)
+        verdict = f"[bold red]{unstable} unstable[/], among them" if unstable else f"all stable, Ms at most {peak:.2f}:"
+        _screen.print(f"{len(changed.peak_s)} changed plants: {verdict} {worst.name}", soft_wrap=True)
+    if compared is not None:
+        verdict = "agrees" if compared.holds else "[bold red]disagrees[/]"
+        _screen.print(
+            f"measured S {verdict}: at most {compared.largest:.1f} deviations from the computed one (noise alone stays "
+            f"below {compared.bound:.1f}), {compared.largest_difference:.3f} in |S|",
+            soft_wrap=True,
+        )
+
+
+def _rows(table: Table, found: "Margins", suffix: str) -> None:
+    for name, axis in zip("xyz", found.axes, strict=True):
+        phase = "any" if math.isinf(axis.phase_margin_rad) else f"{math.degrees(axis.phase_margin_rad):.1f}"
+        delay = "any" if math.isinf(axis.delay_margin_s) else f"{axis.delay_margin_s * 1e6:.0f}"
+        gain = "any" if math.isinf(axis.gain_margin) else f"{axis.gain_margin:.2f}"
+        table.add_row(name + suffix, *_sensitivities(axis), gain, phase, delay)
+    table.add_row("MIMO" + suffix, *_sensitivities(found.mimo), "", "", "")
+
+
+def _sensitivities(found: "Sensitivities") -> tuple[str, ...]:
+    return (f"{found.peak_s:.2f}", f"{found.peak_t:.2f}", f"{found.disk_margin:.2f}", f"{found.bandwidth_hz:.0f}")
