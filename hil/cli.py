@@ -13,8 +13,14 @@ from rich.console import Console
 from rich.table import Table
 
 from hil import (
-    bench_cli, check_amplifier_cli, latency_cli, margins_cli, mechanics_cli, replay_cli, run_cli,
-)  # fmt: skip
+    bench_cli,
+    check_amplifier_cli,
+    latency_cli,
+    margins_cli,
+    mechanics_cli,
+    replay_cli,
+    run_cli,
+)
 from pkxyz_ctrl.config import CONFIG_DIR, ConfigError, names
 
 app = typer.Typer(
