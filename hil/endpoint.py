@@ -21,9 +21,11 @@ class ErrorState(IntEnum):
 
 
 _duration_ns = direct(duration_ns_kernel, 0, b"", 0, 0, 0)
-_REMEMBERED = 1024  # durations, and kinds of frames
+_REMEMBERED = 1024  # identifiers, and durations of each
 
 Entry = tuple[int, int, Frame, int]  # arbitration key, order of queueing, frame, duration_ns
+Kind = tuple[tuple[object, ...], int, int, dict[bytes, int]]  # marks, arbitration key, flags, recurring durations
+_UNSEEN: Kind = ((), 0, 0, {})
 
 
 class Endpoint:
@@ -35,7 +37,6 @@ class Endpoint:
         "_others",
         "_received",
         "_recovery_runs",
-        "_recurring_ns",
         "_to_send",
         "_wire",
         "auto_recover",
@@ -80,8 +81,7 @@ class Endpoint:
         self.overruns = 0  # frames lost because the receive queue was full
         self.send_drops = 0  # frames refused or discarded unsent
         self._to_send: list[Entry] = []
-        self._kinds: dict[tuple[int, tuple[object, ...]], tuple[int, int]] = {}  # identifier, marks: key, flags
-        self._recurring_ns: dict[Frame, int] = {}  # durations of short frames
+        self._kinds: dict[int, Kind] = {}  # by identifier: the latest that was sent
         self._others: tuple[Endpoint, ...] = ()  # on the same wire
         self._received: deque[tuple[Frame, int]] = deque()
         self._earliest_ns = 0
@@ -104,22 +104,17 @@ class Endpoint:
         wire = self._wire
         if wire is not None and wire._is_calm:
             # The short way, for speed: a frame of a kind that was sent before, with nothing else on its way.
-            kind = self._kinds.get((frame[0], frame[2:]))
-            if kind is not None:
-                key, flags = kind
-                can_id, data = frame[0], frame[1]
-                if len(data) < 3:  # SYNC and heartbeats recur; process data hardly ever does
-                    duration_ns = self._recurring_ns.get(frame, 0)
-                else:
-                    duration_ns = _duration_ns(can_id, data, flags, wire.nominal_bitrate, wire._fast_bitrate)
+            can_id, data = frame[0], frame[1]
+            marks, key, flags, recurring_ns = self._kinds.get(can_id, _UNSEEN)
+            if marks == frame[2:]:
+                duration_ns = recurring_ns.get(data) or _duration_ns(
+                    can_id, data, flags, wire.nominal_bitrate, wire._fast_bitrate
+                )
                 if duration_ns > 0:
-                    start_ns = wire.clock.now_us * 1000
-                    if start_ns < wire._free_ns:
-                        start_ns = wire._free_ns
                     wire._order = order = wire._order + 1
                     entry = key, order, frame, duration_ns
                     self._to_send.append(entry)
-                    wire._begin(self, entry, start_ns)
+                    wire._begin(self, entry, wire.clock.now_us * 1000)
                     return True
         return self._queue(frame)
 
@@ -135,15 +130,24 @@ class Endpoint:
             self.send_drops += 1
             return False
         key = arbitration_key(frame)
-        if len(self._kinds) < _REMEMBERED:
-            self._kinds[frame[0], frame[2:]] = key, frame_flags(frame)
-        if len(frame.data) < 3 and not is_passive and len(self._recurring_ns) < _REMEMBERED:
-            self._recurring_ns[frame] = duration_ns
+        if not is_passive:
+            self._remember(frame, key, duration_ns)
+        wire._has_queue = True
         wire._order = order = wire._order + 1
         heappush(self._to_send, (key, order, frame, duration_ns))
         if not wire._delivering and (wire._end_us < 0 or wire.clock.now_us * 1000 <= wire._start_ns):
             wire._arbitrate()
         return True
+
+    def _remember(self, frame: Frame, key: int, duration_ns: int) -> None:
+        can_id, data, *_ = frame
+        if can_id not in self._kinds and len(self._kinds) >= _REMEMBERED:
+            return
+        kind = self._kinds.get(can_id, _UNSEEN)
+        if kind[0] != frame[2:]:
+            kind = self._kinds[can_id] = frame[2:], key, frame_flags(frame), {}
+        if len(data) < 3 and len(kind[3]) < _REMEMBERED:  # SYNC and heartbeats recur; process data hardly ever does
+            kind[3][data] = duration_ns
 
     def _overrun(self, frame: Frame, t_us: int) -> None:
         """There is no room for a frame that has come."""

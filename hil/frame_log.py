@@ -11,6 +11,9 @@ from pkxyz_ctrl.can.frame import Frame
 BLOCK_FRAMES = 4096  # formatted and written together: about 0.3 s of a busy wire, and what a killed process loses
 ERROR_FLAG = 0x2000_0000  # CAN_ERR_FLAG of linux/can.h
 
+_THREE_DIGITS = tuple(f"{n:03d}" for n in range(1000))
+_UNSEEN: tuple[tuple[object, ...], str] = ((), "")
+
 
 class FrameLog:
     """Lines of ``(seconds.microseconds) channel ID#DATA``, FD frames as ``ID##<flags>DATA`` with flags 1 = BRS.
@@ -25,7 +28,7 @@ class FrameLog:
         self.channel = channel
         self.frames = 0
         self._rows: list[tuple[Frame, int]] = []
-        self._middles: dict[tuple[object, ...], str] = {}  # what stands between time and data, by all but the data
+        self._middles: dict[int, tuple[tuple[object, ...], str]] = {}  # of an identifier: marks, text before the data
         self._endpoint: Endpoint | None = None
         self._file = self.path.open("w", encoding="ascii", newline="\n")
 
@@ -50,7 +53,7 @@ class FrameLog:
             rows += self._endpoint.receive_all()
         if rows:
             self.frames += len(rows)
-            self._file.write("".join([self._line(frame, t_us) for frame, t_us in rows]))
+            self._file.write("".join(self._lines(rows)))
             self._file.flush()
 
     def close(self) -> None:
@@ -69,14 +72,22 @@ class FrameLog:
     def __exit__(self, kind: type[BaseException] | None, error: BaseException | None, tb: TracebackType | None) -> None:
         self.close()
 
-    def _line(self, frame: Frame, t_us: int) -> str:
-        data = frame[1]
-        key = (frame[0], frame[2:])
-        middle = self._middles.get(key)
-        if middle is None:
-            middle = self._middles[key] = f") {self.channel} {_identifier(frame)}"
-        payload = data.hex().upper() if not frame[4] else f"{len(data)}" if data else ""
-        return f"({t_us // 1_000_000}.{t_us % 1_000_000:06d}{middle}{payload}\n"
+    def _lines(self, rows: list[tuple[Frame, int]]) -> list[str]:
+        # Formatting a number takes as long as the rest of a line: the milliseconds are kept, the rest is looked up.
+        lines: list[str] = []
+        write, middles = lines.append, self._middles
+        last_ms, begin = -1, ""
+        for frame, t_us in rows:
+            t_ms = t_us // 1000
+            if t_ms != last_ms:
+                last_ms, begin = t_ms, f"({t_ms // 1000}.{t_ms % 1000:03d}"
+            marks, middle = middles.get(frame[0], _UNSEEN)
+            if marks != frame[2:]:
+                marks, middle = middles[frame[0]] = frame[2:], f") {self.channel} {_identifier(frame)}"
+            data = frame[1]
+            payload = data.hex().upper() if not frame[4] else f"{len(data)}" if data else ""
+            write(f"{begin}{_THREE_DIGITS[t_us - 1000 * t_ms]}{middle}{payload}\n")
+        return lines
 
 
 def _identifier(frame: Frame) -> str:

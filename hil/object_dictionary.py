@@ -6,8 +6,10 @@ Written without the canopen library, which plays the master in the tests: a misr
 import struct
 from collections.abc import Iterator
 from configparser import RawConfigParser, SectionProxy
+from copy import copy
 from dataclasses import dataclass
 from enum import IntEnum
+from functools import lru_cache
 from pathlib import Path
 from re import fullmatch
 
@@ -118,20 +120,8 @@ class ObjectDictionary:
     @classmethod
     def from_eds(cls, path: str | Path, node_id: int) -> "ObjectDictionary":
         """Read ``path``; ``$NODEID`` becomes ``node_id``. ValueError names the section that is not understood."""
-        parser = RawConfigParser(inline_comment_prefixes=(";",))
-        with open(path, encoding="utf-8") as lines:
-            parser.read_file(lines)
-        entries = {}
-        for name in parser.sections():
-            match = fullmatch(r"([0-9A-Fa-f]{4})(?:[Ss]ub([0-9A-Fa-f]{1,2}))?", name)
-            if match is None or "datatype" not in parser[name]:
-                continue  # file information, lists of objects, and the heads of arrays and records
-            key = int(match[1], 16), int(match[2] or "0", 16)
-            try:
-                entries[key] = _entry(*key, parser[name], node_id)
-            except (KeyError, ValueError) as error:
-                raise ValueError(f"{path}: section [{name}] is not a variable that this node knows: {error}") from error
-        return cls(entries)
+        factory = _read_eds(Path(path).read_text(encoding="utf-8"), str(path), node_id)
+        return cls({(entry.index, entry.subindex): copy(entry) for entry in factory})
 
     def __getitem__(self, key: tuple[int, int]) -> int:
         value = self._entries[key].value
@@ -165,6 +155,22 @@ class ObjectDictionary:
         for found in self._entries.values():
             if first <= found.index <= last:
                 found.value = found.default
+
+
+@lru_cache(maxsize=8)  # a study makes one node after the other
+def _read_eds(text: str, path: str, node_id: int) -> tuple[Entry, ...]:
+    parser = RawConfigParser(inline_comment_prefixes=(";",))
+    parser.read_string(text, source=path)
+    entries = []
+    for name in parser.sections():
+        match = fullmatch(r"([0-9A-Fa-f]{4})(?:[Ss]ub([0-9A-Fa-f]{1,2}))?", name)
+        if match is None or "datatype" not in parser[name]:
+            continue  # file information, lists of objects, and the heads of arrays and records
+        try:
+            entries.append(_entry(int(match[1], 16), int(match[2] or "0", 16), parser[name], node_id))
+        except (KeyError, ValueError) as error:
+            raise ValueError(f"{path}: section [{name}] is not a variable that this node knows: {error}") from error
+    return tuple(entries)
 
 
 def _entry(index: int, subindex: int, section: SectionProxy, node_id: int) -> Entry:

@@ -1,6 +1,5 @@
 """The plant as the amplifier node sees it: driven and sampled in bus time, one compiled call a tick."""
 
-import struct
 from collections.abc import Sequence
 
 import numpy as np
@@ -16,27 +15,35 @@ from sim.plant import Plant
 EXCHANGE = np.dtype(
     [
         *TRUTH_FIELDS,
-        ("advance_us", "i8"),
-        ("is_driven", "i4"),
         ("drive_count", "i4", (3,)),
         ("sense_count", "i4", (3,)),
     ],
     align=True,
 )
-_AT = {name: offset for name, (_, offset, *_) in dict(EXCHANGE.fields or {}).items()}
-_ASK = struct.Struct("=qi3i")  # advance_us, is_driven, drive_count: numpy takes five times as long to set them
-_ANSWER = struct.Struct("=3i")  # sense_count
 
 
 @njit(cache=True)
-def _exchange(params: NDArray[np.void], state: NDArray[np.void], exchange: NDArray[np.void]) -> None:
+def _exchange(
+    params: NDArray[np.void],
+    state: NDArray[np.void],
+    exchange: NDArray[np.void],
+    advance_us: int,
+    is_driven: bool,
+    count_1: int,
+    count_2: int,
+    count_3: int,
+) -> tuple[int, int, int]:
     """What a SYNC means to the plant: move on to now, take new voltages if there are any, be sampled."""
     x = exchange[0]
-    kernels.advance(params, state, x["advance_us"])
+    kernels.advance(params, state, advance_us)
     observe(params[0], state[0], x)
-    if x["is_driven"] != 0:
-        kernels.drive(params, state, x["drive_count"])
-    kernels.sample(params, state, x["sense_count"])
+    if is_driven:
+        drive = x["drive_count"]
+        drive[0], drive[1], drive[2] = count_1, count_2, count_3
+        kernels.drive(params, state, drive)
+    sense = x["sense_count"]
+    kernels.sample(params, state, sense)
+    return sense[0], sense[1], sense[2]
 
 
 class PlantOnBus:
@@ -51,15 +58,15 @@ class PlantOnBus:
         self.plant = plant
         self._params, self._state = plant.params, plant.state
         self.exchange = np.zeros(1, EXCHANGE)
-        self._bytes = self.exchange.view(np.uint8).data
         self._counts: Sequence[int] = (0, 0, 0)
         self._is_driven = False  # the counts wait to be applied
         self._origin_us: int | None = None
         self._plant_us = plant.t_us
         self._now_us = 0
         self._waiting = False
-        self._exchange = direct(_exchange, plant.params, plant.state, self.exchange)
-        self._exchange(plant.params, plant.state.copy(), self.exchange.copy())  # loaded now, not in the first tick
+        self._exchange = direct(_exchange, plant.params, plant.state, self.exchange, 0, False, 0, 0, 0)
+        # Loaded now, not in the first tick:
+        self._exchange(plant.params, plant.state.copy(), self.exchange.copy(), 0, False, 0, 0, 0)
 
     def advance_to(self, t_us: int) -> None:
         """It is ``t_us`` on the bus."""
@@ -80,12 +87,13 @@ class PlantOnBus:
         if self._origin_us is None:
             self._origin_us = self._now_us
         target_us = self._now_us - self._origin_us
-        _ASK.pack_into(self._bytes, _AT["advance_us"], target_us - self._plant_us, self._is_driven, *self._counts)
-        self._exchange(self._params, self._state, self.exchange)
+        a, b, c = self._counts
+        counts: tuple[int, int, int] = self._exchange(
+            self._params, self._state, self.exchange, target_us - self._plant_us, self._is_driven, a, b, c
+        )
         self._plant_us = target_us
         self._is_driven = self._waiting = False
-        a, b, c = _ANSWER.unpack_from(self._bytes, _AT["sense_count"])
-        return a, b, c
+        return counts
 
     def settle(self) -> None:
         """Carry out what waits: move the plant to now, and apply the counts that came without a sample after them."""

@@ -73,6 +73,7 @@ class Wire:
         self._delivering = False
         self._recovering: list[Endpoint] = []
         self._is_ordinary = False  # at least two nodes, and no error counted anywhere: a frame takes the short way
+        self._has_queue = False  # somebody may have a frame to send besides the one on its way
         self._is_calm = False  # ordinary, idle and nothing queued: a frame that is sent has no rival
         self._runs = 0  # of 11 recessive bits, counted while an endpoint recovers
 
@@ -171,9 +172,11 @@ class Wire:
             self._begin(sender, entry, ready_ns)
 
     def _begin(self, sender: Endpoint, entry: Entry, start_ns: int) -> None:
-        """Put ``entry`` on the wire at ``start_ns``, unless a better one is queued until then."""
+        """Put ``entry`` on the wire at ``start_ns``, or when it is free, unless a better one is queued until then."""
         self._is_calm = False
         self._sender, self._entry = sender, entry
+        if start_ns < self._free_ns:
+            start_ns = self._free_ns
         self._start_ns = start_ns
         self._end_us = end_us = -((self._interframe_ns - entry[3] - start_ns) // 1000)  # rounded up
         self.clock.call_at(end_us, self._complete)
@@ -222,13 +225,15 @@ class Wire:
                 self._complete_out_of_the_ordinary(sender, entry, t_us, before_ns)
         finally:
             self._delivering = False
-            if any(self._queues):
+            if self._has_queue and any(self._queues):
                 self._arbitrate()
             else:
+                self._has_queue = False
                 self._is_calm = self._is_ordinary
 
     def _complete_out_of_the_ordinary(self, sender: Endpoint, entry: Entry, t_us: int, before_ns: int) -> None:
         """``before_ns``: since when the wire was free before this frame."""
+        self._has_queue = True  # what was destroyed is sent again
         if self._recovering:
             self._runs += 1 + (self._start_ns - before_ns) // self._bits_ns(RECESSIVE_RUN_BITS)
         if self.disturbance.armed or self._nodes < 2 or self._rivals or sender._wire is None:

@@ -3,7 +3,6 @@
 It owns no clock and no bus. ``runtime`` drives it, whoever owns the time.
 """
 
-import struct
 from collections.abc import Callable
 
 import numpy as np
@@ -21,10 +20,6 @@ from pkxyz_ctrl.safety.trips import Trip, explain
 
 Array = NDArray[np.float64]
 Send = Callable[[Frame], object]
-
-_SEEN = struct.Struct("<7i")  # event, sense_status, node_events, overrun, sense_count: the first fields of cycle.INPUT
-_COUNTS = struct.Struct("<3i")
-_MODE = struct.Struct("<i")
 
 
 class StartUpError(RuntimeError):
@@ -49,19 +44,17 @@ class Controller:
         self.law = law
         self.memory = cycling.new_memory(Mode.BOOT)
         self._send = send
-        self._bytes = self.memory.view(np.uint8).data
-        fields = dict(cycling.MEMORY.fields or {})
-        self._input_at, self._row_at, self._mode_at = (fields[name][1] for name in ("input", "row", "mode"))
-        self._drive_at = self._row_at + dict(ROW.fields or {})["drive_count"][1]
-        self.row = self._bytes[self._row_at : self._row_at + ROW.itemsize]
+        row_at = dict(cycling.MEMORY.fields or {})["row"][1]
+        self.row = self.memory.view(np.uint8).data[row_at : row_at + ROW.itemsize]
         self.mode = int(Mode.BOOT)
         self.period_us = bus.period_us
         self._event = int(Event.NONE)
         self._blocked = 0
         self._take_sense = self.driver.take_sense
         self._reference: Array = np.zeros((1, 9))  # the latest that was handed in
-        self._cycle = direct(cycling.cycle, law, self.memory, self._reference)
-        self._cycle(law, cycling.new_memory(Mode.BOOT), self._reference)  # loaded now, not in the first tick
+        self._drive_counts = (0, 0, 0)
+        self._cycle = direct(cycling.cycle_on, law, self.memory, self._reference, *[0] * 7)
+        self._cycle(law, cycling.new_memory(Mode.BOOT), self._reference, *[0] * 7)  # loaded now, not in the first tick
 
     # -- start and stop ---------------------------------------------------------------------------------------------
 
@@ -117,17 +110,17 @@ class Controller:
         c1, c2, c3, status = self._take_sense()
         if status & 1:
             self.missing_sense += 1
-        memory = self._bytes
-        _SEEN.pack_into(memory, self._input_at, self._event, status, self.driver.node_events, overrun, c1, c2, c3)
         if self._blocked:
             self.memory["input"]["trips"] = self._blocked
             self._blocked = 0
-        self._event = 0
         if reference is not self._reference:
             _require_rows(reference)
             self._reference = reference
-        self._cycle(self.law, self.memory, reference)
-        mode = _MODE.unpack_from(memory, self._mode_at)[0]
+        mode, a, b, c = self._cycle(
+            self.law, self.memory, reference, self._event, status, self.driver.node_events, overrun, c1, c2, c3
+        )
+        self._drive_counts = (a, b, c)
+        self._event = 0
         if mode != self.mode:
             self._enter(mode)
 
@@ -136,7 +129,7 @@ class Controller:
         SYNC.
         """
         driver = self.driver
-        self.send(driver.drive(_COUNTS.unpack_from(self._bytes, self._drive_at), t_us), t_us)
+        self.send(driver.drive(self._drive_counts, t_us), t_us)
         heartbeat = driver.heartbeat_due(t_us)
         if heartbeat is not None and t_us <= heartbeat_until_us:
             self.send(heartbeat, t_us)

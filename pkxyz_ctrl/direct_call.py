@@ -3,6 +3,7 @@
 from collections.abc import Callable
 from typing import Any
 
+import numpy as np
 from numba import typeof
 
 
@@ -16,7 +17,21 @@ def direct(kernel: Any, *examples: object) -> Callable[..., Any]:
     if not hasattr(kernel, "get_overload"):
         plain: Callable[..., Any] = kernel
         return plain
-    types = tuple(typeof(example) for example in examples)
-    kernel.compile(types)
-    compiled: Callable[..., Any] = kernel.get_overload(types)
+    key = kernel, *map(_kind, examples)
+    compiled = _compiled.get(key)
+    if compiled is None:
+        types = tuple(typeof(example) for example in examples)
+        kernel.compile(types)
+        compiled = _compiled[key] = kernel.get_overload(types)
     return compiled
+
+
+_compiled: dict[tuple[Any, ...], Callable[..., Any]] = {}  # numba takes some ms to say a large record's type
+
+
+def _kind(example: object) -> object:
+    """What decides the type of ``example`` for numba."""
+    if not isinstance(example, np.ndarray):
+        return type(example)
+    flags = example.flags
+    return example.dtype, example.ndim, flags.c_contiguous, flags.f_contiguous, flags.writeable, flags.aligned
