@@ -105,7 +105,7 @@ def sil(
     from hil.run_folder import RunFolder, next_free
     from hil.sil import draw, require_bus
     from pkxyz_ctrl.controller import StartUpError
-    from pkxyz_ctrl.design.estimator_gain import DesignError
+    from pkxyz_ctrl.design.design_error import DesignError
 
     require_bus(loaded, lane.value)
     folder = RunFolder(out if out is not None else next_free(Path("runs"), loaded.config.name, lane.value))

@@ -32,7 +32,7 @@ def replay(
     from hil.run_folder import RECORDING
     from pkxyz_ctrl.config import load
     from pkxyz_ctrl.controller_config import ControllerConfig
-    from pkxyz_ctrl.design.estimator_gain import DesignError
+    from pkxyz_ctrl.design.design_error import DesignError
 
     other = None if controller is None else load("controllers", controller, ControllerConfig)
     try:

@@ -32,7 +32,7 @@ def run(
     from hil.run_folder import RunFolder, next_free
     from hil.wall import LANE, require_real_bus, run_into
     from pkxyz_ctrl.controller import StartUpError
-    from pkxyz_ctrl.design.estimator_gain import DesignError
+    from pkxyz_ctrl.design.design_error import DesignError
 
     loaded = _load(scenario, duration_s, stage=stage, controller=controller, bus=bus)
     require_real_bus(loaded.bus)

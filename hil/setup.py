@@ -10,7 +10,8 @@ from hil.excitation import Excitation
 from pkxyz_ctrl.bus_config import BusConfig
 from pkxyz_ctrl.config import load
 from pkxyz_ctrl.controller_config import ControllerConfig
-from pkxyz_ctrl.design.law import count_max, design_law, slew_counts
+from pkxyz_ctrl.drive_limits import count_max, slew_counts
+from pkxyz_ctrl.law_store import law_of
 from pkxyz_ctrl.safety.gate import GateConfig
 from pkxyz_ctrl.stage import Stage
 from pkxyz_ctrl.stage_config import StageConfig
@@ -43,7 +44,7 @@ class Setup:
     @cached_property
     def law(self) -> NDArray[np.void]:
         """The numbers that the cycle runs on, designed and cross-checked."""
-        return design_law(Stage(self.stage), self.controller, self.bus, autostart=True)
+        return law_of(self.stage, self.controller, self.bus, autostart=True)
 
     @property
     def gate(self) -> GateConfig:

@@ -13,14 +13,10 @@ import math
 
 import numpy as np
 from numba import njit
-from scipy.integrate import DOP853
 
 from sim.amplifier import pass_time
+from sim.dop853 import A, B, C
 from sim.mechanics import acceleration, comb_acceleration, stiffness
-
-A = np.ascontiguousarray(DOP853.A[:12, :12])
-B = np.ascontiguousarray(DOP853.B)
-C = np.ascontiguousarray(DOP853.C[:12])
 
 LONGEST_S = 205e-6
 """Longest step: a sixth of the fastest rigid mode's period, at which the order-8 method is exact to 1e-14 m in a

@@ -14,14 +14,11 @@ from numpy.typing import NDArray
 
 from pkxyz_ctrl.bus_config import BusConfig
 from pkxyz_ctrl.controller_config import EstimatorConfig
+from pkxyz_ctrl.design.design_error import DesignError
 from pkxyz_ctrl.design.plant_model import LinearStage, SampledStage
 from pkxyz_ctrl.stage import Stage
 
 Array = NDArray[np.float64]
-
-
-class DesignError(RuntimeError):
-    """A design that does not hold what it promised; the message says which check failed and by how much."""
 
 
 def process_noise(model: LinearStage, config: EstimatorConfig, period_s: float) -> tuple[Array, Array]:

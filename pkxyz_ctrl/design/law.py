@@ -17,6 +17,7 @@ from pkxyz_ctrl.design.estimator_gain import kalman_gain, measurement_matrix, me
 from pkxyz_ctrl.design.loop_plant import loop_plant
 from pkxyz_ctrl.design.plant_model import LinearStage, SampledStage, linearise, sample
 from pkxyz_ctrl.design.regulator import regulator_gain
+from pkxyz_ctrl.drive_limits import count_max, slew_counts
 from pkxyz_ctrl.law_config import Mpc
 from pkxyz_ctrl.stage import Stage
 
@@ -53,17 +54,6 @@ def design_law(stage: Stage, controller: ControllerConfig, bus: BusConfig, *, au
 def amplifier_time_constant_s(stage: Stage) -> float:
     """Time constant of the amplifier's first-order approach to a new voltage."""
     return 1.0 / (2.0 * math.pi * stage.config.amplifier.bandwidth_hz)
-
-
-def slew_counts(controller: ControllerConfig, bus: BusConfig) -> int:
-    """Most that a drive count may change in one tick."""
-    return math.floor(controller.limits.slew_max_v_per_s * bus.period_s / bus.analog.drive_volt_per_count + 1e-9)
-
-
-def count_max(stage: Stage, controller: ControllerConfig, bus: BusConfig) -> int:
-    """Largest drive count that stays within the controller's and the device's voltage limit."""
-    limit_v = min(controller.limits.voltage_max_v, stage.voltage_max_v)
-    return min(32767, math.floor(limit_v / bus.analog.drive_volt_per_count + 1e-9))
 
 
 def _check_limits(stage: Stage, controller: ControllerConfig, bus: BusConfig) -> None:

@@ -5,7 +5,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from pkxyz_ctrl.controller_config import RegulatorConfig
-from pkxyz_ctrl.design.estimator_gain import DesignError
+from pkxyz_ctrl.design.design_error import DesignError
 from pkxyz_ctrl.design.plant_model import SampledStage
 
 Array = NDArray[np.float64]

@@ -1,0 +1,78 @@
+"""Designed laws, kept: what follows from the same files, sources and libraries is designed and checked once.
+
+Designing needs python-control, filterpy and scipy's solvers, whose import alone takes longer than a run.
+"""
+
+import hashlib
+import os
+import sys
+import tempfile
+from importlib.metadata import version
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+
+from pkxyz_ctrl import cycle
+from pkxyz_ctrl.bus_config import BusConfig
+from pkxyz_ctrl.controller_config import ControllerConfig
+from pkxyz_ctrl.stage_config import StageConfig
+
+_LIBRARIES = ("numpy", "scipy", "control", "filterpy")
+_KEPT = 256
+_SEAL_BYTES = hashlib.sha256().digest_size
+
+
+def law_of(stage: StageConfig, controller: ControllerConfig, bus: BusConfig, *, autostart: bool) -> NDArray[np.void]:
+    """``design.law.design_law``, or what it returned before for the same; raises what it raises.
+
+    A file that is not whole is no file. Where nothing can be kept (no cache folder, no room) it is designed each time.
+    """
+    path = _path_of(stage, controller, bus, autostart)
+    law = _read(path) if path is not None else None
+    if law is None:
+        from pkxyz_ctrl.design.law import design_law
+        from pkxyz_ctrl.stage import Stage
+
+        law = design_law(Stage(stage), controller, bus, autostart=autostart)
+        if path is not None:
+            _keep(path, law)
+    return law
+
+
+def _path_of(stage: StageConfig, controller: ControllerConfig, bus: BusConfig, autostart: bool) -> Path | None:
+    home = os.environ.get("NUMBA_CACHE_DIR")  # beside the kernels, which are newer than the sources, too
+    if not home:
+        return None
+    digest = hashlib.sha256()
+    for model in (stage, controller, bus):
+        digest.update(model.model_dump_json().encode() + b"\0")
+    root = Path(__file__).parent
+    for source in sorted(root.rglob("*.py")):
+        digest.update(source.read_bytes())
+    digest.update(repr((autostart, sys.version, [version(name) for name in _LIBRARIES], cycle.LAW)).encode())
+    return Path(home) / "laws" / digest.hexdigest()[:32]
+
+
+def _read(path: Path) -> NDArray[np.void] | None:
+    try:
+        content = path.read_bytes()
+    except OSError:
+        return None
+    seal, body = content[:_SEAL_BYTES], content[_SEAL_BYTES:]
+    if hashlib.sha256(body).digest() != seal or len(body) != cycle.LAW.itemsize:
+        return None
+    return np.frombuffer(body, cycle.LAW)  # read-only, as bytes are
+
+
+def _keep(path: Path, law: NDArray[np.void]) -> None:
+    body = law.tobytes()
+    try:
+        path.parent.mkdir(parents=True, exist_ok=True)
+        with tempfile.NamedTemporaryFile(dir=path.parent, delete=False) as file:
+            file.write(hashlib.sha256(body).digest() + body)
+        os.replace(file.name, path)  # whoever reads meanwhile sees all of it or nothing
+        for old in sorted(path.parent.iterdir(), key=lambda p: p.stat().st_mtime)[:-_KEPT]:
+            old.unlink(missing_ok=True)
+    except OSError:
+        return
