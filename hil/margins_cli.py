@@ -118,7 +118,7 @@ def margins(
 def _one_line_errors() -> "Iterator[None]":
     from hil.measured_loop import MeasurementError
     from pkxyz_ctrl.design.discrete_law import LawError
-    from pkxyz_ctrl.design.estimator_gain import DesignError
+    from pkxyz_ctrl.design.design_error import DesignError
     from pkxyz_ctrl.stage import StageDomainError
 
     try:
