@@ -117,8 +117,8 @@ def margins(
 @contextmanager
 def _one_line_errors() -> "Iterator[None]":
     from hil.measured_loop import MeasurementError
-    from pkxyz_ctrl.design.discrete_law import LawError
     from pkxyz_ctrl.design.design_error import DesignError
+    from pkxyz_ctrl.design.discrete_law import LawError
     from pkxyz_ctrl.stage import StageDomainError
 
     try:
