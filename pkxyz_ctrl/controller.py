@@ -21,6 +21,8 @@ from pkxyz_ctrl.safety.trips import Trip, explain
 Array = NDArray[np.float64]
 Send = Callable[[Frame], object]
 
+_IDLE = int(Mode.IDLE)
+
 
 class StartUpError(RuntimeError):
     """The amplifier could not be brought to operation; the message says what was expected, what came and what to do."""
@@ -49,6 +51,9 @@ class Controller:
         self.mode = int(Mode.BOOT)
         self.period_us = bus.period_us
         self._event = int(Event.NONE)
+        self._clearing = False  # a clear was asked for, and is not done yet
+        self._restart_due = False
+        self._restarting = False
         self._blocked = 0
         self._take_sense = self.driver.take_sense
         self._reference: Array = np.zeros((1, 9))  # the latest that was handed in
@@ -87,13 +92,21 @@ class Controller:
             self.send(frame, t_us)
 
     def request(self, event: Event) -> None:
-        """Ask for an event at the next tick: HOME, ENABLE, TRACK, HOLD, DISABLE, CLEAR."""
+        """Ask for an event at the next tick: HOME, ENABLE, TRACK, HOLD, DISABLE."""
         self._event = int(event)
+
+    def clear(self) -> None:
+        """Ask to forget the fault. Once the combs have been at 0 V for long enough, gate, driver and node start anew,
+        tick by tick, while the loop goes on; where that failed, it is tried again. Without a fault nothing happens.
+        """
+        self._clearing = self.mode == Mode.FAULT or (self.mode < _IDLE and self.driver.state is DriverState.FAILED)
 
     # -- one tick ---------------------------------------------------------------------------------------------------
 
     def begin(self, t_us: int) -> None:
         """The tick begins: SYNC, on which the amplifier applies the last voltages and samples."""
+        if self.mode < _IDLE:
+            self._go_on_starting(t_us)
         self.send(self.driver.sync(t_us), t_us)
 
     def receive(self, frame: Frame, t_us: int) -> bool:
@@ -107,6 +120,8 @@ class Controller:
         """Run the cycle on what has come since the SYNC. ``reference`` (n, 9) float64, row after row in memory;
         ``overrun`` ticks skipped before this one. Raises ValueError for another reference.
         """
+        if self._clearing:
+            self._event = int(Event.CLEAR) if self.mode == Mode.FAULT else self._event
         c1, c2, c3, status = self._take_sense()
         if status & 1:
             self.missing_sense += 1
@@ -151,13 +166,36 @@ class Controller:
 
     # -- modes ------------------------------------------------------------------------------------------------------
 
+    def _go_on_starting(self, t_us: int) -> None:
+        """After a clear: one step of the start-up at the beginning of a tick, without waiting for anything."""
+        driver = self.driver
+        if self._restart_due or (self._clearing and driver.state is DriverState.FAILED):
+            self._restart_due = self._clearing = False
+            self._restarting = True
+            self.gate.clear()
+            frames = driver.start(t_us)
+        else:
+            frames = driver.poll(t_us)
+        for frame in frames:
+            self.send(frame, t_us)
+        if driver.state is DriverState.FAILED and self._restarting:
+            self._restarting = False
+            self.faults.append(f"start-up after a clear: {driver.failure}")
+            self._event = int(Event.NODE_LOST)
+        elif driver.state is DriverState.CONFIGURING:
+            self._event = int(Event.NODE_FOUND)
+        elif driver.state is DriverState.OPERATIONAL:
+            self._event = int(Event.NODE_READY)
+
     def _apply(self, event: Event) -> None:
         """Let an event of the start-up act on the mode, before there are ticks."""
         self.mode = int(next_mode(self.mode, int(event)))
         self.memory["mode"] = self.mode
 
     def _enter(self, mode: int) -> None:
-        self.mode = mode
+        was, self.mode = self.mode, mode
+        if was == Mode.FAULT:
+            self._restart_due = True
         if mode == Mode.FAULT:
             row = self.memory["row"][0]
             reason = explain(int(row["trips"]))

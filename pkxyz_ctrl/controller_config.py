@@ -48,6 +48,10 @@ class MonitorConfig(FrozenModel):
     stroke_min_m: float
     stroke_max_m: float
     innovation_max_m: Positive
+    residual_max_m: Positive = 0.5e-6
+    """Most that a stroke may be from where it was expected; beyond it the measurement is not used."""
+    unexplained_force_max_n: Positive = 0.4e-3
+    """Most that the estimated disturbance may amount to at a comb."""
     stale_count: int
     sequence_count: int
     crc_count: int
@@ -55,12 +59,16 @@ class MonitorConfig(FrozenModel):
     range_count: int
     frozen_count: int
     innovation_count: int
+    residual_count: int = 3
+    unexplained_force_count: int = 5
     saturation_count: int
     slew_count: int
     overrun_count: int
     solver_count: int
     frame_leak_ticks: Annotated[int, Field(gt=0)]
     overrun_leak_ticks: Annotated[int, Field(gt=0)]
+    safe_cycles: Annotated[int, Field(ge=0)] = 10
+    """Ticks in a row at 0 V, with good sense frames, before the loop is closed or a fault cleared."""
 
 
 class ControllerConfig(FrozenModel):
@@ -75,6 +83,8 @@ class ControllerConfig(FrozenModel):
     """Strokes about which gains are designed; the energy gradient and the kinematics are exact everywhere."""
     homing_s: Annotated[float, Field(gt=0, le=10)]
     """How long the sense offsets are averaged at 0 V."""
+    stop_s: Annotated[float, Field(gt=0, le=10)] = 0.004
+    """How long the path takes to stop when it is held, and to be taken up again."""
     estimator: EstimatorConfig
     regulator: RegulatorConfig
     limits: DriveLimitsConfig

@@ -5,14 +5,25 @@ for a clock and by the lane that does not; it reads ``memory["input"]`` and leav
 ``memory["row"]``.
 """
 
+import math
+
 import numpy as np
 from numba import njit
 from numpy.typing import NDArray
 
-from pkxyz_ctrl.core import tick
+from pkxyz_ctrl.core import pace, tick
 from pkxyz_ctrl.row import ROW
-from pkxyz_ctrl.safety.modes import LOOP_CLOSED, Event, Mode, enable_event, next_homed, next_mode
-from pkxyz_ctrl.safety.monitors import LIMITS, MONITOR_MEMORY, OBSERVATION, SenseStatus, check
+from pkxyz_ctrl.safety.modes import (
+    LOOP_CLOSED,
+    Event,
+    Mode,
+    clear_event,
+    enable_event,
+    next_homed,
+    next_mode,
+    next_safe_cycles,
+)
+from pkxyz_ctrl.safety.monitors import LIMITS, MONITOR_MEMORY, OBSERVATION, SenseStatus, check, implausible_combs
 
 Array = NDArray[np.float64]
 Records = NDArray[np.void]
@@ -36,6 +47,7 @@ LAW = np.dtype(
         ("limits", LIMITS),
         ("period_us", "i8"),
         ("homing_ticks", "i4"),
+        ("pace_ticks", "i4"),  # even: how long the path takes to stop, and to be taken up again
         ("autostart", "i4"),  # 1: home, enable and track by itself, as a scenario wants it
     ],
     align=True,
@@ -53,20 +65,29 @@ MEMORY = np.dtype(
         ("now", "f8", (9,)),  # ... and where this tick's force begins and ends to act
         ("after", "f8", (9,)),
         ("later", "f8", (9,)),  # ... and a period after that
+        ("surprise_m", "f8", (3,)),  # innovation of a measurement that was not believed
+        ("phase", "f8"),  # where between reference_tick and the next row the path stands; 0 unless a hold was cut short
+        ("pace_phase", "f8"),  # where the change of the path speed began, from reference tick 0
         ("tick_index", "i8"),
         ("reference_tick", "i8"),
         ("mode", "i4"),
         ("homed", "i4"),
         ("homing_count", "i4"),
         ("homing_sum", "i8", (3,)),
+        ("safe_cycles", "i4"),
+        ("suspects", "i4"),  # combs whose stroke was not believed in this tick, one bit each
+        ("pace", "i4"),  # pace.SLOWING, STEADY, STARTING
+        ("pace_age", "i4"),
+        ("held", "i4"),  # 1: somebody asked to hold, and the automatic start leaves it at that
     ],
     align=True,
 )
 
 _ROW_LENGTH = 9
 _UNUSABLE = int(SenseStatus.MISSING | SenseStatus.CRC | SenseStatus.LENGTH | SenseStatus.DUPLICATE)
-_NONE, _HOME, _HOMED, _ENABLE, _TRACK, _TRIP = (
-    int(e) for e in (Event.NONE, Event.HOME, Event.HOMED, Event.ENABLE, Event.TRACK, Event.TRIP)
+_IMPLAUSIBLE = int(SenseStatus.IMPLAUSIBLE)
+_NONE, _HOME, _HOMED, _ENABLE, _TRACK, _TRIP, _CLEAR = (
+    int(e) for e in (Event.NONE, Event.HOME, Event.HOMED, Event.ENABLE, Event.TRACK, Event.TRIP, Event.CLEAR)
 )
 _IDLE, _HOMING, _ENABLED, _TRACKING, _FAULT = (
     int(m) for m in (Mode.IDLE, Mode.HOMING, Mode.ENABLED, Mode.TRACKING, Mode.FAULT)
@@ -100,18 +121,23 @@ def observe(law_array: Records, memory_array: Records, reference: Array) -> None
     _handle(law, memory, _asked(law, memory))
     seen = memory["input"]
     usable = (seen["sense_status"] & _UNUSABLE) == 0
+    memory["suspects"] = 0
     if usable:
         tick.measure(law["tick"], memory["tick"], seen["sense_count"])
         if memory["mode"] == _HOMING:
             _average(law, memory)
         if reference.shape[1] > _ROW_LENGTH and memory["mode"] == _TRACKING:
             _excite(memory, reference)
-    tick.estimate(law["tick"], memory["tick"], usable)
+        memory["suspects"] = _suspects(law, memory)
+    believed = usable and memory["suspects"] == 0
+    tick.estimate(law["tick"], memory["tick"], believed)
+    if memory["suspects"] != 0:
+        memory["tick"]["estimate"]["innovation_m"][:] = memory["surprise_m"]
     delay = law["tick"]["delay_periods"]
-    reference_row(memory, reference, 0, memory["here"])
-    reference_row(memory, reference, delay, memory["now"])
-    reference_row(memory, reference, delay + 1, memory["after"])
-    reference_row(memory, reference, delay + 2, memory["later"])
+    reference_row(law, memory, reference, 0, memory["here"])
+    reference_row(law, memory, reference, delay, memory["now"])
+    reference_row(law, memory, reference, delay + 1, memory["after"])
+    reference_row(law, memory, reference, delay + 2, memory["later"])
 
 
 @njit(cache=True)
@@ -126,7 +152,11 @@ def respond(law_array: Records, memory_array: Records) -> None:
         tick.rest(state)
     trips = _monitor(law, memory, saturated)
     _write_row(law, memory, trips, saturated)
-    if memory["mode"] == _TRACKING:
+    usable = (seen["sense_status"] & _UNUSABLE) == 0
+    memory["safe_cycles"] = next_safe_cycles(memory["safe_cycles"], memory["mode"], usable, tick.is_discharged(state))
+    if memory["pace"] != pace.STEADY:
+        _change_pace(law, memory)
+    elif memory["mode"] == _TRACKING:
         memory["reference_tick"] += 1
     memory["tick_index"] += 1
     seen["event"] = _NONE
@@ -168,9 +198,12 @@ def _asked(law: np.void, memory: np.void) -> int:
         mode = memory["mode"]
         if mode == _IDLE:
             event = _ENABLE if memory["homed"] != 0 else _HOME
-        elif mode == _ENABLED:
+        elif mode == _ENABLED and memory["held"] == 0:
             event = _TRACK
-    return enable_event(memory["homed"] != 0) if event == _ENABLE else event
+    settled = memory["safe_cycles"] >= law["limits"]["safe_cycles"]
+    if event == _ENABLE:
+        return enable_event(memory["homed"] != 0, settled)
+    return clear_event(settled) if event == _CLEAR else event
 
 
 @njit(cache=True)
@@ -183,6 +216,8 @@ def _handle(law: np.void, memory: np.void, event: int) -> None:
     if target == mode:
         return
     memory["mode"] = target
+    if LOOP_CLOSED[target] == 0:
+        memory["pace"] = pace.STEADY
     rest = np.zeros(3)
     if target == _HOMING:
         memory["homing_count"] = 0
@@ -192,9 +227,60 @@ def _handle(law: np.void, memory: np.void, event: int) -> None:
     elif target == _ENABLED and mode == _IDLE:
         memory["setpoint"][:] = 0.0
         memory["reference_tick"] = 0
+        memory["phase"] = 0.0
+        memory["pace"] = pace.STEADY
+        memory["held"] = 0
     elif target == _ENABLED and mode == _TRACKING:
-        memory["setpoint"][0:3] = memory["row"]["reference_m"]
-        memory["setpoint"][3:9] = 0.0
+        memory["held"] = 1
+        _turn_pace(law, memory, pace.SLOWING)
+    elif target == _TRACKING:
+        if memory["held"] != 0:
+            _turn_pace(law, memory, pace.STARTING)
+        memory["held"] = 0
+
+
+@njit(cache=True)
+def _turn_pace(law: np.void, memory: np.void, direction: int) -> None:
+    """Begin to stop on the path, or to go on along it; in the middle of the other, from the speed that there is."""
+    at = memory["reference_tick"] + memory["phase"]
+    age = 0
+    if memory["pace"] == -direction:
+        gone, _, _ = pace.advance(memory["pace"], memory["pace_age"], law["pace_ticks"])
+        at = memory["pace_phase"] + gone
+        age = max(0, law["pace_ticks"] - memory["pace_age"])  # where the mirrored ramp has this speed
+    gone, _, _ = pace.advance(direction, age, law["pace_ticks"])
+    memory["pace"] = direction
+    memory["pace_age"] = age
+    memory["pace_phase"] = at - gone
+
+
+@njit(cache=True)
+def _change_pace(law: np.void, memory: np.void) -> None:
+    """A tick of slowing down or starting has passed; at its end the path stands, or goes on at its own speed."""
+    memory["pace_age"] += 1
+    gone, _, _ = pace.advance(memory["pace"], memory["pace_age"], law["pace_ticks"])
+    at = memory["pace_phase"] + gone
+    if memory["pace_age"] >= law["pace_ticks"]:
+        if memory["pace"] == pace.SLOWING:
+            memory["setpoint"][:] = memory["now"]  # which is ahead of this tick, and so stands already
+        memory["pace"] = pace.STEADY
+    memory["reference_tick"] = np.int64(math.floor(at))
+    memory["phase"] = at - math.floor(at)
+
+
+@njit(cache=True)
+def _suspects(law: np.void, memory: np.void) -> int:
+    """Combs whose strokes are not to be believed, one bit each; leaves what the innovation would have been. While the
+    loop is open there is no estimate to hold them against.
+    """
+    if LOOP_CLOSED[memory["mode"]] == 0:
+        return 0
+    combs: int = implausible_combs(law["limits"], memory["tick"]["residual_m"])
+    if combs != 0:
+        origin, predicted = law["tick"]["estimator"]["operating_point_m"], memory["tick"]["estimate"]["predicted"]
+        for i in range(3):
+            memory["surprise_m"][i] = memory["tick"]["measurement_m"][i] - origin[i] - predicted[i]
+    return combs
 
 
 @njit(cache=True)
@@ -224,10 +310,18 @@ def _excite(memory: np.void, reference: Array) -> None:
 
 
 @njit(cache=True)
-def reference_row(memory: np.void, reference: Array, ahead: int, out: Array) -> None:
+def reference_row(law: np.void, memory: np.void, reference: Array, ahead: int, out: Array) -> None:
     """Write the row (9,) of the set-point ``ahead`` ticks from this one to ``out``."""
-    if memory["mode"] == _TRACKING:
-        index = memory["reference_tick"] - memory["input"]["reference_base"] + ahead
+    base = memory["input"]["reference_base"]
+    if memory["pace"] != pace.STEADY:
+        gone, speed, change = pace.advance(memory["pace"], memory["pace_age"] + ahead, law["pace_ticks"])
+        at = memory["pace_phase"] - base + gone
+        pace.sample(reference, at, speed, change, law["period_us"] * 1e-6, out)
+    elif memory["mode"] == _TRACKING and memory["phase"] != 0.0:
+        at = memory["reference_tick"] - base + ahead + memory["phase"]
+        pace.sample(reference, at, 1.0, 0.0, law["period_us"] * 1e-6, out)
+    elif memory["mode"] == _TRACKING:
+        index = memory["reference_tick"] - base + ahead
         index = min(max(index, 0), len(reference) - 1)
         for i in range(_ROW_LENGTH):
             out[i] = reference[index, i]
@@ -244,6 +338,8 @@ def _monitor(law: np.void, memory: np.void, saturated: int) -> int:
     obs["saturated"] = saturated
     obs["solver_ok"] = 0 if law["tick"]["kind"] == tick.PREDICTIVE and state["plan_known"] == 0 else 1
     obs["finite"] = 1 if tick.is_finite(state) else 0
+    obs["implausible_combs"] = memory["suspects"]
+    tick.unexplained_force(state, obs["unexplained_force_n"])
     for i in range(3):
         obs["sense_count"][i] = seen["sense_count"][i]
         obs["stroke_m"][i] = state["stroke_m"][i]
@@ -266,7 +362,8 @@ def _write_row(law: np.void, memory: np.void, trips: int, saturated: int) -> Non
     row["t_us"] = memory["tick_index"] * law["period_us"]
     row["tick"] = memory["tick_index"]
     row["reference_tick"] = memory["reference_tick"] if memory["mode"] == _TRACKING else -1
-    row["mode"], row["trips"], row["sense_status"] = memory["mode"], trips, seen["sense_status"]
+    row["mode"], row["trips"] = memory["mode"], trips
+    row["sense_status"] = (seen["sense_status"] & ~_IMPLAUSIBLE) | (_IMPLAUSIBLE if memory["suspects"] != 0 else 0)
     row["request"], row["outside_trips"] = seen["event"], seen["trips"]
     row["node_events"], row["overrun"], row["saturated"] = seen["node_events"], seen["overrun"], saturated
     row["active_set_steps"] = state["active_set_steps"]

@@ -60,10 +60,28 @@ def test_after_a_loss_the_next_frame_is_used_and_flagged(running):
     assert tick(running, frame(103)) == (103, 0)
 
 
-def test_late_frame_is_flagged_then_superseded_by_the_newer_one(running):
+def test_a_late_frame_is_flagged_and_not_used_and_this_ticks_own_is(running):
     assert tick(running) == (100, SENSE_MISSING)
-    assert tick(running, frame(101), frame(102)) == (102, SENSE_COUNTER | SENSE_DUPLICATE)
+    running.on_sync()
+    running.receive(frame(101))
+    assert not running.fresh  # so that the loop goes on waiting for the sample of this SYNC
+    running.receive(frame(102))
+    assert running.fresh
+    assert running.take()[::3] == (102, SENSE_COUNTER)
     assert tick(running, frame(103)) == (103, 0)
+
+
+@pytest.mark.parametrize("late", [1, 2, 7])
+def test_frames_that_are_always_late_are_never_this_ticks(running, late):
+    """Every frame ``late`` ticks behind its SYNC, from now on: a shift of the whole loop if they were used."""
+    for k in range(400):
+        arriving = [frame(101 + k - late)] if k >= late else []
+        value, status = tick(running, *arriving)
+        assert (value, status & SENSE_MISSING) == (100, SENSE_MISSING)
+        assert status == SENSE_MISSING | (SENSE_COUNTER if arriving else 0)
+    caught_up = [frame(501 - late + n) for n in range(late + 1)]  # the backlog and this tick's own, in one tick
+    assert tick(running, *caught_up) == (501, SENSE_COUNTER)
+    assert tick(running, frame(502)) == (502, 0)
 
 
 def test_frame_after_take_is_reported_with_the_next_tick_and_its_value_is_not_used(running):

@@ -6,7 +6,16 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from pkxyz_ctrl.safety import modes
-from pkxyz_ctrl.safety.modes import Event, Mode, enable_event, next_homed, next_mode, refusal
+from pkxyz_ctrl.safety.modes import (
+    Event,
+    Mode,
+    clear_event,
+    enable_event,
+    next_homed,
+    next_mode,
+    next_safe_cycles,
+    refusal,
+)
 
 # Columns: mode now. Rows: event. Cell: mode then; "-" is refused, the mode stays.
 EXPECTED = """
@@ -24,6 +33,8 @@ HOLD            -               -                -        -       -         ENAB
 DISABLE         -               -                -        IDLE    IDLE      IDLE      -
 TRIP            FAULT           FAULT            FAULT    FAULT   FAULT     FAULT     -
 CLEAR           -               -                -        -       -         -         BOOT
+ENABLE_UNSETTLED -              -                -        -       -         -         -
+CLEAR_UNSETTLED -               -                -        -       -         -         -
 """
 
 
@@ -64,7 +75,7 @@ def test_facts_by_mode(mode: Mode, may_energise: int, loop_closed: int, node_exp
 
 def test_numbers_are_a_contract_of_recordings() -> None:
     assert [mode.value for mode in Mode] == list(range(7))
-    assert [event.value for event in Event] == list(range(13))
+    assert [event.value for event in Event] == list(range(15))
 
 
 @pytest.mark.parametrize("mode", [-1, 7, 127])
@@ -72,7 +83,7 @@ def test_unknown_mode_is_a_fault(mode: int) -> None:
     assert all(next_mode(mode, int(event)) == Mode.FAULT for event in Event)
 
 
-@pytest.mark.parametrize("event", [-1, 13, 1 << 20])
+@pytest.mark.parametrize("event", [-1, 15, 1 << 20])
 def test_unknown_event_is_refused(event: int) -> None:
     assert all(next_mode(int(mode), event) == mode for mode in Mode)
 
@@ -99,6 +110,36 @@ def test_refusal_tells_where_it_would_be_possible() -> None:
     assert "TRACK is not possible in IDLE" in str(refusal(Mode.IDLE, Event.TRACK))
     assert str(refusal(Mode.IDLE, Event.TRACK)).endswith("ENABLED")
     assert "home first" in str(refusal(Mode.IDLE, Event.ENABLE_UNHOMED))
+    assert "for enough cycles" in str(refusal(Mode.IDLE, Event.ENABLE_UNSETTLED))
+    assert "for enough cycles" in str(refusal(Mode.FAULT, Event.CLEAR_UNSETTLED))
+
+
+def test_a_wish_is_an_event_that_says_what_is_missing() -> None:
+    assert [Event(enable_event(homed, settled)) for homed in (False, True) for settled in (False, True)] == [
+        Event.ENABLE_UNHOMED, Event.ENABLE_UNHOMED, Event.ENABLE_UNSETTLED, Event.ENABLE,
+    ]  # fmt: skip
+    assert [Event(clear_event(settled)) for settled in (False, True)] == [Event.CLEAR_UNSETTLED, Event.CLEAR]
+
+
+@pytest.mark.parametrize("mode", [-1, *Mode, 7])
+def test_safe_cycles_by_mode(mode: int) -> None:
+    """A voltage always ends the count, a bad frame where one is owed; an unknown mode owes everything."""
+    is_owed = mode not in list(Mode) or modes.MODE_FACTS[Mode(mode)].node_expected
+    for is_usable in (False, True):
+        assert next_safe_cycles(41, mode, is_usable, False) == 0
+        assert next_safe_cycles(41, mode, is_usable, True) == (42 if is_usable or not is_owed else 0)
+    assert next_safe_cycles(1 << 30, mode, True, True) == 1 << 30
+
+
+@settings(max_examples=200, deadline=None)
+@given(st.lists(st.tuples(st.booleans(), st.booleans()), max_size=40))
+def test_safe_cycles_are_those_since_the_last_unsafe_one(ticks: list[tuple[bool, bool]]) -> None:
+    """Oracle: look back to the last tick that was not safe."""
+    cycles = 0
+    for k, (is_usable, is_discharged) in enumerate(ticks):
+        cycles = next_safe_cycles(cycles, int(Mode.IDLE), is_usable, is_discharged)
+        unsafe = [n for n in range(k + 1) if not all(ticks[n])]
+        assert cycles == k - max(unsafe, default=-1)
 
 
 @settings(max_examples=200, deadline=None)
@@ -113,7 +154,7 @@ def test_loop_closes_only_after_homing_since_the_last_boot(choices: list[tuple[b
     for fitting, number in choices:
         accepted = [event for source, event in modes.TRANSITIONS if source == mode]
         event = accepted[number % len(accepted)] if fitting else Event(number)
-        asked = enable_event(homed) if event in (Event.ENABLE, Event.ENABLE_UNHOMED) else int(event)
+        asked = enable_event(homed, True) if event in (Event.ENABLE, Event.ENABLE_UNHOMED) else int(event)
         was = mode
         homed, mode = next_homed(homed, mode, asked), int(next_mode(mode, asked))
         if was == Mode.HOMING and event is Event.HOMED:

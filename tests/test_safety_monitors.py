@@ -18,6 +18,7 @@ from pkxyz_ctrl.safety.monitors import (
     SenseStatus,
     check,
     default_limits,
+    implausible_combs,
 )
 from pkxyz_ctrl.safety.trips import EXPLANATIONS, Trip, explain
 
@@ -93,6 +94,11 @@ STATES: list[tuple[str, Changes, Trip]] = [
         for comb in range(3)
         for value in (10.01, -10.01, math.nan)
     ),
+    *(
+        ("unexplained_force_count", {"unexplained_force_n": beyond(comb, value)}, Trip(Trip.COMB_FORCE_1 << comb))
+        for comb in range(3)
+        for value in (0.401e-3, -0.401e-3, math.nan, math.inf)
+    ),
     ("saturation_count", {"saturated": 1}, Trip.SATURATION),
     ("solver_count", {"solver_ok": 0}, Trip.SOLVER),
 ]
@@ -105,6 +111,10 @@ EVENTS: list[tuple[str, str, Changes, Trip]] = [
     ("crc_count", "frame_leak_ticks", {"sense_status": SenseStatus.CRC}, Trip.SENSE_CRC),
     ("length_count", "frame_leak_ticks", {"sense_status": SenseStatus.LENGTH}, Trip.SENSE_LENGTH),
     ("overrun_count", "overrun_leak_ticks", {"overrun": 1}, Trip.OVERRUN),
+    *(
+        ("residual_count", "frame_leak_ticks", {"implausible_combs": 1 << comb}, Trip(Trip.COMB_MISFIT_1 << comb))
+        for comb in range(3)
+    ),
 ]
 
 
@@ -191,6 +201,7 @@ def test_boundaries_themselves_are_permitted() -> None:
         "stroke_m": [limits["stroke_min_m"][0], limits["stroke_max_m"][0], 0.0],
         "sense_count": [-32767, 32766, 0],
         "innovation_m": [0.5e-6, -0.5e-6, 0.0],
+        "unexplained_force_n": [0.4e-3, -0.4e-3, 0.0],
         "voltage_step_v": [10.0, -10.0, 0.0],
     }
     assert Bench(limits=limits).tick(edge) == 0
@@ -218,6 +229,7 @@ ALL_BAD: Changes = {
     "sense_status": SenseStatus.COUNTER,
     "sense_count": [32767] * 3,
     "innovation_m": 1.0,
+    "unexplained_force_n": 1.0,
     "voltage_step_v": 100.0,
     "saturated": 1,
     "solver_ok": 0,
@@ -234,7 +246,7 @@ def test_what_is_watched_in_which_mode(mode: Mode) -> None:
         trips |= bench.tick(ALL_BAD)
     frames = Trip.SENSE_SEQUENCE | 0b111 * Trip.SENSE_RANGE_1 | 0b111 * Trip.SENSE_FROZEN_1 | Trip.OVERRUN
     frames |= 0b1111 * Trip.HEARTBEAT_LOST
-    loop = 0b111 * Trip.INNOVATION_X | Trip.SATURATION | Trip.SLEW | Trip.SOLVER
+    loop = 0b111 * Trip.INNOVATION_X | Trip.SATURATION | Trip.SLEW | Trip.SOLVER | 0b111 * Trip.COMB_FORCE_1
     assert trips == (frames if NODE_EXPECTED[mode] else 0) | (loop if LOOP_CLOSED[mode] else 0)
 
 
@@ -257,15 +269,64 @@ def test_unknown_mode_owes_nothing(mode: int) -> None:
     assert bench.tick({"mode": mode, "finite": 0}) == Trip.NOT_FINITE
 
 
+def test_a_stroke_is_implausible_from_just_beyond_the_limit() -> None:
+    limits = default_limits()
+    limit = float(limits["residual_max_m"][0])
+    assert limit == 0.5e-6
+    for comb in range(3):
+        for value in (math.nextafter(limit, 1.0), -math.nextafter(limit, 1.0), math.nan, math.inf, -math.inf):
+            assert implausible_combs(limits[0], np.array(beyond(comb, value))) == 1 << comb
+    assert implausible_combs(limits[0], np.array([limit, -limit, 0.0])) == 0
+    assert implausible_combs(limits[0], np.array([1.0, math.nan, -1.0])) == 0b111
+    assert (
+        implausible_combs(np.zeros(1, LIMITS)[0], np.full(3, 1e-12)) == 0b111
+    )  # a limit never filled in believes nothing
+
+
+@pytest.mark.parametrize("comb", [0, 1, 2])
+def test_one_comb_alone_is_named_several_are_the_stage(comb: int) -> None:
+    """A sensor or a drive comb goes wrong by itself; what moves the stage is seen by all of them."""
+    alone = Bench(limits=only("residual_count", 3))
+    assert [alone.tick({"implausible_combs": 1 << comb, "innovation_m": 1e-6}) for _ in range(3)] == [
+        0, 0, Trip.COMB_MISFIT_1 << comb,
+    ]  # fmt: skip
+    others = 0b111 & ~(1 << comb)
+    stage = Bench(limits=only("residual_count", 3))
+    for axis, trip in enumerate((Trip.INNOVATION_X, Trip.INNOVATION_Y, Trip.INNOVATION_Z)):
+        stage = Bench(limits=only("residual_count", 3))
+        moved = {"implausible_combs": others, "innovation_m": beyond(axis, 3e-6)}
+        assert [stage.tick(moved) for _ in range(3)] == [0, 0, trip]
+    both = Bench(limits=only("residual_count", 3))
+    moved = {"implausible_combs": 0b111, "innovation_m": [1.0e-6, -0.5e-6, 0.49e-6]}
+    assert [both.tick(moved) for _ in range(3)][-1] == Trip.INNOVATION_X | Trip.INNOVATION_Y
+    nonsense = Bench(limits=only("residual_count", 1))
+    moved = {"implausible_combs": 0b111, "innovation_m": math.nan}
+    assert nonsense.tick(moved) | nonsense.tick(moved) >= Trip.INNOVATION_X | Trip.INNOVATION_Y | Trip.INNOVATION_Z
+
+
+def test_another_combs_single_outlier_does_not_clear_the_culprit() -> None:
+    bench = Bench(limits=only("residual_count", 3))
+    assert bench.tick({"implausible_combs": 0b101}) == 0
+    assert bench.tick({"implausible_combs": 0b001}) == 0
+    assert bench.tick({"implausible_combs": 0b001}) == Trip.COMB_MISFIT_1
+    bench = Bench(limits=only("residual_count", 3))
+    assert bench.tick({"implausible_combs": 0b101, "innovation_m": 1e-6}) == 0
+    assert bench.tick({"implausible_combs": 0b101, "innovation_m": 1e-6}) == 0
+    assert bench.tick({"implausible_combs": 0b001, "innovation_m": 1e-6}) == 0b111 * Trip.INNOVATION_X
+
+
 def test_opening_the_loop_forgets_what_only_the_loop_can_do() -> None:
     limits = only("innovation_count", 5)
     limits["saturation_count"] = limits["solver_count"] = limits["slew_count"] = 5
+    limits["unexplained_force_count"] = limits["residual_count"] = 5
     bench = Bench(limits=limits)
-    bad = {"innovation_m": 1.0, "saturated": 1, "solver_ok": 0, "voltage_step_v": 99.0}
+    bad = {"innovation_m": 1.0, "saturated": 1, "solver_ok": 0, "voltage_step_v": 99.0, "unexplained_force_n": 1.0}
+    bad["implausible_combs"] = 1
     for mode in (Mode.TRACKING, Mode.IDLE, Mode.ENABLED):
         bench.mode = mode
         assert [bench.tick(bad) for _ in range(4)] == [Trip(0)] * 4
-    assert bench.tick(bad) == 0b111 * Trip.INNOVATION_X | Trip.SATURATION | Trip.SOLVER | Trip.SLEW
+    loop = Trip.SATURATION | Trip.SOLVER | Trip.SLEW | 0b111 * Trip.COMB_FORCE_1 | Trip.COMB_MISFIT_1
+    assert bench.tick(bad) == 0b111 * Trip.INNOVATION_X | loop
 
 
 def test_limits_that_were_never_filled_in_trip_at_once() -> None:
@@ -319,12 +380,12 @@ def test_every_trip_is_explained_with_what_to_check() -> None:
         assert len(remedy) > 20
     assert explain(0) == ""
     assert len(explain(int(sum(Trip))).splitlines()) == len(Trip)
-    assert "0x10000000" in explain(1 << 28)
+    assert "0x10000000000" in explain(1 << 40)
     assert explain(Trip.SENSE_FROZEN_2).startswith("Sense comb 2 repeats")
 
 
 def test_neighbouring_bits_are_combs_and_axes() -> None:
-    for first in (Trip.SENSE_RANGE_1, Trip.SENSE_FROZEN_1, Trip.INNOVATION_X):
+    for first in (Trip.SENSE_RANGE_1, Trip.SENSE_FROZEN_1, Trip.INNOVATION_X, Trip.COMB_MISFIT_1, Trip.COMB_FORCE_1):
         stem = str(first.name)[:-1]
         assert [str(Trip(first << i).name) for i in range(3)] in (
             [stem + digit for digit in "123"],

@@ -15,8 +15,10 @@ class SenseInput:
     """Takes sense PDOs, offers the newest counts once a tick.
 
     The node sends one PDO a SYNC and counts them, so an alive counter is believed only if it is 1 to n more than the
-    last, n being the number of SYNCs since: an old frame that is played again is never used, and after a loss the next
-    good frame is. After 255 SYNCs of silence any counter is taken. Counter and CRC are not looked at in plain PDOs.
+    last, n being the number of SYNCs since. Only the n-th is the sample of the present SYNC. Those before it are late:
+    they are counted, and no more, so that a frame that came after its tick gave up does not shift the later ones. An
+    old frame that is played again is never used, and after a loss the next good frame is. After 255 SYNCs of silence
+    any counter is taken. Counter and CRC are not looked at in plain PDOs.
     """
 
     __slots__ = (
@@ -77,8 +79,13 @@ class SenseInput:
                 return False  # repeated
         elif (ahead != 1 or self._syncs != 1) and self._counter >= 0:
             self._flags |= SENSE_COUNTER
-            if not 1 <= ahead <= self._syncs and self._syncs < _SYNCS_UNCOUNTABLE:
-                return False
+            if self._syncs < _SYNCS_UNCOUNTABLE:
+                if not 1 <= ahead <= self._syncs:
+                    return False
+                if ahead < self._syncs:  # the sample of an earlier SYNC
+                    self._counter = counter
+                    self._syncs -= ahead
+                    return False
         self._counter = counter
         self._syncs = 0
         return True

@@ -78,6 +78,7 @@ MEMORY = np.dtype(
         ("sense_zero_f", "f8", (3,)),  # found by homing: capacitance at rest less its nominal value
         ("sense_f", "f8", (3,)),
         ("stroke_m", "f8", (3,)),
+        ("residual_m", "f8", (3,)),  # strokes measured less those of the predicted position
         ("measurement_m", "f8", (3,)),
         ("seen_m", "f8", (3,)),  # the measurement, or the estimate in its place
         ("linear", linear_law.LINEAR_STATE),
@@ -101,15 +102,19 @@ MEMORY = np.dtype(
 @njit(cache=True)
 def measure(law: np.void, memory: np.void, sense_count: NDArray[np.int32]) -> None:
     """Sense counts (3,) -> capacitances -> strokes -> ``measurement_m``, by one Newton step from the predicted
-    position.
+    position; ``residual_m`` is how far the strokes are from those expected there.
     """
     sense = law["sense"]
     capacitance, stroke, position = memory["sense_f"], memory["stroke_m"], memory["measurement_m"]
     predicted, origin = memory["estimate"]["predicted"], law["estimator"]["operating_point_m"]
+    residual = memory["residual_m"]
     for i in range(3):
         capacitance[i] = sense["offset_f"] + sense["farad_per_count"] * sense_count[i] - memory["sense_zero_f"][i]
         stroke[i] = (capacitance[i] - sense["rest_f"]) * sense["metre_per_farad"]
         position[i] = origin[i] + predicted[i]
+    kinematics.strokes(law["geometry"], position, residual)
+    for i in range(3):
+        residual[i] = stroke[i] - residual[i]
     kinematics.newton_step(law["geometry"], stroke, position)
 
 
@@ -238,6 +243,26 @@ def set_position(law: np.void, memory: np.void, position_m: Array) -> None:
         memory["estimate"]["ahead"][i] = known
     for i in range(3):
         memory["estimate"]["innovation_m"][i] = 0.0
+
+
+@njit(cache=True)
+def is_discharged(memory: np.void) -> bool:
+    """Whether the voltages of this tick are 0 V on every comb."""
+    count = memory["count"]
+    return bool(count[0, 0] == 0 and count[0, 1] == 0 and count[0, 2] == 0)
+
+
+@njit(cache=True)
+def unexplained_force(memory: np.void, out_n: Array) -> None:
+    """Comb forces (3,) that would amount to the estimated disturbance: J^-T d, with the Jacobian of the last ``act``.
+
+    A comb that does not give the force of its voltage shows up in its own entry alone.
+    """
+    inverse, disturbance = memory["scratch"]["inverse"], memory["estimate"]["filtered"]
+    for i in range(3):
+        out_n[i] = 0.0
+        for k in range(3):
+            out_n[i] += inverse[k, i] * disturbance[6 + k]
 
 
 @njit(cache=True)

@@ -36,6 +36,8 @@ class Event(IntEnum):
     DISABLE = 10
     TRIP = 11
     CLEAR = 12
+    ENABLE_UNSETTLED = 13
+    CLEAR_UNSETTLED = 14
 
 
 EVENT_MEANING: Final[dict[Event, str]] = {
@@ -51,7 +53,9 @@ EVENT_MEANING: Final[dict[Event, str]] = {
     Event.HOLD: "asked for: stop following, hold the set-point",
     Event.DISABLE: "asked for: open the loop, 0 V",
     Event.TRIP: "a monitor, the transmit gate or the operator has tripped",
-    Event.CLEAR: "asked for: forget the fault and begin again",
+    Event.CLEAR: "asked for: forget the fault and begin again, after enough cycles at 0 V",
+    Event.ENABLE_UNSETTLED: "asked for: close the loop, too few safe cycles after the last; refused in every mode",
+    Event.CLEAR_UNSETTLED: "asked for: forget the fault, too few cycles at 0 V after it; refused in every mode",
 }
 
 
@@ -122,7 +126,7 @@ def _fact_array(facts: list[bool]) -> NDArray[np.int8]:
     return array
 
 
-# (7, 13) int8: the target, or REFUSED. Compiled callers freeze this and the three arrays below as constants.
+# (7, 15) int8: the target, or REFUSED. Compiled callers freeze this and the three arrays below as constants.
 TRANSITION_TABLE: Final = _transition_table()
 # (7,) int8, 0 or 1, by mode.
 MAY_ENERGISE: Final = _fact_array([MODE_FACTS[mode].may_energise for mode in Mode])
@@ -137,6 +141,10 @@ _FAULT = int(Mode.FAULT)
 _HOMED = int(Event.HOMED)
 _ENABLE = int(Event.ENABLE)
 _ENABLE_UNHOMED = int(Event.ENABLE_UNHOMED)
+_ENABLE_UNSETTLED = int(Event.ENABLE_UNSETTLED)
+_CLEAR = int(Event.CLEAR)
+_CLEAR_UNSETTLED = int(Event.CLEAR_UNSETTLED)
+_ENOUGH = 1 << 30  # counting further would only overflow
 
 
 @njit(cache=True)
@@ -151,9 +159,33 @@ def next_mode(mode: int, event: int) -> int:
 
 
 @njit(cache=True)
-def enable_event(homed: bool) -> int:
-    """The event that a wish to close the loop amounts to: ENABLE, or ENABLE_UNHOMED, which no mode accepts."""
-    return _ENABLE if homed else _ENABLE_UNHOMED
+def next_safe_cycles(cycles: int, mode: int, is_usable: bool, is_discharged: bool) -> int:
+    """Safe cycles in a row, this one included: 0 V commanded, and a usable sense frame where one is owed.
+
+    Entering an active mode and clearing a fault both ask for some of them. So after an active mode was left, however
+    it was left, the combs are at 0 V for as many cycles before anything else is done with them.
+    """
+    is_owed = mode < 0 or mode >= _MODE_COUNT or NODE_EXPECTED[mode] != 0
+    if not is_discharged or (is_owed and not is_usable):
+        return 0
+    return cycles + 1 if cycles < _ENOUGH else cycles
+
+
+@njit(cache=True)
+def enable_event(homed: bool, settled: bool) -> int:
+    """The event that a wish to close the loop amounts to: ENABLE, or one that no mode accepts and that says why.
+
+    ``settled``: there have been enough safe cycles.
+    """
+    if not homed:
+        return _ENABLE_UNHOMED
+    return _ENABLE if settled else _ENABLE_UNSETTLED
+
+
+@njit(cache=True)
+def clear_event(settled: bool) -> int:
+    """The event that a wish to clear the fault amounts to: CLEAR, or CLEAR_UNSETTLED, which no mode accepts."""
+    return _CLEAR if settled else _CLEAR_UNSETTLED
 
 
 @njit(cache=True)
@@ -175,5 +207,7 @@ def refusal(mode: Mode, event: Event) -> str | None:
         return None
     if event == Event.ENABLE_UNHOMED:
         return "the sense offsets are not known yet: home first (needs IDLE), then enable"
+    if event in (Event.ENABLE_UNSETTLED, Event.CLEAR_UNSETTLED):
+        return "the combs have not been at 0 V, with good sense frames, for enough cycles yet: ask again"
     accepting = ", ".join(source.name for source, accepted in TRANSITIONS if accepted == event)
     return f"{event.name} is not possible in {mode.name} ({MODE_FACTS[mode].meaning}); it is in: {accepting}"

@@ -7,6 +7,10 @@ Two ways to count. A *state* (stale, at a rail, frozen, saturated) counts consec
 that it is over. An *event* (a bad CRC, a lost frame, a missed tick) fills a leaky bucket, since a good tick between two
 of them proves nothing: each event adds one, each good tick takes away 1/leak_ticks. So a burst of N trips at the
 N-th, and so does, later, any rate that stays above one in leak_ticks + 1.
+
+One judgement is needed before the tick goes on: a stroke that is too far from where the filter expected it is not to be
+believed (:func:`implausible_combs`). What is not believed corrupts no estimate, and so no voltage, until it has been
+counted often enough.
 """
 
 from enum import IntFlag
@@ -28,6 +32,7 @@ class SenseStatus(IntFlag):
     CRC = 4
     LENGTH = 8
     DUPLICATE = 16
+    IMPLAUSIBLE = 32  # a good frame with a stroke that is not believed; the cycle sets it
 
 
 class NodeEvent(IntFlag):
@@ -45,6 +50,8 @@ LIMITS: Final = np.dtype(
         ("stroke_min_m", "f8"),
         ("stroke_max_m", "f8"),
         ("innovation_max_m", "f8", (3,)),
+        ("residual_max_m", "f8"),
+        ("unexplained_force_max_n", "f8"),
         ("voltage_step_max_v", "f8"),
         ("sense_count_min", "i4"),  # at or below is at the rail
         ("sense_count_max", "i4"),  # at or above is at the rail
@@ -55,12 +62,15 @@ LIMITS: Final = np.dtype(
         ("range_count", "i4"),
         ("frozen_count", "i4"),
         ("innovation_count", "i4"),
+        ("residual_count", "i4"),
+        ("unexplained_force_count", "i4"),
         ("saturation_count", "i4"),
         ("slew_count", "i4"),
         ("overrun_count", "i4"),
         ("solver_count", "i4"),
         ("frame_leak_ticks", "i4"),
         ("overrun_leak_ticks", "i4"),
+        ("safe_cycles", "i4"),  # of modes.enable_event and clear_event
     ],
     align=True,
 )
@@ -72,11 +82,13 @@ MONITOR_MEMORY: Final = np.dtype(
         ("crc_level", "i8"),
         ("length_level", "i8"),
         ("overrun_level", "i8"),
+        ("residual_level", "i8", (3,)),
         ("stale", "i4"),
         ("range", "i4", (3,)),
         ("frozen", "i4", (3,)),
         ("frozen_sense_count", "i4", (3,)),
         ("innovation", "i4", (3,)),
+        ("unexplained_force", "i4", (3,)),
         ("saturation", "i4"),
         ("slew", "i4"),
         ("solver", "i4"),
@@ -88,7 +100,9 @@ OBSERVATION: Final = np.dtype(
     [
         ("stroke_m", "f8", (3,)),  # measured strokes relative to rest
         ("innovation_m", "f8", (3,)),  # measured minus predicted position, x y z
+        ("unexplained_force_n", "f8", (3,)),  # at combs 1 2 3, what the estimated disturbance amounts to there
         ("voltage_step_v", "f8", (3,)),  # commanded now minus commanded one tick ago, combs 1 2 3
+        ("implausible_combs", "i4"),  # of :func:`implausible_combs`, bit 0 for comb 1
         ("mode", "i4"),  # Mode in which this tick was computed
         ("sense_status", "i4"),  # SenseStatus
         ("node_events", "i4"),  # NodeEvent
@@ -105,7 +119,9 @@ OBSERVATION: Final = np.dtype(
 def default_limits() -> NDArray[np.void]:
     """(1,) of LIMITS, for a 25 um stage at 5 kHz with 2 nm rms of sense noise.
 
-    The innovation is a few nm when all is well and the shock of a snap is micrometres, hence 500 nm. Identical counts
+    The innovation is a few nm when all is well, up to 450 nm where a fast circle begins on the harsh plant, and the
+    shock of a snap is micrometres, hence 500 nm, for strokes as well as for axes. A disturbance of 0.2 mN is what ten
+    per cent of error in combs and springs amounts to in mid-workspace, a comb that fails there 1 mN. Identical counts
     for 50 ticks do not happen while noise spans several counts (0.2^50). 250 ticks at a bound are 50 ms, longer than
     any move across the workspace takes.
     """
@@ -113,6 +129,8 @@ def default_limits() -> NDArray[np.void]:
     limits["stroke_min_m"] = -2e-6
     limits["stroke_max_m"] = 27e-6
     limits["innovation_max_m"] = 0.5e-6
+    limits["residual_max_m"] = 0.5e-6
+    limits["unexplained_force_max_n"] = 0.4e-3
     limits["voltage_step_max_v"] = 10.0
     limits["sense_count_min"] = -32768
     limits["sense_count_max"] = 32767
@@ -123,12 +141,15 @@ def default_limits() -> NDArray[np.void]:
     limits["range_count"] = 3
     limits["frozen_count"] = 50
     limits["innovation_count"] = 5
+    limits["residual_count"] = 3
+    limits["unexplained_force_count"] = 5
     limits["saturation_count"] = 250
     limits["slew_count"] = 1
     limits["overrun_count"] = 10
     limits["solver_count"] = 5
     limits["frame_leak_ticks"] = 200
     limits["overrun_leak_ticks"] = 500
+    limits["safe_cycles"] = 10
     return limits
 
 
@@ -144,6 +165,8 @@ _SENSE_LENGTH = int(Trip.SENSE_LENGTH)
 _SENSE_RANGE_1 = int(Trip.SENSE_RANGE_1)
 _SENSE_FROZEN_1 = int(Trip.SENSE_FROZEN_1)
 _INNOVATION_X = int(Trip.INNOVATION_X)
+_COMB_MISFIT_1 = int(Trip.COMB_MISFIT_1)
+_COMB_FORCE_1 = int(Trip.COMB_FORCE_1)
 _SATURATION = int(Trip.SATURATION)
 _SLEW = int(Trip.SLEW)
 _OVERRUN = int(Trip.OVERRUN)
@@ -202,6 +225,21 @@ def _clear_loop(memory: np.void) -> None:
     memory["solver"] = 0
     for i in range(3):
         memory["innovation"][i] = 0
+        memory["residual_level"][i] = 0
+        memory["unexplained_force"][i] = 0
+
+
+@njit(cache=True)
+def implausible_combs(limits: np.void, residual_m: NDArray[np.float64]) -> int:
+    """Combs whose measured stroke is further from the expected one than plausible, bit 0 for comb 1.
+
+    ``residual_m`` (3,): measured less expected strokes. While any bit is set the measurement is not to be used.
+    """
+    combs: int = 0
+    for i in range(3):
+        if not abs(residual_m[i]) <= limits["residual_max_m"]:  # NaN counts as beyond
+            combs |= 1 << i
+    return combs
 
 
 @njit(cache=True)
@@ -239,12 +277,40 @@ def _check_channels(limits: np.void, memory: np.void, obs: np.void) -> int:
 
 
 @njit(cache=True)
+def _check_residuals(limits: np.void, memory: np.void, obs: np.void) -> int:
+    """Whose strokes have been implausible too often. One comb alone: something is wrong with that comb. Several: the
+    stage has moved, along the axes that the innovation shows.
+    """
+    leak = limits["frame_leak_ticks"]
+    involved = 0
+    combs: int = 0
+    for i in range(3):
+        level = _bucket(memory["residual_level"][i], obs["implausible_combs"] >> i & 1, leak)
+        memory["residual_level"][i] = level
+        involved += 1 if level > int(leak) else 0  # more than a single outlier
+        combs |= _filled(level, limits["residual_count"], leak, _COMB_MISFIT_1 << i)
+    if combs == 0 or involved <= 1:
+        return combs
+    widest = 0.0
+    for k in range(3):
+        widest = max(widest, abs(obs["innovation_m"][k]))
+    axes: int = 0
+    for k in range(3):
+        # as far as the widest, or nearly: NaN included, so that some axis is always named
+        axes |= 0 if abs(obs["innovation_m"][k]) < 0.5 * widest else _INNOVATION_X << k
+    return axes
+
+
+@njit(cache=True)
 def _check_loop(limits: np.void, memory: np.void, obs: np.void) -> int:
     """What has a meaning only while the loop is closed."""
     trips: int = 0
     too_fast = False
     for i in range(3):
         # Written as "not within", so that NaN counts as beyond.
+        astray = not abs(obs["unexplained_force_n"][i]) <= limits["unexplained_force_max_n"]
+        memory["unexplained_force"][i] = _consecutive(memory["unexplained_force"][i], astray)
+        trips |= _reached(memory["unexplained_force"][i], limits["unexplained_force_count"], _COMB_FORCE_1 << i)
         beyond = not abs(obs["innovation_m"][i]) <= limits["innovation_max_m"][i]
         memory["innovation"][i] = _consecutive(memory["innovation"][i], beyond)
         trips |= _reached(memory["innovation"][i], limits["innovation_count"], _INNOVATION_X << i)
@@ -255,7 +321,7 @@ def _check_loop(limits: np.void, memory: np.void, obs: np.void) -> int:
     trips |= _reached(memory["saturation"], limits["saturation_count"], _SATURATION)
     trips |= _reached(memory["slew"], limits["slew_count"], _SLEW)
     trips |= _reached(memory["solver"], limits["solver_count"], _SOLVER)
-    return trips
+    return trips | _check_residuals(limits, memory, obs)
 
 
 @njit(cache=True)

@@ -32,6 +32,12 @@ class Trip(IntFlag):
     # Raised by the caller, here so that one mask and one explanation serve all.
     GATE_BLOCKED = 1 << 22
     OPERATOR = 1 << 23
+    COMB_MISFIT_1 = 1 << 24
+    COMB_MISFIT_2 = 1 << 25
+    COMB_MISFIT_3 = 1 << 26
+    COMB_FORCE_1 = 1 << 27
+    COMB_FORCE_2 = 1 << 28
+    COMB_FORCE_3 = 1 << 29
 
 
 # What happened, in terms of the instrument; then what to look at, most likely first.
@@ -131,6 +137,30 @@ EXPLANATIONS: Final[dict[Trip, tuple[str, str]]] = {
     Trip.OPERATOR: (
         "stopped by hand",
         "clear the fault when ready",
+    ),
+    Trip.COMB_MISFIT_1: (
+        "the stroke that sense comb 1 reads is not what the voltages can have made, and the other combs see nothing",
+        "check sense comb 1's cable, preamplifier and gain, then amplifier channel 1: from inside they look alike",
+    ),
+    Trip.COMB_MISFIT_2: (
+        "the stroke that sense comb 2 reads is not what the voltages can have made, and the other combs see nothing",
+        "check sense comb 2's cable, preamplifier and gain, then amplifier channel 2: from inside they look alike",
+    ),
+    Trip.COMB_MISFIT_3: (
+        "the stroke that sense comb 3 reads is not what the voltages can have made, and the other combs see nothing",
+        "check sense comb 3's cable, preamplifier and gain, then amplifier channel 3: from inside they look alike",
+    ),
+    Trip.COMB_FORCE_1: (
+        "drive comb 1 pulls with a force that is not that of its voltage",
+        "check amplifier channel 1 (stuck, dead, limited, slow), then look for something that pushes the stage",
+    ),
+    Trip.COMB_FORCE_2: (
+        "drive comb 2 pulls with a force that is not that of its voltage",
+        "check amplifier channel 2 (stuck, dead, limited, slow), then look for something that pushes the stage",
+    ),
+    Trip.COMB_FORCE_3: (
+        "drive comb 3 pulls with a force that is not that of its voltage",
+        "check amplifier channel 3 (stuck, dead, limited, slow), then look for something that pushes the stage",
     ),
 }
 
