@@ -8,7 +8,7 @@ from pkxyz_ctrl.design.discrete_law import DiscreteLaw, LawError
 from pkxyz_ctrl.design.estimator_gain import measurement_noise
 from pkxyz_ctrl.design.loop_plant import LoopPlant
 from pkxyz_ctrl.design.margins import closed_loop
-from pkxyz_ctrl.design.plant_model import linearise
+from pkxyz_ctrl.design.plant_model import LinearStage, linearise
 from pkxyz_ctrl.stage import Stage
 
 Array = NDArray[np.float64]
@@ -24,8 +24,7 @@ def hold_noise_m(
     """
     model = linearise(stage, plant.strokes_m)
     sense = measurement_noise(stage, model, bus)
-    volts = stage.holding_voltages(model.position_m)
-    per_count = model.jacobian.T * (2.0 * stage.force_gain_n_per_v2 * volts * bus.analog.drive_volt_per_count)
+    per_count = _force_per_count(stage, bus, model)
     rounding = per_count @ per_count.T / 12.0
     loop = closed_loop(plant, law)
     n, plant_n = len(loop), len(plant.a)
@@ -41,6 +40,18 @@ def hold_noise_m(
         rounded[n:] = np.eye(3)
     covariance = _stationary(a, seen @ sense @ seen.T + rounded @ rounding @ rounded.T)
     return np.sqrt(np.diag(covariance)[:3])
+
+
+def rounding_force_n(stage: Stage, bus: BusConfig, model: LinearStage) -> Array:
+    """Standard deviation (3,) in N of the force at the platform that rounding the voltages leaves, unshaped."""
+    per_count = _force_per_count(stage, bus, model)
+    return np.sqrt(np.diag(per_count @ per_count.T) / 12.0)
+
+
+def _force_per_count(stage: Stage, bus: BusConfig, model: LinearStage) -> Array:
+    """(3,3) in N: force at the platform for one more count on each comb, about the voltages that hold the point."""
+    volts = stage.holding_voltages(model.position_m)
+    return model.jacobian.T * (2.0 * stage.force_gain_n_per_v2 * volts * bus.analog.drive_volt_per_count)
 
 
 def _stationary(a: Array, q: Array) -> Array:
