@@ -29,6 +29,7 @@ HOSTILE: tuple[Any, ...] = (
     "", "x", "é\n", "../..", "nominal", "\0", [], [1], [0.0, 0.0, 0.0], [[1]], {}, {"x": 1}, "1.0",
 )  # fmt: skip
 FILES = [(kind, path) for kind in MODELS for path in sorted((CONFIG_DIR / kind).glob("*.toml"))]
+_TEXTS = {path: path.read_text(encoding="utf-8") for _, path in FILES}
 _TEXT_BITS = ("=", "[", "]", '"', "\n", "[[", "]]", "{", "}", "#", ",", "nan", "inf", "-", "_", "\0", "\ufeff", "'''")
 _WHOLE_SHARE = 0.01  # of the scenarios: loaded with all that they name, trajectory and stage check included
 
@@ -36,20 +37,20 @@ _WHOLE_SHARE = 0.01  # of the scenarios: loaded with all that they name, traject
 def fuzz_documents(count: int, seed: int) -> str:
     """Try ``count`` documents; how many were taken and refused. Raises whatever is not a ConfigError."""
     outcomes: Counter[str] = Counter()
-    texts = {path: path.read_text(encoding="utf-8") for _, path in FILES}
     with tempfile.TemporaryDirectory() as folder:
         for number in range(count):
-            rng = random.Random(f"document {seed} {number}")
-            kind, path = rng.choice(FILES)
             try:
-                outcomes[_try(rng, kind, path, texts[path], Path(folder))] += 1
+                outcomes[try_document(random.Random(f"document {seed} {number}"), Path(folder))] += 1
             except Exception as error:
-                error.add_note(f"document {number} of seed {seed}, from {path.name}")
+                error.add_note(f"document {number} of seed {seed}")
                 raise
     return ", ".join(f"{number} {outcome}" for outcome, number in sorted(outcomes.items()))
 
 
-def _try(rng: random.Random, kind: str, path: Path, text: str, folder: Path) -> str:
+def try_document(rng: random.Random, folder: Path) -> str:
+    """One document bent from a shipped one: "taken" or "refused". ``folder`` is for files that are read."""
+    kind, path = rng.choice(FILES)
+    text = _TEXTS[path]
     try:
         if rng.random() < 0.4:
             broken = folder / path.name

@@ -1,7 +1,8 @@
 """Mutants of a Python module: one small change each, by its syntax tree.
 
-Changed are comparisons, arithmetic, ``and`` / ``or`` / ``not``, numbers, what is returned, and statements that are left
-out. Left alone are docstrings, messages (whatever is raised is raised or not), annotations and decorators.
+Changed are comparisons, arithmetic, ``and`` / ``or`` / ``not``, conditions, ``min`` / ``max``, numbers, what is
+returned, and statements that are left out. Left alone are docstrings, messages (whatever is raised is raised or not),
+annotations and decorators.
 """
 
 import ast
@@ -38,25 +39,30 @@ ARITHMETIC: dict[type[ast.operator], type[ast.operator]] = {
 
 @dataclass(frozen=True)
 class Mutant:
-    """``change`` is ``old -> new`` of an expression or statement; ``place`` and ``number`` find it again."""
+    """``change`` is ``old -> new`` of an expression or statement; ``place`` and ``number`` find it again.
+
+    ``function``: first line, decorators included, of the outermost function around it; None in the module's own code.
+    """
 
     line: int
     change: str
     place: int
     number: int
+    function: int | None
 
 
 def mutants(source: str) -> list[Mutant]:
     """All of them, in the order of the text."""
     tree = ast.parse(source)
     quiet = _left_alone(tree)
+    functions = _functions(tree)
     found = []
     for place, node in enumerate(ast.walk(tree)):
         if id(node) not in quiet:
             for number, new in enumerate(_changes(node)):
-                shown = "(left out)" if isinstance(new, ast.Pass) else ast.unparse(new)
-                change = f"{ast.unparse(node)} -> {shown}"
-                found.append(Mutant(node.lineno, change, place, number))  # type: ignore[attr-defined]
+                change = f"{_shown(node)} -> {_shown(new)}"
+                line = node.lineno  # type: ignore[attr-defined]
+                found.append(Mutant(line, change, place, number, functions.get(id(node))))
     return sorted(found, key=lambda mutant: (mutant.line, mutant.place, mutant.number))
 
 
@@ -66,6 +72,12 @@ def mutated(source: str, mutant: Mutant) -> ast.Module:
     target = next(node for place, node in enumerate(ast.walk(tree)) if place == mutant.place)
     _replace(tree, target, list(_changes(target))[mutant.number])
     return ast.fix_missing_locations(tree)
+
+
+def _shown(node: ast.AST) -> str:
+    if isinstance(node, ast.Pass):
+        return "(left out)"
+    return ast.unparse(node.test if isinstance(node, ast.If | ast.IfExp | ast.While) else node)
 
 
 def _changes(node: ast.AST) -> Iterator[ast.AST]:
@@ -93,6 +105,8 @@ def _changes(node: ast.AST) -> Iterator[ast.AST]:
             yield new_bool
         case ast.UnaryOp(op=ast.Not() | ast.USub() | ast.Invert()):
             yield node.operand
+        case ast.Name(id="min" | "max" as name, ctx=ast.Load()):
+            yield ast.Name("max" if name == "min" else "min", ast.Load())
         case ast.Constant(value=bool(value)):
             yield ast.Constant(not value)
         case ast.Constant(value=int() | float() as value):
@@ -104,6 +118,21 @@ def _changes(node: ast.AST) -> Iterator[ast.AST]:
             yield ast.Pass()
         case ast.Assign(targets=[ast.Subscript() | ast.Attribute()]):
             yield ast.Pass()
+        case ast.If() | ast.IfExp() | ast.While() if isinstance(node.test, ast.Name | ast.Attribute | ast.Call):
+            new_condition = copy.deepcopy(node)
+            new_condition.test = ast.UnaryOp(ast.Not(), new_condition.test)
+            yield new_condition
+
+
+def _functions(tree: ast.Module) -> dict[int, int]:
+    """First line of the outermost function by the id of each node in its body; a default value is not in its body."""
+    found: dict[int, int] = {}
+    for function in ast.walk(tree):  # outer ones come first
+        if isinstance(function, ast.FunctionDef | ast.AsyncFunctionDef):
+            first = min(node.lineno for node in (function, *function.decorator_list))
+            for inner in (inner for statement in function.body for inner in ast.walk(statement)):
+                found.setdefault(id(inner), first)
+    return found
 
 
 def _left_alone(tree: ast.Module) -> set[int]:

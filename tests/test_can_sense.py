@@ -102,7 +102,7 @@ def test_a_counter_from_the_future_is_not_used(running):
     assert tick(running, CODEC.encode((1, -1, 7), 102)) == (100, SENSE_MISSING | SENSE_COUNTER)
 
 
-@pytest.mark.parametrize("counter", [101, 103, 100])
+@pytest.mark.parametrize("counter", [101, 102, 103, 100])
 def test_repeated_or_odd_second_frame_keeps_the_first_value(running, counter):
     assert tick(running, frame(101), CODEC.encode((55, -55, 7), counter)) == (101, SENSE_DUPLICATE)
     assert tick(running, frame(102)) == (102, 0)

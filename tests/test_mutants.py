@@ -1,11 +1,14 @@
 """The mutator: every change that it should make, and no other."""
 
 import ast
+import math
 from pathlib import Path
 
+import mutation_run
 import pytest
 from mutants import mutants, mutated
 from mutate import TARGETS
+from mutation_run import BaselineError, Subject, run_mutants
 
 ROOT = Path(__file__).parents[1]
 
@@ -24,6 +27,9 @@ def changes(source: str) -> list[str]:
         ("x = a >> b", ["a >> b -> a << b"]),
         ("x = a and b", ["a and b -> a or b"]),
         ("x = not a", ["not a -> a"]),
+        ("if a:\n    b = 1", ["a -> not a", "1 -> 2"]),
+        ("x = a if f(b) else c", ["f(b) -> not f(b)"]),
+        ("x = max(a, b)", ["max -> min"]),
         ("x = True", ["True -> False"]),
         ("x = 7", ["7 -> 8"]),
         ("f(a)", ["f(a) -> (left out)"]),
@@ -51,6 +57,87 @@ def test_each_mutant_of_the_real_modules_compiles_and_differs(module: str) -> No
         tree = mutated(source, mutant)
         compile(tree, str(path), "exec")
         assert ast.dump(tree) != original
+
+
+def test_safety_is_mutated_whole() -> None:
+    """A new file of safety/ is in from its first day."""
+    files = {path.stem for path in (ROOT / "pkxyz_ctrl" / "safety").glob("*.py")} - {"__init__"}
+    assert files == {module.split(".")[-1] for module in TARGETS if ".safety." in module}
+
+
+def test_function_of_a_mutant_is_the_outermost_with_its_decorators() -> None:
+    source = "@cache\ndef f(x=1):\n    def g():\n        return 2\n    return 3\n"
+    source += "class A:\n    def h():\n        4\n    b = 5\n"
+    found = {mutant.change: mutant.function for mutant in mutants(source)}
+    numbers = {change: function for change, function in found.items() if change[0].isdigit()}
+    assert numbers == {"1 -> 2": None, "2 -> 3": 1, "3 -> 4": 1, "4 -> 5": 7, "5 -> 6": None}
+
+
+# What an import runs, or a cache keeps, concerns every test.
+SUBJECT = """
+from functools import cache
+LIMIT = 3
+@cache
+def table():
+    return [1, 2]
+def low(x):
+    if x > LIMIT:
+        return -1
+    return table()[0]
+def high(x):
+    while x < 0:
+        x = x + 1
+    return x
+def unused(x):
+    return x
+"""
+SUBJECT_TESTS = """
+from subject import high, low
+def test_low():
+    assert low(9) == -1
+    assert low(3) == 1
+def test_table():
+    assert low(0) == 1
+def test_high():
+    assert high(-3) == 0
+def test_nothing():
+    assert high
+"""
+
+
+@pytest.mark.parametrize("unmeasured", [False, True])
+def test_mutants_of_functions_imports_and_caches(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, unmeasured: bool
+) -> None:
+    """The runner, whole: with the collected tests or by a new import, a mutant is killed, survives or never ends."""
+    (tmp_path / "subject.py").write_text(SUBJECT)
+    (tmp_path / "test_subject.py").write_text(SUBJECT_TESTS)
+    monkeypatch.syspath_prepend(tmp_path)
+    monkeypatch.setattr(mutation_run, "ENDLESS_S", 1.0)
+    expected = {
+        (3, "3 -> 4"): "survived",
+        (6, "2 -> 3"): "survived",
+        (6, "1 -> 2"): "killed",
+        (8, "x > LIMIT -> x >= LIMIT"): "killed",
+        (13, "1 -> 2"): "killed",
+        (16, "return x -> return None"): "survived",
+        (13, "x + 1 -> x - 1"): "timeout",
+    }
+    if unmeasured:
+        del expected[13, "x + 1 -> x - 1"]  # nobody knows how long it may take
+    subject = Subject("subject", tmp_path / "subject.py", (str(tmp_path / "test_subject.py"),))
+    chosen = [mutant for mutant in mutants(SUBJECT) if (mutant.line, mutant.change) in expected]
+    results = run_mutants(subject, chosen, math.inf, 1, unmeasured)
+    assert {(mutant.line, mutant.change): result for mutant, result in results} == expected
+
+
+def test_tests_that_fail_without_a_mutant_are_told(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    (tmp_path / "subject.py").write_text(SUBJECT)
+    (tmp_path / "test_subject.py").write_text(SUBJECT_TESTS.replace("-1", "-2"))
+    monkeypatch.syspath_prepend(tmp_path)
+    subject = Subject("subject", tmp_path / "subject.py", (str(tmp_path / "test_subject.py"),))
+    with pytest.raises(BaselineError, match="subject"):
+        list(run_mutants(subject, mutants(SUBJECT), math.inf, 1))
 
 
 def test_a_mutant_is_one_change() -> None:

@@ -5,7 +5,7 @@ from dataclasses import dataclass, field
 
 import pytest
 from crccheck.crc import Crc8Autosar
-from gate_frames import CONFIG, DRIVE_ID, crc8h2f, drive, holding, nmt, sdo_write, sync
+from gate_frames import CONFIG, DRIVE_ID, WRITES, crc8h2f, drive, holding, nmt, sdo_write, sync
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
@@ -23,38 +23,9 @@ def passes(gate: TransmitGate, frame: Frame, t_us: int = T, mode: Mode = Mode.TR
     return gate.check(frame, mode, t_us) is None
 
 
-def one(comb: int, value: int, others: int = 500) -> tuple[int, int, int]:
-    a, b, c = (value if i == comb else others for i in range(3))
-    return a, b, c
-
-
 def test_oracle_is_the_autosar_crc() -> None:
     assert crc8h2f(b"123456789") == 0xDF
     assert all(crc8h2f(bytes(range(n))) == Crc8Autosar.calc(bytes(range(n))) for n in range(1, 40))
-
-
-@pytest.mark.parametrize("comb", [0, 1, 2])
-@pytest.mark.parametrize(
-    ("held", "asked", "permitted"),
-    [
-        (29500, 30000, True),
-        (29500, 30001, False),
-        (29500, 30500, False),
-        (500, -1, False),
-        (500, -32768, False),
-        (500, 1500, True),
-        (500, 1501, False),
-        (2500, 1500, True),
-        (2500, 1499, False),
-        (900, 0, True),
-        (1001, 0, False),  # one comb alone may not drop while the others hold
-        (1000, 0, True),
-    ],
-)
-def test_range_and_slew_at_their_boundaries(comb: int, held: int, asked: int, permitted: bool) -> None:
-    gate = holding(one(comb, held))
-    assert passes(gate, drive(*one(comb, asked), 0)) == permitted
-    assert bool(gate.latched) != permitted
 
 
 @pytest.mark.parametrize("count_max", [1, 32767])
@@ -87,12 +58,6 @@ def test_one_voltage_in_a_tick_but_zero_may_follow_at_once() -> None:
     assert "no SYNC" in str(gate.check(drive(7, 5, 5, 1), Mode.TRACKING, 3 * T))
 
 
-@pytest.mark.parametrize("counter", range(256))
-def test_alive_counter_of_a_voltage_must_be_the_next(counter: int) -> None:
-    assert passes(holding((5, 5, 5)), drive(6, 5, 5, counter)) == (counter == 0)
-    assert passes(holding((5, 5, 5)), drive(0, 0, 0, counter)) == (counter != 255)
-
-
 def test_voltage_waits_until_a_zero_in_sequence_has_been_sent() -> None:
     """The node ignores a frame whose counter jumped, so that its combs still hold the old voltage."""
     gate = holding((900, 900, 900))
@@ -103,22 +68,6 @@ def test_voltage_waits_until_a_zero_in_sequence_has_been_sent() -> None:
     assert passes(gate, drive(0, 0, 0, 8), 2 * T)
     assert passes(gate, sync(), 2 * T)
     assert passes(gate, drive(10, 10, 10, 9), 3 * T)
-
-
-def spoilt_by(flips: tuple[int, ...], frame: Frame) -> Frame:
-    number = int.from_bytes(frame.data, "little")
-    for bit in flips:
-        number ^= 1 << bit
-    return frame._replace(data=number.to_bytes(8, "little"))
-
-
-def test_every_one_and_two_bit_error_is_blocked() -> None:
-    wide = GateConfig(count_max=32767, count_slew_max=32767, period_us=T)
-    good = drive(500, 600, 700, 0)
-    flips = [(i,) for i in range(64)] + [(i, j) for i in range(64) for j in range(i)]
-    for places in flips:
-        assert not passes(holding((500, 600, 700), wide), spoilt_by(places, good)), places
-    assert passes(holding((500, 600, 700), wide), good)
 
 
 def test_frame_made_for_another_node_is_blocked() -> None:
@@ -214,30 +163,6 @@ def test_fd_frames_only_where_the_bus_carries_them() -> None:
     assert passes(TransmitGate(classic), sync()._replace(is_fd=False, bitrate_switch=False))
     assert passes(TransmitGate(CONFIG), sync()._replace(is_fd=False, bitrate_switch=False))
     assert passes(TransmitGate(CONFIG), sync()._replace(bitrate_switch=False))
-
-
-# index, sub-index, size, permitted values, refused values
-WRITES = [
-    (0x1005, 0, 4, [0x80], [0x81, 0x40000080, 0]),
-    (0x1016, 1, 4, [0x7F0001, 0x7F03E8], [0x7F0000, 0x7F03E9, 0x7E0032, 0x0A0032, 0]),
-    (0x1017, 0, 2, [1, 0xFFFF], [0]),
-    (0x1019, 0, 1, [240], [0, 239, 241]),
-    (0x1029, 1, 1, [0, 2], [1, 3, 255]),
-    (0x1400, 1, 4, [0x8000020A, 0x80000000], [0x20A, 0x30A]),
-    (0x1401, 1, 4, [0x30A, 0x8000030A, 0x4000030A], [0x30B, 0x080, 0x2000030A]),
-    (0x1401, 2, 1, [1], [0, 2, 240, 254, 255]),
-    (0x1601, 0, 1, [0, 5], []),
-    (0x1601, 1, 4, [0x64110110], []),
-    (0x1801, 1, 4, [0x28A, 0x4000028A, 0x8000028A], [0x080, 0x30A, 0x28B, 0x000, 0x77F]),
-    (0x1801, 2, 1, [0, 1, 255], []),
-    (0x1801, 3, 2, [0, 1000], []),
-    (0x1801, 5, 2, [0, 1000], []),
-    (0x1A01, 0, 1, [0, 5], []),
-    (0x1A01, 1, 4, [0x64010110], []),
-    (0x2010, 0, 1, [1, 5, 255], [0]),
-    *((0x6443, comb, 1, [1], [0, 2, 255]) for comb in (1, 2, 3)),
-    *((0x6444, comb, 4, [0], [1, 0x7FFFFFFF, 0xFFFFFFFF]) for comb in (1, 2, 3)),
-]
 
 
 @pytest.mark.parametrize(("index", "subindex", "size", "permitted", "refused"), WRITES)
@@ -406,7 +331,8 @@ def test_random_traffic_never_moves_the_combs_beyond_limits(
             a, b, c = near if MAY_ENERGISE[mode] or action == "voltage" else (0, 0, 0)
             counter += 2 if action == "jump" else 1
             frame = drive(a, b, c, counter)
-            send(spoilt_by((63,), frame) if action == "bad crc" else frame, mode)
+            spoilt = frame._replace(data=frame.data[:7] + bytes([frame.data[7] ^ 0x80]))
+            send(spoilt if action == "bad crc" else frame, mode)
         elif action == "zero":
             counter += 1
             send(drive(0, 0, 0, counter), mode)

@@ -1,12 +1,19 @@
-"""The gate over all 2048 identifiers, all lengths and a payload of every kind, imposed on each mode in turn."""
+"""The gate's full sweep, imposed on each mode in turn.
 
-from collections.abc import Iterator, Set
+All 2048 identifiers with all lengths and a payload of every kind; and of each kind every value where there are few,
+else each boundary and one step past it. A mode adds nothing but the list of what it permits.
+"""
+
+from abc import ABC
+from collections.abc import Iterable, Set
+from dataclasses import replace
+from itertools import combinations
 
 import pytest
-from gate_frames import DRIVE_ID, drive, holding, nmt, sdo_read, sdo_write, sync
+from gate_frames import CONFIG, DRIVE_ID, WRITES, drive, holding, nmt, sdo_read, sdo_write, sync
 
 from pkxyz_ctrl.can.frame import Frame
-from pkxyz_ctrl.safety.gate import TransmitGate
+from pkxyz_ctrl.safety.gate import GateConfig, TransmitGate
 from pkxyz_ctrl.safety.modes import Mode
 
 LENGTHS = [*range(9), 12, 16, 20, 24, 32, 48, 64]
@@ -43,39 +50,58 @@ RESET = {(0x000, "reset node"), (0x000, "reset communication")}
 DRIVE = {(DRIVE_ID, "drive")}
 
 
-class GateSweep:
-    """What holds in every mode; a subclass says what that mode adds."""
+WIDE = replace(CONFIG, count_max=32767, count_slew_max=32767)
+MOST, SLEW = CONFIG.count_max, CONFIG.count_slew_max
+# A comb's count now, and what is asked of it: at each boundary, and one step past it.
+STEPS = [
+    (MOST - SLEW // 2, MOST),
+    (MOST - SLEW // 2, MOST + 1),
+    (SLEW // 2, -1),
+    (SLEW // 2, -32768),
+    (SLEW // 2, 32767),
+    (500, 500 + SLEW),
+    (500, 501 + SLEW),
+    (2500, 2500 - SLEW),
+    (2500, 2499 - SLEW),
+    (SLEW, 0),
+    (SLEW + 1, 0),
+]
+
+
+class GateSweep(ABC):
+    """What holds in every mode; a subclass says what that mode permits of :data:`PAYLOADS`."""
 
     mode: int
     permitted: Set[tuple[int, str]]
 
-    def gate(self) -> TransmitGate:
-        """A gate that last let ``HELD`` pass, so that a small step is the best that a drive frame can be."""
-        return holding(HELD)
+    def gate(self, held: tuple[int, int, int] = HELD, config: GateConfig = CONFIG) -> TransmitGate:
+        """A gate that last let ``held`` pass, so that a small step is the best that a drive frame can be."""
+        return holding(held, config)
 
     def forget(self, gate: TransmitGate) -> None:
         """After a blocked frame, as if it had not been asked."""
         gate.clear()
 
-    def passed(self, frames: Iterator[tuple[str, Frame]]) -> set[tuple[int, str]]:
+    def passes(self, gate: TransmitGate, frame: Frame) -> bool:
+        """Whether it does, 10 ms after the last drive frame; if not, forgotten."""
+        if gate.check(frame, self.mode, 10_000) is None:
+            return True
+        self.forget(gate)
+        return False
+
+    def passed(self, frames: Iterable[tuple[str, Frame]]) -> set[tuple[int, str]]:
+        """Identifier and name of the frames that pass, each after ``HELD``."""
         result = set()
         gate = self.gate()
         for name, frame in frames:
-            if gate.check(frame, self.mode, 10_000) is None:
+            if self.passes(gate, frame):
                 result.add((frame.can_id, name))
                 gate = self.gate()
-            else:
-                self.forget(gate)
         return result
 
-    def test_every_identifier_with_every_kind_of_payload(self) -> None:
-        frames = ((name, Frame(can_id, payload)) for can_id in range(2048) for name, payload in PAYLOADS.items())
-        assert self.passed(frames) == self.permitted
-
-    def test_the_same_as_fd_frames(self) -> None:
-        frames = (
-            (name, Frame(can_id, payload, True, True)) for can_id in range(2048) for name, payload in PAYLOADS.items()
-        )
+    @pytest.mark.parametrize("fd", [False, True])
+    def test_every_identifier_with_every_kind_of_payload(self, fd: bool) -> None:
+        frames = ((name, Frame(can_id, data, fd, fd)) for can_id in range(2048) for name, data in PAYLOADS.items())
         assert self.passed(frames) == self.permitted
 
     @pytest.mark.parametrize("fill", [0x00, 0x40, 0xFF])
@@ -89,25 +115,94 @@ class GateSweep:
         may_sync = (0x080, "one 0x05") in self.permitted
         assert self.passed(frames) == ({(0x080, "1")} if fill == 0x40 and may_sync else set())
 
+    def test_identifiers_of_29_bits_that_end_like_ours(self) -> None:
+        """Every extended identifier with one or two bits above the eleven, and a payload that its end may carry."""
+        gate = self.gate()
+        above = [1 << a | 1 << b for a in range(11, 29) for b in range(11, 29)]
+        for can_id, name in sorted(self.permitted):
+            for bits in above:
+                for extended in (False, True):
+                    frame = Frame(can_id | bits, PAYLOADS[name], is_extended=extended)
+                    assert not self.passes(gate, frame), frame
+
     def test_permitted_payloads_with_another_length_or_format(self) -> None:
         gate = self.gate()
-        for can_id, name in {*self.permitted, *ALWAYS, *DRIVE}:
+        for can_id, name in sorted({*self.permitted, *ALWAYS, *DRIVE}):
             payload = PAYLOADS[name]
             spoilt = [Frame(can_id, payload + b"\x00", True, True), Frame(can_id, payload[:-1])]
             plain = Frame(can_id, payload)
             spoilt += [plain._replace(is_remote=True), plain._replace(is_extended=True), plain._replace(is_error=True)]
             spoilt += [plain._replace(bitrate_switch=True)]  # which only FD frames have
             for frame in spoilt:
-                assert gate.check(frame, self.mode, 10_000) is not None, frame
-                self.forget(gate)
+                assert not self.passes(gate, frame), frame
+
+    @pytest.mark.parametrize("comb", [0, 1, 2])
+    @pytest.mark.parametrize(("held", "asked"), STEPS)
+    def test_drive_counts_at_each_boundary_and_one_past_it(self, held: int, asked: int, comb: int) -> None:
+        now, then = [500, 500, 500], [500, 500, 500]
+        now[comb], then[comb] = held, asked
+        gate = self.gate((now[0], now[1], now[2]))
+        within = 0 <= asked <= MOST and abs(asked - held) <= SLEW
+        assert self.passes(gate, drive(*then, 0)) == (within and self.permitted >= DRIVE)
+
+    def test_alive_counter_over_all_its_values(self) -> None:
+        """A voltage needs the next one; 0 V any that the node does not take for a repetition."""
+        for counter in range(256):
+            small = drive(501, 601, 701, counter)
+            assert self.passes(self.gate(), small) == (counter == 0 and self.permitted >= DRIVE)
+            zero = drive(0, 0, 0, counter)
+            assert self.passes(self.gate(), zero) == (counter != 255 and (DRIVE_ID, "drive 0 V") in self.permitted)
+
+    @pytest.mark.parametrize("name", ["drive", "drive 0 V"])
+    def test_every_error_of_one_or_two_bits_in_a_drive_frame(self, name: str) -> None:
+        """Held back by the CRC alone, since no limit is in the way."""
+        gate, word = self.gate(HELD, WIDE), int.from_bytes(PAYLOADS[name], "little")
+        masks = [1 << a for a in range(64)] + [1 << a | 1 << b for a, b in combinations(range(64), 2)]
+        assert len(masks) == 64 + 2016
+        for mask in masks:
+            assert not self.passes(gate, Frame(DRIVE_ID, (word ^ mask).to_bytes(8, "little"))), hex(mask)
+
+    def test_sync_over_all_its_values(self) -> None:
+        gate = self.gate()
+        passed = [value for value in range(256) if self.passes(gate, sync(value))]
+        assert passed == (list(range(1, 241)) if (0x080, "one 0x05") in self.permitted else [])
+
+    def test_heartbeat_over_all_its_values(self) -> None:
+        gate = self.gate()
+        passed = [value for value in range(256) if self.passes(gate, Frame(0x77F, bytes([value])))]
+        assert passed == ([5] if (0x77F, "one 0x05") in self.permitted else [])
+
+    def test_nmt_over_all_commands_and_nodes(self) -> None:
+        gate = self.gate()
+        ours = {PAYLOADS[name] for can_id, name in self.permitted if can_id == 0x000}
+        commands = [nmt(command, node) for command in range(256) for node in (0, 1, 9, 10, 11, 127, 128, 255)]
+        commands += [nmt(command, node) for command in (0x01, 0x02, 0x80, 0x81, 0x82) for node in range(256)]
+        assert {frame.data for frame in commands if self.passes(gate, frame)} == ours
+
+    def test_sdo_command_bytes_over_all_their_values(self) -> None:
+        """With an object that may be read and written; 0 as its value, so that no command leaves bytes behind it."""
+        gate = self.gate()
+        plain = sdo_write(0x1801, 5, 0, 2).data
+        passed = {command for command in range(256) if self.passes(gate, Frame(0x60A, bytes([command]) + plain[1:]))}
+        read, write = self.permitted >= READ, self.permitted >= WRITE
+        assert passed == ({0x40, 0x80} if read else set()) | ({0x2B} if write else set())
+
+    def test_sdo_writes_value_by_value(self) -> None:
+        """Each object that may be written, with what it may hold and one past it, where the mode configures at all."""
+        gate = self.gate()
+        for index, subindex, size, permitted, refused in WRITES:
+            for value in permitted:
+                frame = sdo_write(index, subindex, value, size)
+                assert self.passes(gate, frame) == (self.permitted >= WRITE), frame
+            for value in refused:
+                assert not self.passes(gate, sdo_write(index, subindex, value, size))
 
     def test_no_voltage_behind_the_back_of_the_modes(self) -> None:
         gate = self.gate()
         for index in (0x6411, 0x6413, 0x6421, 0x6423, 0x2000, 0x1010, 0x1011, 0x1F51):
             for subindex in range(5):
                 for size in (1, 2, 3, 4):
-                    assert gate.check(sdo_write(index, subindex, 0, size), self.mode, 10_000) is not None
-                    self.forget(gate)
+                    assert not self.passes(gate, sdo_write(index, subindex, 0, size))
 
     def test_blocked_frame_leaves_only_what_is_always_permitted(self) -> None:
         gate = self.gate()
@@ -162,8 +257,8 @@ class TestLatched(GateSweep):
     mode = Mode.TRACKING
     permitted = ALWAYS
 
-    def gate(self) -> TransmitGate:
-        gate = holding(HELD)
+    def gate(self, held: tuple[int, int, int] = HELD, config: GateConfig = CONFIG) -> TransmitGate:
+        gate = super().gate(held, config)
         gate.check(Frame(0x7FF, b""), Mode.TRACKING, 0)
         return gate
 
@@ -183,23 +278,3 @@ class TestNegativeMode(GateSweep):
 
 def test_every_mode_is_swept() -> None:
     assert {sweep.mode for sweep in GateSweep.__subclasses__()} == {*map(int, Mode), 7, -1}
-
-
-def test_sync_over_all_its_values() -> None:
-    gate = holding((0, 0, 0))
-    for value in range(256):
-        passed = gate.check(sync(value), Mode.IDLE, 1000) is None
-        assert passed == (1 <= value <= 240)
-        gate.clear()
-
-
-def test_nmt_over_all_commands_and_nodes() -> None:
-    gate = holding((0, 0, 0))
-    passed = set()
-    for command in range(256):
-        for node in range(256):
-            if gate.check(nmt(command, node), Mode.BOOT, 1000) is None:
-                passed.add((command, node))
-            else:
-                gate.clear()
-    assert passed == {(command, 10) for command in (0x01, 0x02, 0x80, 0x81, 0x82)}

@@ -75,9 +75,8 @@ class SenseInput:
     def _believe(self, counter: int) -> bool:
         ahead = (counter - self._counter) & 0xFF
         if self.fresh:
-            if ahead != 1:
-                return False  # repeated
-        elif (ahead != 1 or self._syncs != 1) and self._counter >= 0:
+            return False  # this SYNC's sample is here: what else comes is repeated, or not yet due
+        if (ahead != 1 or self._syncs != 1) and self._counter >= 0:
             self._flags |= SENSE_COUNTER
             if self._syncs < _SYNCS_UNCOUNTABLE:
                 if not 1 <= ahead <= self._syncs:
