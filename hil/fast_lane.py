@@ -4,16 +4,31 @@ bus.
 No frames, no gate, no driver: on a fault-free scenario they change no bit, and a test holds the two lanes to that.
 """
 
+from collections.abc import Callable
+from functools import partial
+
 import numpy as np
 from numba import njit
 from numpy.typing import NDArray
 
 from hil.truth import observe
+from pkxyz_ctrl.core.tick import PREDICTIVE
 from pkxyz_ctrl.cycle import cycle
+from pkxyz_ctrl.period import Period, period_of
 from sim import kernels
 
 Array = NDArray[np.float64]
 Records = NDArray[np.void]
+RunBlock = Callable[..., None]
+"""``run_block``, or another of its signature."""
+
+
+def runner_of(law: Records) -> RunBlock:
+    """What runs blocks of ticks of ``law`` (1,): ``run_block``, or where a law plans in Python the same uncompiled."""
+    if law["tick"]["kind"][0] != PREDICTIVE:
+        runner: RunBlock = run_block
+        return runner
+    return partial(run_block_in_steps, period_of(law, np.zeros((1, 9))))
 
 
 @njit(cache=True)
@@ -41,4 +56,27 @@ def run_block(
         kernels.drive(plant_params, plant_state, due)
         kernels.sample(plant_params, plant_state, seen["sense_count"])
         cycle(law, memory, reference)
+        rows[i] = row
+
+
+def run_block_in_steps(
+    period: Period,
+    law: Records,
+    memory: Records,
+    reference: Array,
+    plant_params: Records,
+    plant_state: Records,
+    sample_us: NDArray[np.int64],
+    rows: Records,
+    count: int,
+) -> None:
+    """``run_block`` with ``period`` in place of the cycle, a tick at a time."""
+    seen, row, state = memory[0]["input"], memory[0]["row"], plant_state[0]
+    due = memory[0]["tick"]["count"][law[0]["tick"]["delay_periods"] - 1]
+    for i in range(count):
+        kernels.advance(plant_params, plant_state, sample_us[i] - state["t_us"])
+        observe(plant_params[0], state, row)
+        kernels.drive(plant_params, plant_state, due)
+        kernels.sample(plant_params, plant_state, seen["sense_count"])
+        period(law, memory, reference)
         rows[i] = row

@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from hil.blocks import Blocks
-from hil.fast_lane import run_block
+from hil.fast_lane import RunBlock, runner_of
 from hil.frame_time import INTERFRAME_BITS, frame_duration_ns
 from hil.lockstep import LockstepRig
 from hil.setup import Setup
@@ -52,10 +52,11 @@ def run(
     law = setup.law
     if lane == "fast":
         plant, memory = setup.new_plant(), new_memory(Mode.IDLE)
+        run_block = runner_of(law)
         run_block(law, memory, np.zeros((1, 9)), plant.params, plant.state, np.zeros(0, np.int64), blocks.rows, 0)
         _sample_us(setup, 0, 0)
         begin_s = time.perf_counter()
-        missed, load, faults = 0, None, _run_fast(setup, law, memory, plant, blocks)
+        missed, load, faults = 0, None, _run_fast(setup, run_block, memory, plant, blocks)
     elif lane == "lockstep":
         rig = LockstepRig(setup, frame_log)
         begin_s = time.perf_counter()  # designed, wired up and loaded: what is timed from here is the run
@@ -67,9 +68,9 @@ def run(
     return LaneResult(setup.ticks, missed, load, tuple(faults), factor)
 
 
-def _run_fast(setup: Setup, law: NDArray[np.void], memory: NDArray[np.void], plant: Plant, blocks: Blocks) -> list[str]:
+def _run_fast(setup: Setup, run_block: RunBlock, memory: NDArray[np.void], plant: Plant, blocks: Blocks) -> list[str]:
     faults: list[str] = []
-    mode = int(Mode.IDLE)
+    law, mode = setup.law, int(Mode.IDLE)
     while count := blocks.next_count():
         reference = blocks.reference(memory)
         run_block(

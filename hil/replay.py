@@ -19,7 +19,7 @@ from hil.run_folder import versions
 from hil.scenario import Scenario, resolve, restore
 from pkxyz_ctrl import cycle as cycling
 from pkxyz_ctrl.controller_config import ControllerConfig
-from pkxyz_ctrl.direct_call import direct
+from pkxyz_ctrl.period import period_of
 from pkxyz_ctrl.row import CONTROLLER_FIELDS, ROW, columns
 from pkxyz_ctrl.safety.modes import Mode
 
@@ -107,7 +107,7 @@ class _Player:
         self._law = setup.law
         self._memory = cycling.new_memory(Mode.IDLE)
         self._trajectory, self._period_us = scenario.trajectory, scenario.bus.period_us
-        self._cycle = direct(cycling.cycle, self._law, self._memory, np.zeros((1, 9)))
+        self._cycle = period_of(self._law, np.zeros((1, 9)))
 
     def play(self, recorded: Rows) -> Rows:
         """The rows (n,) that the inputs of these rows (n,), which follow those of the last call, lead to."""

@@ -12,7 +12,7 @@ from pkxyz_ctrl import cycle as cycling
 from pkxyz_ctrl.bus_config import BusConfig, CanConfig
 from pkxyz_ctrl.can.driver import AmplifierDriver, DriverState
 from pkxyz_ctrl.can.frame import Frame
-from pkxyz_ctrl.direct_call import direct
+from pkxyz_ctrl.period import period_on
 from pkxyz_ctrl.row import ROW
 from pkxyz_ctrl.safety.gate import GateConfig, TransmitGate
 from pkxyz_ctrl.safety.modes import Event, Mode, next_mode
@@ -58,7 +58,7 @@ class Controller:
         self._take_sense = self.driver.take_sense
         self._reference: Array = np.zeros((1, 9))  # the latest that was handed in
         self._drive_counts = (0, 0, 0)
-        self._cycle = direct(cycling.cycle_on, law, self.memory, self._reference, *[0] * 7)
+        self._cycle = period_on(law, self._reference)
         self._cycle(law, cycling.new_memory(Mode.BOOT), self._reference, *[0] * 7)  # loaded now, not in the first tick
 
     # -- start and stop ---------------------------------------------------------------------------------------------

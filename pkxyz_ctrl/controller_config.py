@@ -5,7 +5,7 @@ from typing import Annotated, Self
 from pydantic import Field, model_validator
 
 from pkxyz_ctrl.config import FrozenModel
-from pkxyz_ctrl.law_config import LAWS, SECTIONS, Hinf, Irc, Linear, PiNotch
+from pkxyz_ctrl.law_config import LAWS, SECTIONS, Hinf, Irc, Linear, Mpc, PiNotch
 
 Positive = Annotated[float, Field(gt=0)]
 
@@ -20,8 +20,8 @@ class EstimatorConfig(FrozenModel):
 
 
 class RegulatorConfig(FrozenModel):
-    """Bryson weights of the linear-quadratic regulator: deviations that are equally unwelcome. And
-    the authority, which limits the feedback of every law.
+    """Bryson weights of the linear-quadratic regulator (lqg and mpc): deviations that are equally unwelcome. And the
+    authority, which limits the feedback of every law.
     """
 
     position_error_m: Positive
@@ -76,7 +76,7 @@ class ControllerConfig(FrozenModel):
 
     name: Annotated[str, Field(min_length=1)]
     law: LAWS
-    """lqg: Kalman filter and state feedback; open_loop: feed-forward alone;
+    """lqg: Kalman filter and state feedback; open_loop: feed-forward alone; mpc: lqg that plans ahead inside limits;
     pi_notch, irc, hinf: linear laws, designed; linear: one of the user's own.
     """
     operating_strokes_m: tuple[float, float, float]
@@ -93,6 +93,7 @@ class ControllerConfig(FrozenModel):
     irc: Irc | None = None
     hinf: Hinf | None = None
     linear: Linear | None = None
+    mpc: Mpc | None = None
 
     @model_validator(mode="after")
     def _section_of_this_law_alone(self) -> Self:

@@ -104,9 +104,10 @@ class Mpc(FrozenModel):
     """periods that are planned"""
     iterations_max: Annotated[int, Field(ge=1)] = 50
     """of the solver in one tick; more, and the clipped answer of the regulator is used"""
-    rho: Positive = 1.0
+    rho: Positive = 0.3
     """the solver's step, fixed: adapting it by measured time would end determinism"""
     stroke_min_m: float
+    """beyond which no plan goes, unless the reference does"""
     stroke_max_m: float
 
     @model_validator(mode="after")
@@ -116,6 +117,6 @@ class Mpc(FrozenModel):
         return self
 
 
-LAWS = Literal["lqg", "open_loop", "pi_notch", "irc", "hinf", "linear"]
-SECTIONS = ("pi_notch", "irc", "hinf", "linear")
+LAWS = Literal["lqg", "open_loop", "pi_notch", "irc", "hinf", "linear", "mpc"]
+SECTIONS = ("pi_notch", "irc", "hinf", "linear", "mpc")
 """Laws with a section of their own, which has their name."""

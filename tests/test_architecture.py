@@ -29,7 +29,14 @@ ALLOWED: dict[str, tuple[str, ...]] = {
     "pkxyz_ctrl.row": ("numpy",),
     "pkxyz_ctrl.runtime": ("pkxyz_ctrl.controller", "pkxyz_ctrl.can.frame", "numpy", *VALUES),
     "pkxyz_ctrl.controller": (
-        *("pkxyz_ctrl.cycle", "pkxyz_ctrl.row", "pkxyz_ctrl.bus_config", "pkxyz_ctrl.can", "pkxyz_ctrl.safety"),
+        *(
+            "pkxyz_ctrl.cycle",
+            "pkxyz_ctrl.period",
+            "pkxyz_ctrl.row",
+            "pkxyz_ctrl.bus_config",
+            "pkxyz_ctrl.can",
+            "pkxyz_ctrl.safety",
+        ),
         "pkxyz_ctrl.direct_call",
         *("numpy", *VALUES),
     ),

@@ -57,8 +57,9 @@ def feedforwards(law: np.void, rows: Array, force_n: Array, comb_n: Array) -> No
 @njit(cache=True)
 def deviation(law: np.void, memory: np.void, rows: Array, force_n: Array, error: Array) -> None:
     """e (6,) at the start of the first interval, as the state feedback sees it."""
-    target = np.empty(9)
-    last = memory["feedforward_n"] if memory["feedforward_known"] != 0 else force_n[0]
+    target, last = np.empty(9), force_n[0].copy()
+    if memory["feedforward_known"] != 0:
+        last[:] = memory["feedforward_n"]
     feedback.sampled_target(law["feedback"], rows[0], force_n[0], last, target)
     ahead, origin = memory["estimate"]["ahead"], law["estimator"]["operating_point_m"]
     for i in range(3):
@@ -108,26 +109,27 @@ def slew_bounds(drive: np.void, comb_n: Array, planned_n: Array, lower: Array, u
 
 @njit(cache=True)
 def stroke_bounds(law: np.void, rows: Array, free_m: Array, lower: Array, upper: Array) -> None:
-    """Bounds (3n,) in m of the strokes that v adds, for the rows (n, 9) at the ends of the intervals and the strokes
-    (3n,) about them that come by themselves.
+    """Bounds (3m,) in m of the strokes that v adds, for the rows (m, 9) at the ends of as many intervals and the
+    strokes (3m,) about them that come by themselves.
     """
     stroke = np.empty(3)
     low, high = law["predictive"]["stroke_min_m"], law["predictive"]["stroke_max_m"]
     for k in range(len(rows)):
         kinematics.strokes(law["geometry"], rows[k, 0:3], stroke)
         for i in range(3):
-            lower[3 * k + i] = low - stroke[i] - free_m[3 * k + i]
-            upper[3 * k + i] = high - stroke[i] - free_m[3 * k + i]
+            lower[3 * k + i] = min(low - stroke[i], 0.0) - free_m[3 * k + i]  # a reference may go to a limit
+            upper[3 * k + i] = max(high - stroke[i], 0.0) - free_m[3 * k + i]
 
 
 @njit(cache=True)
 def is_inside(lower: Array, upper: Array, slewed: Array, stroked: Array, v: Array, n: int) -> bool:
     """Whether a plan v (3n,) keeps bounds, slew and strokes; the latter's values as ``slewed`` (3n-3,) and ``stroked``
-    (3n,).
+    (3m,).
     """
     inside = True
     for i in range(3 * n):
         inside = inside and lower[i] <= v[i] <= upper[i]
+    for i in range(len(stroked)):
         inside = inside and lower[6 * n - 3 + i] <= stroked[i] <= upper[6 * n - 3 + i]
     for i in range(3 * n - 3):
         inside = inside and lower[3 * n + i] <= slewed[i] <= upper[3 * n + i]

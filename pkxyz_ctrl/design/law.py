@@ -43,6 +43,8 @@ def design_law(stage: Stage, controller: ControllerConfig, bus: BusConfig, *, au
     else:
         law["tick"]["kind"] = LINEAR
         _fill_linear(law["tick"]["linear"], stage, controller, bus)
+    if controller.mpc is not None:
+        _fill_predictive(law["tick"]["predictive"], controller.mpc, controller.regulator)
     law["tick"]["delay_periods"] = bus.delay_periods
     law["period_us"] = bus.period_us
     law["homing_ticks"] = max(1, round(controller.homing_s / bus.period_s))

@@ -1,0 +1,40 @@
+"""Which function runs one period of a law: the compiled cycle, or the one that plans between its two parts."""
+
+from collections.abc import Callable
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from pkxyz_ctrl import cycle as cycling
+from pkxyz_ctrl.core.tick import PREDICTIVE
+from pkxyz_ctrl.direct_call import direct
+
+Records = NDArray[np.void]
+Array = NDArray[np.float64]
+Period = Callable[..., Any]
+"""Called as ``cycle.cycle`` is, or as ``cycle.cycle_on``."""
+
+
+def period_of(law: Records, reference: Array) -> Period:
+    """``cycle.cycle`` for ``law``, a (1,) array of ``cycle.LAW``, and references of the type of ``reference``.
+
+    A new one for each controller: that of the predictive law remembers its last plan.
+    """
+    if law["tick"]["kind"][0] == PREDICTIVE:
+        return _planning(law)
+    return direct(cycling.cycle, law, cycling.new_memory(), reference)
+
+
+def period_on(law: Records, reference: Array) -> Period:
+    """``cycle.cycle_on`` for a law, as ``period_of``."""
+    if law["tick"]["kind"][0] == PREDICTIVE:
+        on: Period = _planning(law).on
+        return on
+    return direct(cycling.cycle_on, law, cycling.new_memory(), reference, *[0] * 7)
+
+
+def _planning(law: Records) -> Any:
+    from pkxyz_ctrl.predictive_cycle import PredictiveCycle  # brings OSQP and scipy's solvers
+
+    return PredictiveCycle(law)

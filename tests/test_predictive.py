@@ -1,0 +1,220 @@
+"""The predictive law: the regulator as long as no limit is met, optimal where one is, and what is left if it fails."""
+
+import dataclasses
+import types
+from functools import cache
+
+import numpy as np
+import osqp
+import pytest
+from loop_rig import bus, controller, first_difference, rows_of, setup, shortened, stage
+
+from hil.fast_lane import run_block, run_block_in_steps
+from pkxyz_ctrl import cycle as cycling
+from pkxyz_ctrl.config import ConfigError, load, parse, plain
+from pkxyz_ctrl.controller_config import ControllerConfig
+from pkxyz_ctrl.design.law import design_law
+from pkxyz_ctrl.predictive_cycle import FORCE_UNIT_N, PredictiveCycle, Problem
+from pkxyz_ctrl.row import ROW
+from pkxyz_ctrl.safety.modes import Mode
+from pkxyz_ctrl.safety.trips import Trip
+from pkxyz_ctrl.trajectory import Hold, Move, Steps, Trajectory
+
+LOW_M, WAY_M = 4e-6, 31e-6
+"""A jump over nearly all that can be reached above rest: 4 to 35 um."""
+
+
+@cache
+def mpc():
+    return load("controllers", "mpc", ControllerConfig)
+
+
+@cache
+def law():
+    return design_law(stage(), mpc(), bus(), autostart=True)
+
+
+def far_jump(config):
+    limits = {"velocity_max_m_per_s": 0.5e-3, "acceleration_max_m_per_s2": 0.05, "jerk_max_m_per_s3": 10.0}
+    reference = Trajectory(
+        [
+            Hold(kind="hold", duration_s=0.02),
+            Move(kind="move", to_m=(0.0, 0.0, LOW_M), **limits),
+            Hold(kind="hold", duration_s=0.03),
+            Steps(kind="steps", by_m=(0.0, 0.0, WAY_M), count=1, dwell_s=0.04),
+        ]
+    )
+    return dataclasses.replace(setup(), controller=config, trajectory=reference, duration_s=0.27)
+
+
+@cache
+def jumped(name):
+    return rows_of(far_jump({"mpc": mpc(), "lqg": controller()}[name]), "fast")
+
+
+def settled_ms(rows, target_m, band_m=10e-9):
+    """When the true height enters the band about a target for good, ms after the reference jumped there."""
+    at = np.flatnonzero(np.abs(np.diff(rows["reference_m"][:, 2])) > 1e-6) + 1
+    (begin,) = [i for i in at if abs(rows["reference_m"][i, 2] - target_m) < 1e-9]
+    outside = np.abs(rows["position_m"][begin : begin + 185, 2] - target_m) > band_m
+    return (int(np.flatnonzero(outside)[-1]) + 1) * 0.2
+
+
+def test_without_limits_it_is_the_regulator():
+    """First force of the plan without limits against the regulator's gains, which python-control found: P is right."""
+    problem, feedback = Problem(law()), law()["tick"][0]["feedback"]
+    gains = np.hstack([feedback["position_gain_n_per_m"], feedback["velocity_gain_n_s_per_m"]])
+    first = problem.jacobian.T @ problem.answer_error[:3] * FORCE_UNIT_N
+    assert np.abs(first + gains).max(axis=0) == pytest.approx(0.0, abs=1e-6 * np.abs(gains).max())
+    assert first[:, :3] == pytest.approx(-gains[:, :3], rel=1e-5, abs=1e-6 * np.abs(gains[:, :3]).max())
+
+
+def test_a_jump_ahead_is_a_jump_now_seen_from_further():
+    """c enters where the reference jumps: before the first interval it would be an error of the state itself."""
+    problem = Problem(law())
+    n = problem.horizon
+    error, jump = np.zeros(6), np.zeros(3 * n)
+    error[2], jump[2] = 1e-6, 1e-6  # e_0, and a jump at the end of interval 0
+    phi = law()["tick"][0]["estimator"]["transition"][:, :6]
+    # e_1 = Phi e_0 + Gamma v + c: the jump acts as an e_0 of Phi^-1 c that cost nothing in interval 0
+    assert problem.linear_jump @ jump == pytest.approx(problem.linear_error @ np.linalg.solve(phi, error), rel=1e-9)
+    assert problem.stroke_jump @ jump == pytest.approx(problem.stroke_error @ np.linalg.solve(phi, error), rel=1e-9)
+
+
+def test_on_the_default_scan_it_solves_nothing():
+    """No limit is near: the plan without limits is the solution, and as accurate as lqg."""
+    rows, result = rows_of(dataclasses.replace(shortened(setup(), 2200), controller=mpc()), "fast")
+    scan = rows[rows["reference_tick"] > 1000]
+    assert len(scan) > 500
+    assert not scan["solver_iterations"].any()
+    rms_nm = np.sqrt(np.mean((scan["position_m"] - scan["reference_m"]) ** 2, axis=0)) * 1e9
+    assert (rms_nm > 0.3).all()
+    assert (rms_nm < 2.0).all()
+    assert result.faults == ()
+
+
+def test_one_tick_of_it_asks_for_what_lqg_asks_for():
+    """Both laws from the same memory in mid-scan, on the same sample: demands that agree to 10 pN, of millinewtons."""
+    run = setup()
+    plant, memory = run.new_plant(), cycling.new_memory(Mode.IDLE)
+    reference = run.trajectory.sample(0, run.ticks + 25, 200)
+    rows = np.zeros(2000, ROW)
+    for end in (1500, 1700, 2000):
+        at_us = plant.t_us + 200 * np.arange(1, end - int(memory["tick_index"][0]) + 1, dtype=np.int64)
+        run_block(run.law, memory, reference, plant.params, plant.state, at_us, rows, len(at_us))
+        demands = []
+        for law_array, period in ((run.law, cycling.cycle), (law(), PredictiveCycle(law()))):
+            own = memory.copy()
+            period(law_array, own, reference)
+            demands.append(own["row"]["demand_n"][0].copy())
+        assert own["row"]["trips"][0] == 0
+        assert demands[1] == pytest.approx(demands[0], rel=0, abs=1e-11)
+        assert np.abs(demands[0]).max() > 1e-4
+
+
+def test_both_lanes_have_the_same_bits_while_it_solves():
+    near = shortened(far_jump(mpc()), 1100)
+    fast, _ = rows_of(near, "fast")
+    lockstep, _ = rows_of(near, "lockstep")
+    assert (fast["solver_iterations"] > 0).sum() > 20
+    assert first_difference(fast, lockstep) is None
+
+
+def test_a_full_range_move_that_saturates():
+    """Voltage, slew and strokes keep their limits, and it is in place no later than the clipped regulator: there and
+    back, the slower of the two counts."""
+    planned, result = jumped("mpc")
+    clipped, _ = jumped("lqg")
+    assert clipped["saturated"].sum() > 5  # what it is about
+    assert result.faults == ()
+    step_v = np.abs(np.diff(planned["voltage_v"], axis=0)).max()
+    assert planned["voltage_v"].min() >= 0.0
+    assert planned["voltage_v"].max() <= 200.0
+    assert 15.0 < step_v <= 20.0
+    assert planned["stroke_m"].max() <= 25e-6
+    assert planned["stroke_m"].min() >= -0.1e-6
+    times = {name: [settled_ms(rows, z) for z in (LOW_M + WAY_M, LOW_M)] for name, rows in
+             (("mpc", planned), ("lqg", clipped))}  # fmt: skip
+    assert max(times["mpc"]) <= max(times["lqg"])
+    assert min(times["mpc"]) > 1.0
+    solved = planned["solver_iterations"]
+    assert (solved > 0).sum() > 30
+    assert (solved < 0).sum() <= 4
+    assert solved.max() <= 50
+
+
+def test_solutions_are_osqps_to_many_digits():
+    """What the bounded solver answers over the whole move, against the same problems solved to 1e-7 without a bound on
+    iterations: the force that goes out is right to 3 % of the largest."""
+    run = far_jump(mpc())
+    problems = []
+    period = PredictiveCycle(run.law)
+    original = period._solve
+
+    def keep(self, law_array, memory):
+        q, lower, upper = period._q.copy(), period._lower.copy(), period._upper.copy()
+        original(law_array, memory)
+        if memory["tick"]["solver_iterations"][0] > 0:
+            problems.append((q, lower, upper, period._v.copy()))
+
+    period._solve = types.MethodType(keep, period)
+    plant, memory = run.new_plant(), cycling.new_memory(Mode.IDLE)
+    rows, reference = np.zeros(run.ticks, ROW), run.trajectory.sample(0, run.ticks + 25, 200)
+    at_us = 200 * np.arange(run.ticks, dtype=np.int64)
+    run_block_in_steps(period, run.law, memory, reference, plant.params, plant.state, at_us, rows, run.ticks)
+    assert len(problems) > 30
+    hessian, matrix = period.problem.matrices()
+    solver = osqp.OSQP()
+    solver.setup(
+        hessian, problems[0][0], matrix, problems[0][1], problems[0][2],
+        eps_abs=1e-7, eps_rel=1e-7, max_iter=50_000, verbose=False,
+    )  # fmt: skip
+    misses = []
+    for q, lower, upper, v in problems:
+        solver.update(q=q, l=lower, u=upper)
+        exact = solver.solve(raise_error=True).x
+        misses.append(np.abs(v[:3] - exact[:3]).max())
+    assert max(misses) < 0.03 * max(np.abs(v).max() for *_, v in problems)
+    assert np.median(misses) < 0.01
+
+
+def test_without_a_solution_the_regulator_stands_in_and_it_is_counted():
+    """One iteration is never enough: the clipped regulator answers until the monitor has seen five such ticks in a
+    row."""
+    config = mpc().model_copy(update={"mpc": mpc().mpc.model_copy(update={"iterations_max": 1})})
+    failing, result = rows_of(far_jump(config), "fast")
+    bad = np.flatnonzero(failing["solver_iterations"] < 0)
+    assert len(bad) >= 5
+    assert failing["trips"][bad[bad > 500][4]] & int(Trip.SOLVER)
+    assert len(result.faults) == 1
+    assert "(SOLVER)" in result.faults[0]
+
+
+@pytest.mark.parametrize(
+    ("change", "reason"),
+    [
+        ({"horizon": 9}, "mpc.horizon"),
+        ({"horizon": 21}, "mpc.horizon"),
+        ({"iterations_max": 0}, "mpc.iterations_max"),
+        ({"stroke_min_m": 26e-6}, "stroke_min_m must lie below stroke_max_m"),
+    ],
+)
+def test_numbers_that_make_no_sense_are_refused(change, reason):
+    data = plain(mpc())
+    data["mpc"] |= change
+    with pytest.raises(ConfigError, match=reason):
+        parse(data, ControllerConfig, "x.toml")
+
+
+@pytest.mark.parametrize("horizon", [10, 11, 20])
+def test_every_horizon_fits(horizon):
+    config = mpc().model_copy(update={"mpc": mpc().mpc.model_copy(update={"horizon": horizon})})
+    record = design_law(stage(), config, bus(), autostart=True)
+    problem = Problem(record)
+    hessian, matrix = problem.matrices()
+    assert hessian.shape == (3 * horizon + 3,) * 2
+    assert matrix.shape == (6 * horizon - 3 + 3 * (horizon // 2), 3 * horizon + 3)
+    assert np.linalg.eigvalsh(problem.hessian)[0] > 0.0
+    period, memory = PredictiveCycle(record), cycling.new_memory(Mode.IDLE)
+    period(record, memory, np.zeros((4, 9)))
+    assert memory["mode"][0] == Mode.HOMING
