@@ -187,7 +187,7 @@ def plan(law_array: Records, memory_array: Records, reference: Array, matrices: 
         return 0
     state, jacobian0 = memory["tick"], matrices[7]
     for k in range(n + 2):
-        cycling.reference_row(memory, reference, law["tick"]["delay_periods"] + k, rows[k])
+        cycling.reference_row(law, memory, reference, law["tick"]["delay_periods"] + k, rows[k])
     feedforward, comb, error = np.empty((n, 3)), np.empty((n, 3)), np.empty(6)
     predictive.feedforwards(law["tick"], rows[: n + 1], feedforward, comb)
     predictive.deviation(law["tick"], state, rows, feedforward, error)

@@ -1,0 +1,203 @@
+"""What the loop reaches on ``fd_5k`` with 2 nm of sense noise a sample: bandwidth, steps, circle, raster, hold, limits.
+
+The nominal plant, the fast lane (whose bits are those of the lockstep lane), true position against reference.
+"""
+
+import time
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from hil.bench.figure import Figure
+from hil.bench.motions import MIDDLE_M, error_m, run, settled_s, setup_of
+from hil.fast_lane import run_block_in_steps
+from pkxyz_ctrl.cycle import new_memory
+from pkxyz_ctrl.period import period_of
+from pkxyz_ctrl.row import ROW
+from pkxyz_ctrl.safety.modes import Mode
+from pkxyz_ctrl.trajectory import Circle, Hold, Move, Raster, Sine, Steps
+
+BAND_M = 10e-9
+STEP_M = 1e-6
+QUICK = {"velocity_max_m_per_s": 5e-3, "acceleration_max_m_per_s2": 12.0, "jerk_max_m_per_s3": 60e3}
+"""Limits of a 1 um step: 0.8 ms on its way, with forces of some 60 uN and 4 V a tick."""
+LOW_M, WAY_M = 4e-6, 31e-6
+"""The full range: a jump from 4 to 35 um of height, most strokes but the last um."""
+
+
+def control() -> list[Figure]:
+    """All of it with the default law, and the far jump with mpc beside lqg."""
+    return [*_bandwidth(), *_steps(), _jump(), _circle(), _raster(), _hold(), *_far_jump(), _mpc_tick()]
+
+
+def response(axis: str, frequency_hz: float, controller: str = "lqg") -> complex:
+    """True position over reference of a 100 nm sine along an axis, 200 periods of it."""
+    motion = run(
+        [Sine(kind="sine", axis=axis, amplitude_m=100e-9, frequency_hz=frequency_hz, cycles=200.0)],  # type: ignore[arg-type]
+        controller,
+    )
+    rows, i = motion.scan(0), "xyz".index(axis)
+    t_s = rows["reference_tick"] * motion.period_us * 1e-6
+    angle = 2 * np.pi * frequency_hz * t_s
+    basis = np.stack([np.cos(angle), np.sin(angle), np.ones(len(angle))], axis=1)
+    true, wanted = (np.linalg.lstsq(basis, rows[name][:, i], rcond=None)[0] for name in ("position_m", "reference_m"))
+    return complex((true[0] - 1j * true[1]) / (wanted[0] - 1j * wanted[1]))
+
+
+def _bandwidth() -> list[Figure]:
+    figures = []
+    for name, frequency_hz, target in (("gain_631", 631.0, 1.0), ("gain_1262", 1262.0, -3.0)):
+        found = {axis: response(axis, frequency_hz) for axis in "xy"}
+        gain_db = {axis: 20 * np.log10(abs(g)) for axis, g in found.items()}
+        words = ", ".join(f"{a} {gain_db[a]:+.2f} dB, {np.degrees(np.angle(g)):+.1f} deg" for a, g in found.items())
+        detail = f"100 nm sine at {frequency_hz:g} Hz: {words}"
+        if target > 0:
+            value = max(abs(v) for v in gain_db.values())
+            figures.append(Figure(f"control.{name}", float(value), "dB off", target, "at most", None, detail))
+        else:
+            value = min(gain_db.values())
+            figures.append(Figure(f"control.{name}", float(value), "dB", target, "at least", None, detail))
+    return figures
+
+
+def _steps() -> list[Figure]:
+    """Ten moves of 1 um to and fro on each axis; the worst counts."""
+    settle_s, beyond = 0.0, 0.0
+    for i in range(3):
+        way = [float(i == k) * STEP_M for k in range(3)]
+        segments: list[Any] = []
+        for n in range(10):
+            to = np.array([0.0, 0.0, MIDDLE_M]) + (np.array(way) if n % 2 == 0 else 0.0)
+            segments += [Move(kind="move", to_m=tuple(to), **QUICK), Hold(kind="hold", duration_s=0.02)]  # type: ignore[arg-type]
+        motion = run(segments)
+        for n in range(10):
+            begin, end = motion.segments[2 * n].t_start_us, motion.segments[2 * n + 1].t_end_us
+            rows = motion.during((begin, end))
+            settle_s = max(settle_s, settled_s(rows, i, BAND_M, motion.period_us * 1e-6))
+            sign = 1.0 if n % 2 == 0 else -1.0
+            past = sign * (rows["position_m"][:, i] - rows["reference_m"][-1, i])
+            beyond = max(beyond, float(past.max()) / STEP_M)
+    words = "1 um from point to point on each axis, to and fro, ten times: the worst"
+    return [
+        Figure("control.step_settle", settle_s * 1e3, "ms", 1.5, "at most", None, f"{words}; from its start to 10 nm"),
+        Figure("control.step_overshoot", beyond * 100, "%", 5.0, "at most", None, words),
+    ]
+
+
+def _jump() -> Figure:
+    """The same as a jump of the set-point, which no stage can follow."""
+    motion = run([Steps(kind="steps", by_m=(STEP_M, 0.0, 0.0), count=3, dwell_s=0.02)])
+    period_s, jumps_us = motion.period_us * 1e-6, motion.segments[0].jumps_us
+    times = [settled_s(motion.during((at_us, at_us + 19_000)), 0, BAND_M, period_s) for at_us in jumps_us]
+    words = "1 um in x as a jump of the set-point, which no stage can follow"
+    return Figure("control.jump_settle", max(times) * 1e3, "ms", None, None, None, words)
+
+
+def _rms_nm(errors_m: NDArray[np.float64]) -> float:
+    return float(np.sqrt(np.mean(np.sum(np.atleast_2d(errors_m) ** 2, axis=-1)))) * 1e9
+
+
+def _circle() -> Figure:
+    motion = run([Circle(kind="circle", radius_m=4e-6, frequency_hz=100.0, turns=50.0)])
+    rms_nm = _rms_nm(error_m(motion.scan(0))[:, :2])
+    detail = f"radius 4 um, 100 Hz, in the plane: {rms_nm:.2f} nm of 8 um"
+    return Figure("control.circle", rms_nm / 8e3 * 100, "% of diameter", 0.1, "at most", None, detail)
+
+
+def _raster() -> Figure:
+    motion = run(
+        [
+            Raster(
+                kind="raster", line_length_m=10e-6, lines=20, line_pitch_m=0.2e-6, line_rate_hz=50.0,
+                velocity_max_m_per_s=2e-3, acceleration_max_m_per_s2=1.0, jerk_max_m_per_s3=1000.0,
+            )
+        ]
+    )  # fmt: skip
+    lines = np.concatenate([error_m(motion.during(window)) for window in motion.segments[0].lines_us])
+    along, across = _rms_nm(lines[:, :1]), np.sqrt(np.mean(lines[:, 1:] ** 2, axis=0)) * 1e9
+    detail = f"20 lines of 10 um, 50 lines/s: x {along:.2f}, y {across[0]:.2f}, z {across[1]:.2f} nm on the lines"
+    worst = max(along, *across)
+    return Figure("control.raster", worst / 10e3 * 100, "% of line", 0.1, "at most", None, detail)
+
+
+def _hold() -> Figure:
+    motion = run([Hold(kind="hold", duration_s=1.0)])
+    rms_nm = np.sqrt(np.mean(error_m(motion.during(motion.segments[0].still_us or (0, 0))) ** 2, axis=0)) * 1e9
+    detail = "true position against the set-point at mid-workspace, 1 s: " + ", ".join(
+        f"{axis} {v:.2f}" for axis, v in zip("xyz", rms_nm, strict=True)
+    )
+    return Figure("control.hold", float(rms_nm.max()), "nm rms", 1.5, "at most", None, detail)
+
+
+def far_jump(controller: str) -> dict[str, Any]:
+    """A jump over nearly the whole height, there and back: settling of each in ms, and how near the limits it came."""
+    motion = run([Steps(kind="steps", by_m=(0.0, 0.0, WAY_M), count=1, dwell_s=0.04)], controller, height_m=LOW_M)
+    period_us = motion.period_us
+    times = [
+        settled_s(motion.during((at, at + 36_000)), 2, BAND_M, period_us * 1e-6) * 1e3
+        for at in motion.segments[0].jumps_us
+    ]
+    rows = motion.during((motion.segments[0].t_start_us, motion.segments[0].t_end_us))
+    solved = rows["solver_iterations"]
+    return {
+        "settle_ms": times, "voltage_max_v": float(rows["voltage_v"].max()),
+        "step_max_v": float(np.abs(np.diff(rows["voltage_v"], axis=0)).max()),
+        "stroke_max_um": float(rows["stroke_m"].max()) * 1e6, "stroke_min_um": float(rows["stroke_m"].min()) * 1e6,
+        "saturated": int(rows["saturated"].sum()),
+        "solved": int((solved > 0).sum()), "gave_up": int((solved < 0).sum()),
+    }  # fmt: skip
+
+
+def _far_jump() -> list[Figure]:
+    clipped, planned = far_jump("lqg"), far_jump("mpc")
+    inside = (
+        planned["voltage_max_v"] <= 200.0 and planned["step_max_v"] <= 20.0
+        and planned["stroke_max_um"] <= 25.0 and planned["stroke_min_um"] >= -0.5
+    )  # fmt: skip
+    there_and_back = {n: " and ".join(f"{t:.1f}" for t in d["settle_ms"]) for n, d in (("l", clipped), ("p", planned))}
+    return [
+        Figure("control.mpc_settle", max(planned["settle_ms"]) - max(clipped["settle_ms"]), "ms", 0.0, "at most", None,
+               f"4 to 35 um of height and back, the slower of the two, less that of lqg: "
+               f"mpc {there_and_back['p']} ms, lqg {there_and_back['l']} ms, {clipped['saturated']} ticks at a limit"),
+        Figure("control.mpc_violations", 0.0 if inside else 1.0, "count", 0.0, "at most", None,
+               f"{planned['voltage_max_v']:.1f} of 200 V, {planned['step_max_v']:.2f} of 20 V a tick, "
+               f"strokes {planned['stroke_min_um']:.2f} to {planned['stroke_max_um']:.2f} of 0 to 25 um; solved "
+               f"{planned['solved']} times, gave up {planned['gave_up']} times"),
+    ]  # fmt: skip
+
+
+def _mpc_tick() -> Figure:
+    """Wall time of every tick of the far jump, called as the fast lane calls it."""
+    taken = mpc_tick_us()
+    limited = taken["solved"]
+    detail = (
+        f"the whole tick, all of a far jump; median {np.percentile(taken['all'], 50):.1f} us; the {len(limited)} ticks "
+        f"with a problem to solve {np.percentile(limited, 50):.0f} us, p99 {np.percentile(limited, 99):.0f} us"
+    )
+    p99_us = float(np.percentile(taken["all"], 99))
+    return Figure("control.mpc_tick", p99_us, "us at p99", 100.0, "at most", None, detail)
+
+
+def mpc_tick_us(repeats: int = 5) -> dict[str, NDArray[np.float64]]:
+    """Time of each tick of the far jump in us, the best of several runs, which have the same bits: ``all`` of them, and
+    those that ``solved`` a problem.
+    """
+    jump = Steps(kind="steps", by_m=(0.0, 0.0, WAY_M), count=1, dwell_s=0.04)
+    setup, _ = setup_of([jump], "mpc", "nominal", LOW_M)
+    reference = setup.trajectory.sample(0, setup.ticks + 25, setup.bus.period_us)
+    at_us = setup.bus.period_us * np.arange(setup.ticks, dtype=np.int64)
+    best = np.full(setup.ticks, np.inf)
+    rows = np.zeros(setup.ticks, ROW)
+    for _ in range(repeats):
+        period, plant, memory = period_of(setup.law, reference), setup.new_plant(), new_memory(Mode.IDLE)
+        taken: list[float] = []
+
+        def timed(*arguments: Any, period: Any = period, taken: list[float] = taken) -> None:
+            begin = time.perf_counter()
+            period(*arguments)
+            taken.append(time.perf_counter() - begin)
+
+        run_block_in_steps(timed, setup.law, memory, reference, plant.params, plant.state, at_us, rows, setup.ticks)
+        best = np.minimum(best, np.array(taken) * 1e6)
+    return {"all": best, "solved": best[rows["solver_iterations"] != 0]}
