@@ -132,16 +132,12 @@ def load_scenario(
         raise ConfigError("\n".join(dict.fromkeys(problems)))
     try:
         trajectory = Trajectory(in_folder(scenario.reference, source.parent))
+        _check_duration(source, scenario, trajectory)  # first: to sample one of 10^18 s would never end
         limits = parts["controller"].limits
         drive = DriveLimits(limits.voltage_max_v, limits.slew_max_v_per_s, parts["bus"].period_us)
         check_against(Stage(parts["stage"]), trajectory, drive)
     except TrajectoryError as error:
         raise TrajectoryError(f"{source}: {error}") from None
-    if trajectory.duration_us * 1e-6 > scenario.duration_s:
-        raise ConfigError(
-            f"{source}: duration_s: {scenario.duration_s:g} s are over before the reference, which alone takes "
-            f"{trajectory.duration_us * 1e-6:.4g} s; give more, start-up included, or a shorter reference"
-        )
     return Scenario(source, scenario, trajectory=trajectory, **parts)
 
 
@@ -197,3 +193,11 @@ def restore(resolved: dict[str, Any], folder: Path) -> Scenario:
             raise ConfigError(f"{folder}: reference.{n}: its table is not the one of the run")
     device = config.parse(resolved["stage"], Device, source)
     return Scenario(folder, scenario, device=device, trajectory=trajectory, **parts)
+
+
+def _check_duration(source: Path, scenario: ScenarioConfig, trajectory: Trajectory) -> None:
+    if trajectory.duration_us * 1e-6 > scenario.duration_s:
+        raise ConfigError(
+            f"{source}: duration_s: {scenario.duration_s:g} s are over before the reference, which alone takes "
+            f"{trajectory.duration_us * 1e-6:.4g} s; give more, start-up included, or a shorter reference"
+        )

@@ -14,6 +14,7 @@ import re
 import sys
 import time
 import tomllib
+from collections import Counter
 from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path
@@ -119,7 +120,8 @@ def _name(job: Job) -> str:
 
 
 def _name_with_tests(job: Job) -> str:
-    return f"{_name(job)} {_digest(*sorted(TESTS.glob('*.py')))}"
+    helpers = [path for path in TESTS.glob("*.py") if not path.name.startswith("test_")]
+    return f"{_name(job)} {_digest(*sorted(helpers), *(TESTS / name for name in subject_of(job.module).files))}"
 
 
 def _digest(*paths: Path) -> str:
@@ -133,10 +135,12 @@ def one_line(text: str) -> str:
     return re.sub(r"\s+", " ", text)
 
 
-def known_survivors() -> dict[tuple[str, str, str], str]:
-    """Reasons by (module, text of the source line, change)."""
+def known_survivors() -> dict[tuple[str, str, str], tuple[str, int]]:
+    """Reason and how many there may be, by (module, text of the source line, change)."""
     entries = tomllib.loads(SURVIVORS.read_text(encoding="utf-8")).get("survivor", [])
-    return {(entry["module"], entry["line"], entry["change"]): entry["reason"] for entry in entries}
+    return {
+        (entry["module"], entry["line"], entry["change"]): (entry["reason"], entry.get("times", 1)) for entry in entries
+    }
 
 
 def key_of(job: Job) -> tuple[str, str, str]:
@@ -148,6 +152,7 @@ def key_of(job: Job) -> tuple[str, str, str]:
 def report(jobs: list[Job], outcomes: dict[Job, str]) -> tuple[str, int]:
     """The text of docs/mutation.md, and how many survivors have no reason."""
     reasons = known_survivors()
+    met: Counter[tuple[str, str, str]] = Counter()
     rows, survivors, unexplained = [], [], 0
     for module in TARGETS:
         made = [job for job in jobs if job.module == module]
@@ -156,10 +161,13 @@ def report(jobs: list[Job], outcomes: dict[Job, str]) -> tuple[str, int]:
         slow = sum(outcomes[job] == "timeout" for job in tried)
         rows.append(f"| `{module}` | {len(made)} | {len(tried)} | {len(tried) - len(lived)} ({slow}) | {len(lived)} |")
         for job in lived:
-            reason = reasons.get(key_of(job))
-            unexplained += reason is None
+            key = key_of(job)
+            met[key] += 1
+            reason, times = reasons.get(key, ("", 0))
+            known = met[key] <= times
+            unexplained += not known
             change = one_line(job.mutant.change).replace("|", "\\|")
-            survivors.append(f"| `{module}`:{job.mutant.line} | `{change}` | {reason or '**none yet**'} |")
+            survivors.append(f"| `{module}`:{job.mutant.line} | `{change}` | {reason if known else '**none yet**'} |")
     killed = sum(result != "survived" for result in outcomes.values())
     table = "\n".join(rows)
     listed = "\n".join(survivors) or "| none | | |"

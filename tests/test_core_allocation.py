@@ -119,6 +119,14 @@ def test_a_demand_that_is_no_number_ends_within_the_tries(demand_n):
     assert 2 <= tries <= 27
 
 
+def test_at_a_bound_is_within_it():
+    """At rest, no force is asked for and none is the least there is: no search. Nor where nothing may be given."""
+    jacobian = jacobian_at(np.full(3, 12.5e-6))
+    for upper in (FORCE_MAX_N, 0.0):
+        force, tries = solve(jacobian, np.zeros(3), np.zeros(3), np.full(3, upper))
+        assert (force.tolist(), tries) == ([0.0, 0.0, 0.0], 1)
+
+
 def test_more_force_is_never_nearer():
     """No random feasible force does better, anywhere in the workspace."""
     rng = np.random.default_rng(3)

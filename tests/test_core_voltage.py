@@ -87,6 +87,22 @@ def test_a_force_within_the_limits_is_met_to_half_a_count(fractions, last, slew,
     assert np.abs(count - wanted).max() <= 0.5 + 1e-6
 
 
+def test_force_limits_are_those_of_the_counts_in_reach():
+    """0 V is in reach from ``slew`` counts on, to the last bit; the voltage limit from as far below it."""
+    drive, lower, upper = drive_with(slew=100, most=30_000), np.zeros(3), np.zeros(3)
+    one = drive["force_gain_n_per_v2"] * drive["volt_per_count"] ** 2
+    for last, low, high in (
+        (0, 0, 100),
+        (100, 0, 200),
+        (101, 1, 201),
+        (29_900, 29_800, 30_000),
+        (30_000, 29_900, 30_000),
+    ):
+        force_limits(drive, np.full(3, last, np.int32), lower, upper)
+        assert lower == pytest.approx(np.full(3, one * low**2), rel=1e-12, abs=0)
+        assert upper == pytest.approx(np.full(3, one * high**2), rel=1e-12)
+
+
 def sweep(shaping, ticks=1 << 16):
     """Voltage error in counts of a slow sweep over thousands of counts on three combs (ticks, 3), and the carries."""
     drive, carry = drive_with(shaping=shaping), np.zeros(3)
@@ -134,13 +150,14 @@ def test_unshaped_error_is_white():
     assert np.abs(carry + error).max() < 1e-6  # it is noted, and not used
 
 
-def test_a_constant_between_two_counts_is_met_on_average():
+@pytest.mark.parametrize("count", [20, 20_000])
+def test_a_constant_between_two_counts_is_met_on_average(count):
     """0.3 of a count: three ticks in ten the upper one. Without shaping it would be the lower one for ever."""
     drive = drive_with()
-    force = np.full(3, drive["force_gain_n_per_v2"] * (20_000.3 * drive["volt_per_count"]) ** 2)
-    for shaping, mean in ((1, 20_000.3), (0, 20_000.0)):
+    force = np.full(3, drive["force_gain_n_per_v2"] * ((count + 0.3) * drive["volt_per_count"]) ** 2)
+    for shaping, mean in ((1, count + 0.3), (0, count)):
         drive["noise_shaping"] = shaping
-        carry, last, total = np.zeros(3), np.full(3, 20_000, np.int32), np.zeros(3)
+        carry, last, total = np.zeros(3), np.full(3, count, np.int32), np.zeros(3)
         for _ in range(1000):
             last = convert(drive, force, last, carry)
             total += last

@@ -83,6 +83,7 @@ def test_paths_are_taken_from_the_scenarios_folder_and_overrides_from_the_workin
         ("duration_s = 1.1", "duration_ms = 1100.0", r"duration_ms: unknown key; .*'duration_s', in seconds"),
         ("duration_s = 1.1", "duration_s = nan", r"duration_s: .*finite"),
         ("duration_s = 1.1", "duration_s = 0.5", r"duration_s: 0\.5 s are over before the reference.*0\.95"),
+        ("duration_s = 0.1\n", "duration_s = 1e18\n", r"are over before the reference, which alone takes 1e\+18 s"),
         ("line_rate_hz = 60.0", "line_rate_hz = 600.0", r"reference\.3 \(raster\): 600 lines/s is beyond the 85"),
         ("19.2495e-6", "49e-6", r"reference\.1 \(move\): 0\.1\d+ s after its start .*stroke 1 would be 25\.\d+ um"),
         ("max = 0.85 }", "max = 0.85", r"not valid TOML.*line"),

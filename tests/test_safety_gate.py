@@ -53,6 +53,7 @@ def test_one_voltage_in_a_tick_but_zero_may_follow_at_once() -> None:
     assert passes(gate, drive(6, 5, 5, 0), T)
     assert passes(gate, drive(0, 0, 0, 1), T)
     assert not passes(gate, drive(0, 0, 0, 2), T + 99)  # a second 0 V says nothing new: babble
+    assert passes(gate, drive(0, 0, 0, 2), T + 100)
     gate = holding((5, 5, 5))
     assert passes(gate, drive(6, 5, 5, 0), T)
     assert "no SYNC" in str(gate.check(drive(7, 5, 5, 1), Mode.TRACKING, 3 * T))
@@ -68,6 +69,18 @@ def test_voltage_waits_until_a_zero_in_sequence_has_been_sent() -> None:
     assert passes(gate, drive(0, 0, 0, 8), 2 * T)
     assert passes(gate, sync(), 2 * T)
     assert passes(gate, drive(10, 10, 10, 9), 3 * T)
+
+
+@pytest.mark.parametrize("before", [0, 1, 200, 255])
+def test_a_zero_whose_counter_jumped_is_not_known_to_be_held(before: int) -> None:
+    """Whatever counter came before it; the first ever may carry any."""
+    for step in (2, 7, 255):
+        gate = TransmitGate(CONFIG)
+        assert passes(gate, drive(0, 0, 0, before), 0)
+        assert passes(gate, sync(), 0)
+        assert passes(gate, drive(0, 0, 0, before + step), T)
+        assert passes(gate, sync(), T)
+        assert not passes(gate, drive(10, 10, 10, before + step + 1), 2 * T)
 
 
 def test_frame_made_for_another_node_is_blocked() -> None:
@@ -118,6 +131,9 @@ def test_without_protection_six_bytes_and_nothing_else() -> None:
 
 def test_voltage_needs_a_zero_first_at_the_start_and_after_nmt() -> None:
     assert not passes(TransmitGate(CONFIG), drive(1, 1, 1, 0))
+    gate = TransmitGate(CONFIG)
+    assert passes(gate, sync(), 0)  # that the tick is new does not help
+    assert not passes(gate, drive(1, 1, 1, 0))
     for command in (0x80, 0x02):
         gate = holding((5, 5, 5))
         assert passes(gate, nmt(command))
@@ -247,6 +263,8 @@ def test_reason_names_frame_mode_and_rule() -> None:
     reason = TransmitGate(CONFIG).check(drive(1, 2, 3, 4), Mode.IDLE, T)
     assert str(reason).startswith("frame 0x30A [01 00 02 00 03 00 04 ")
     assert str(reason).endswith("blocked in IDLE: DRIVE is not permitted now")
+    assert "SYNC is not permitted" in str(TransmitGate(CONFIG).check(sync(), 7, T))
+    assert "1..240" in str(TransmitGate(CONFIG).check(sync(0), Mode.IDLE, T))
 
 
 @dataclass

@@ -251,10 +251,9 @@ def test_what_is_watched_in_which_mode(mode: Mode) -> None:
 
 
 def test_memory_is_cleared_where_nothing_is_expected() -> None:
-    bench = Bench()
-    for _ in range(40):
-        bench.tick(ALL_BAD)
-    bench.mode = Mode.FAULT
+    bench = Bench(Mode.FAULT)
+    for name in MONITOR_MEMORY.names or ():
+        bench.memory[name] = 7
     bench.tick(ALL_BAD)
     clean = np.zeros(1, MONITOR_MEMORY)
     clean["frozen_sense_count"] = bench.memory["frozen_sense_count"]  # without meaning while frozen is 0
@@ -334,10 +333,12 @@ def test_limits_that_were_never_filled_in_trip_at_once() -> None:
     assert {Trip.SENSE_STALE, Trip.SENSE_CRC, Trip.SATURATION, Trip.SLEW, Trip.OVERRUN, Trip.SOLVER} <= set(trips)
 
 
-def test_healthy_ticks_never_trip_with_the_defaults() -> None:
+def test_healthy_ticks_never_trip_with_the_defaults_and_fill_no_bucket() -> None:
     for mode in Mode:
         bench = Bench(mode)
-        assert not any(bench.tick() for _ in range(2000))
+        for _ in range(2000):
+            assert bench.tick() == 0
+            assert not any(bench.memory[name].any() for name in MONITOR_MEMORY.names or () if name.endswith("_level"))
 
 
 def test_silence_is_called_stale_at_the_fifth_tick() -> None:
@@ -367,6 +368,24 @@ def test_consecutive_counts_against_the_history(ticks: list[tuple[Mode, bool, bo
         if recent and all(LOOP_CLOSED[m] and was_astray for m, _, was_astray in recent):
             expected |= Trip.INNOVATION_Y
         assert trips == expected
+
+
+def test_counting_stops_long_before_a_counter_overflows() -> None:
+    enough = 1 << 30
+    bench = Bench()
+    bench.memory["stale"] = bench.memory["crc_level"] = enough
+    for _ in range(3):
+        assert bench.tick({"sense_status": SenseStatus.CRC}) & Trip.SENSE_STALE
+        assert bench.memory["stale"] == bench.memory["crc_level"] == enough
+
+
+def test_a_single_outlier_of_a_second_comb_does_not_take_the_blame_from_the_first() -> None:
+    limits = only("residual_count", 3)
+    bench = Bench(limits=limits)
+    assert [bench.tick({"implausible_combs": combs}) for combs in (1, 1, 3)] == [0, 0, Trip.COMB_MISFIT_1]
+    bench = Bench(limits=limits)
+    both = [bench.tick({"implausible_combs": combs, "innovation_m": [0.0, 1e-6, 0.0]}) for combs in (1, 3, 3)]
+    assert both == [0, 0, Trip.INNOVATION_Y]
 
 
 def test_every_trip_is_explained_with_what_to_check() -> None:

@@ -8,7 +8,7 @@ import pytest
 from pkxyz_ctrl.can.codec import ProcessCodec
 from pkxyz_ctrl.safety.gate import PERMITTED, FrameKind, GateConfig
 from pkxyz_ctrl.safety.modes import Mode
-from pkxyz_ctrl.safety.monitors import default_limits
+from pkxyz_ctrl.safety.monitors import NodeEvent, SenseStatus, default_limits
 from pkxyz_ctrl.safety.sdo_rules import write_refusal
 from pkxyz_ctrl.safety.trips import Trip
 
@@ -51,6 +51,16 @@ def test_trip_bits() -> None:
     assert {name: trip.value for name, trip in Trip.__members__.items()} == {
         name: 1 << place for place, name in enumerate(TRIPS)
     }
+
+
+def test_bits_of_what_was_wrong_with_a_frame_and_a_node() -> None:
+    """The driver raises them by number."""
+    sense = ["MISSING", "COUNTER", "CRC", "LENGTH", "DUPLICATE", "IMPLAUSIBLE"]
+    assert {name: bit.value for name, bit in SenseStatus.__members__.items()} == {
+        n: 1 << k for k, n in enumerate(sense)
+    }
+    node = ["HEARTBEAT_LOST", "NOT_OPERATIONAL", "REBOOTED", "EMERGENCY"]
+    assert {name: bit.value for name, bit in NodeEvent.__members__.items()} == {n: 1 << k for k, n in enumerate(node)}
 
 
 # What may be written to the amplifier (node 10, controller 127, at most 1000 ms): objects, sub-indices, bytes, a value
@@ -130,6 +140,14 @@ def test_values_with_more_than_one_permitted() -> None:
         assert not refused(0x1801, 1, 4, cob_id)
 
 
+@pytest.mark.parametrize(("index", "subindex", "size"), [(0x1601, 0, 1), (0x1801, 3, 2)])
+def test_nothing_may_stand_behind_the_value(index: int, subindex: int, size: int) -> None:
+    """Of objects that may hold anything: whatever is refused, is so for the bytes behind."""
+    for bit in range(32):
+        data = struct.pack("<BHBI", COMMAND[size], index, subindex, 1 << bit)
+        assert (write_refusal(data, 10, 127, 1000) is not None) == (bit >= 8 * size)
+
+
 GATE_RANGES = {
     "count_max": (0, 32767),
     "count_slew_max": (1, 32767),
@@ -197,6 +215,7 @@ def test_identifiers_of_a_codec_have_eleven_bits() -> None:
 
 def test_default_limits_of_the_monitors() -> None:
     """They decide when 200 V go off, so nobody changes one by a slip; why they are what they are is told there."""
+    assert default_limits().shape == (1,)
     limits = default_limits()[0]
     counts = {name: int(limits[name]) for name in limits.dtype.names if name.endswith(("_count", "_ticks"))}
     assert counts == {
