@@ -20,6 +20,7 @@ from hil import (
     mechanics_cli,
     replay_cli,
     run_cli,
+    tune_cli,
 )
 from pkxyz_ctrl.config import CONFIG_DIR, ConfigError, names
 
@@ -33,7 +34,7 @@ app = typer.Typer(
 _screen = Console(highlight=False)
 _notes = Console(stderr=True, highlight=False)
 
-KINDS = ("scenarios", "stages", "plants", "controllers", "buses", "tolerances")
+KINDS = ("scenarios", "stages", "plants", "controllers", "buses", "tolerances", "searches")
 """Folders of configs/, as ``pkxyz configs`` lists them."""
 
 
@@ -143,6 +144,7 @@ app.command("plant")(run_cli.plant)
 app.command("replay")(replay_cli.replay)
 app.command("latency")(latency_cli.latency)
 app.command("margins")(margins_cli.margins)
+app.command("tune")(tune_cli.tune)
 app.command("paper")(mechanics_cli.paper)
 app.command("workspace")(mechanics_cli.workspace)
 app.command("design")(mechanics_cli.design)

@@ -1,0 +1,97 @@
+"""``pkxyz tune``: better numbers for a controller file."""
+
+import json
+from pathlib import Path
+from typing import Annotated
+
+import typer
+from rich.console import Console
+from rich.table import Table
+
+from pkxyz_ctrl.config import ConfigError
+
+_screen = Console(highlight=False)
+_notes = Console(stderr=True, highlight=False)
+
+
+def tune(
+    search: Annotated[str, typer.Argument(help="A shipped search's name or a TOML file.")] = "lqg",
+    trials: Annotated[int, typer.Option(min=0, help="How many to add to the study; 0 only shows it.")] = 100,
+    workers: Annotated[int | None, typer.Option(min=1, help="Processes; default: as many as cores.")] = None,
+    dask: Annotated[
+        str | None, typer.Option(metavar="ADDRESS", help="Scheduler of a Dask cluster to work on instead.")
+    ] = None,
+    storage: Annotated[
+        str | None, typer.Option(metavar="URL", help="Database of the study; default: study.db in the folder.")
+    ] = None,
+    seed: Annotated[int, typer.Option(min=0, help="Of the search.")] = 1,
+    out: Annotated[Path, typer.Option(help="Folder for the controller file, study and pictures.")] = Path("tuned"),
+    as_json: Annotated[bool, typer.Option("--json", help="Print JSON, and nothing else.")] = False,
+) -> None:
+    """Search a law's weights: margins are constraints and computed first, runs on the fast lane follow if they hold.
+
+    Call it again to go on. Exit code 0 if numbers were found that keep every constraint, 1 if not, 2 for bad input,
+    130 if interrupted (what is done is kept).
+    """
+    from hil.search import load_problem
+    from hil.tuning import best, draw, nearest, open_study, write_controller
+    from hil.tuning import search as run_search
+    from hil.workers import cores
+
+    problem = load_problem(search)
+    try:
+        out.mkdir(parents=True, exist_ok=True)
+    except OSError as error:
+        raise ConfigError(f"--out: {out}: {(error.strerror or str(error)).lower()}; give another folder") from None
+    study = open_study(problem, storage or f"sqlite:///{(out / 'study.db').absolute()}", seed)
+    interrupted = False
+    if trials:
+        try:
+            with _progress(quiet=as_json) as progress:
+                task = progress.add_task(problem.search.name, total=trials)
+                run_search(
+                    study, problem, trials, workers or cores(), dask,
+                    lambda done, total: progress.update(task, completed=done, total=total),
+                )  # fmt: skip
+        except KeyboardInterrupt:
+            interrupted = True
+    found = best(study, problem)
+    importance = draw(study, problem, out) if study.trials else {}
+    path = out / f"{problem.search.name}_tuned.toml"
+    if found is not None:
+        write_controller(problem, found, path)
+    data = {
+        "search": problem.search.name, "digest": problem.digest(), "seed": seed, "trials": len(study.trials),
+        "best": None if found is None else vars(found) | {"controller": str(path)},
+        "missed": {} if found is not None else nearest(study), "importance": importance, "interrupted": interrupted,
+    }  # fmt: skip
+    if as_json:
+        print(json.dumps(data, allow_nan=False))
+    else:
+        _show(data, problem.search.objective)
+    raise typer.Exit(130 if interrupted else 0 if found is not None else 1)
+
+
+def _progress(*, quiet: bool):  # type: ignore[no-untyped-def]
+    from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn
+
+    columns = (TextColumn("{task.description}"), BarColumn(), MofNCompleteColumn(), TimeRemainingColumn())
+    return Progress(*columns, console=_notes, transient=True, disable=quiet or not _notes.is_terminal)
+
+
+def _show(data: dict, objective: str) -> None:  # type: ignore[type-arg]
+    found = data["best"]
+    _screen.print(f"{data['search']}: {data['trials']} trials in the study")
+    if found is None:
+        missed = ", ".join(f"{name} by {beyond:.0%}" for name, beyond in data["missed"].items())
+        _screen.print(f"none keeps every constraint; the nearest one misses {missed or 'nothing, but did not run'}")
+        return
+    table = Table(box=None, pad_edge=False, show_header=False)
+    table.add_row(objective, f"{found['value']:.4g}", f"trial {found['number']}")
+    for name, value in found["figures"].items():
+        table.add_row(name, f"{value:.4g}", "")
+    for key, value in found["numbers"].items():
+        share = data["importance"].get(key)
+        table.add_row(key, f"{value:.4g}", "" if share is None else f"importance {share:.2f}")
+    _screen.print(table)
+    _screen.print(f"run it: pkxyz sil --controller {found['controller']}", soft_wrap=True)

@@ -1,0 +1,217 @@
+"""A search by Optuna: numbers are asked for here, valued by many hands, and told back here; the study lives in a
+database, so it can be continued, and shared by several machines.
+"""
+
+import importlib.metadata
+import logging
+import warnings
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass
+from functools import partial
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import optuna
+import tomlkit
+
+from hil.search import Problem, Worth, evaluate, put
+from hil.workers import as_done, hands
+from pkxyz_ctrl.config import ConfigError
+
+_DIGITS = 4
+"""Significant digits of a tried number: what is tried is what the file will say."""
+_STATE = optuna.trial.TrialState
+
+
+@dataclass(frozen=True)
+class Best:
+    """The best trial that keeps every constraint."""
+
+    number: int
+    value: float
+    numbers: dict[str, float]
+    figures: dict[str, float]
+
+
+def open_study(problem: Problem, storage: str, seed: int) -> optuna.Study:
+    """The study of a problem in a database, made anew or continued. Raises ``ConfigError`` for a database that can't
+    be had, and for a study of the same name with another problem.
+    """
+    optuna.logging.set_verbosity(logging.WARNING)
+    warnings.filterwarnings("ignore", category=optuna.exceptions.ExperimentalWarning)
+    try:
+        study = optuna.create_study(
+            study_name=problem.search.name,
+            storage=storage,
+            direction="maximize" if problem.maximise else "minimize",
+            load_if_exists=True,
+        )
+        study.sampler = _sampler(seed, len(study.get_trials(deepcopy=False)))
+        digest = study.user_attrs.get("digest")
+        if digest is None:
+            study.set_user_attr("digest", problem.digest())
+            study.set_user_attr("version", importlib.metadata.version("pkxyz-ctrl"))
+            study.enqueue_trial(problem.start())
+    except Exception as error:  # SQLAlchemy's, the driver's and Optuna's own have nothing in common
+        line = (str(error).splitlines() or [type(error).__name__])[0]
+        raise ConfigError(f"--storage: {storage}: {line}; give the URL of a database that can be written") from None
+    if digest not in (None, problem.digest()):
+        raise ConfigError(
+            f"--storage: {storage}: its study {problem.search.name!r} is of another problem (the search file or a "
+            "file that it names has changed since); give another --storage, or another name in the search file"
+        )
+    return study
+
+
+def _sampler(seed: int, trials: int) -> optuna.samplers.BaseSampler:
+    """Random numbers of its own for each continuation, or it would begin with the first run's choices again."""
+    state = int(np.random.SeedSequence([seed, trials]).generate_state(1)[0])
+    return optuna.samplers.TPESampler(seed=state, multivariate=True, constant_liar=True, n_startup_trials=20)
+
+
+def search(
+    study: optuna.Study,
+    problem: Problem,
+    trials: int,
+    workers: int,
+    scheduler: str | None = None,
+    on_progress: Callable[[int, int], None] = lambda done, total: None,
+) -> None:
+    """Add so many trials to the study. Interrupted, it keeps those that are done. One worker and one seed give the
+    same trials again; with more, the order in which they finish decides.
+    """
+    asked: dict[int, optuna.Trial] = {}
+
+    def choices() -> Iterator[tuple[int, dict[str, float]]]:
+        for _ in range(trials):
+            trial = study.ask()
+            asked[trial.number] = trial
+            yield trial.number, _numbers(trial, problem)
+
+    try:
+        with hands(workers, scheduler) as (pool, width):
+            valued = as_done(pool, width, partial(_valued, problem), choices())
+            for done, ((number, _), worth) in enumerate(valued, start=1):
+                _tell(study, asked.pop(number), worth)
+                on_progress(done, trials)
+    finally:
+        for trial in asked.values():
+            study.tell(trial, state=_STATE.FAIL)
+
+
+def _valued(problem: Problem, item: tuple[int, dict[str, float]]) -> Worth:
+    return evaluate(problem, item[1])
+
+
+def _numbers(trial: optuna.Trial, problem: Problem) -> dict[str, float]:
+    tried = {n.key: trial.suggest_float(n.key, n.low, n.high, log=n.log) for n in problem.search.number}
+    return {key: rounded(value) for key, value in tried.items()}
+
+
+def rounded(value: float) -> float:
+    """To the digits that are tried."""
+    return float(f"{value:.{_DIGITS - 1}e}")
+
+
+def _tell(study: optuna.Study, trial: optuna.Trial, worth: Worth) -> None:
+    for name, beyond in worth.constraints.items():
+        trial.set_constraint(name, beyond)
+    for name, value in worth.figures.items():
+        trial.set_user_attr(name, value if np.isfinite(value) else None)
+    if worth.reason:
+        trial.set_user_attr("reason", worth.reason)
+    if worth.value is None:
+        study.tell(trial, state=_STATE.PRUNED)
+    else:
+        study.tell(trial, worth.value)
+
+
+def best(study: optuna.Study, problem: Problem) -> Best | None:
+    """None as long as no trial keeps every constraint."""
+    kept = [t for t in study.get_trials(deepcopy=False) if t.state == _STATE.COMPLETE and _keeps(t)]
+    if not kept:
+        return None
+    chosen = (max if problem.maximise else min)(kept, key=lambda t: t.value)
+    numbers = {key: rounded(value) for key, value in chosen.params.items()}
+    return Best(
+        chosen.number, float(chosen.value), numbers, {k: v for k, v in chosen.user_attrs.items() if k != "reason"}
+    )
+
+
+def _keeps(trial: Any) -> bool:
+    return all(beyond <= 0.0 for beyond in trial.constraints.values())
+
+
+def nearest(study: optuna.Study) -> dict[str, float]:
+    """Constraints that the trial misses which misses least, and by which share of the goal; empty without a trial."""
+    tried = [t for t in study.get_trials(deepcopy=False) if t.constraints]
+    if not tried:
+        return {}
+    closest = min(tried, key=lambda t: max(t.constraints.values()))
+    return {name: beyond for name, beyond in closest.constraints.items() if beyond > 0.0}
+
+
+def write_controller(problem: Problem, found: Best, path: Path) -> None:
+    """The controller file with the best numbers: its comments stay, and the first lines say where the numbers are
+    from. Raises ``ConfigError`` where it can't be written.
+    """
+    document = tomlkit.parse(problem.source.read_text(encoding="utf-8"))
+    for key, value in found.numbers.items():
+        put(document, key, value)
+    document["name"] = path.stem
+    figures = ", ".join(f"{name} {value:.4g}" for name, value in found.figures.items())
+    unit = "Hz" if problem.maximise else "nm"
+    head = (
+        f"# {problem.search.controller}, tuned by the search {problem.search.name!r} ({problem.digest()}).\n"
+        f"# Trial {found.number}: {problem.search.objective} = {found.value:.4g} {unit}; {figures}.\n"
+    )
+    try:
+        path.write_text(head + tomlkit.dumps(document), encoding="utf-8")
+    except OSError as error:
+        raise ConfigError(f"{path}: {(error.strerror or str(error)).lower()}; give another --out") from None
+
+
+def draw(study: optuna.Study, problem: Problem, folder: Path) -> dict[str, float]:
+    """history.png and importance.png; returns the importances, empty with fewer than four values to judge by."""
+    from matplotlib.backends.backend_agg import FigureCanvasAgg
+    from matplotlib.figure import Figure
+
+    finished = [t for t in study.get_trials(deepcopy=False) if t.state == _STATE.COMPLETE]
+    importance: dict[str, Any] = {}
+    if len(finished) >= 4:
+        evaluator = optuna.importance.PedAnovaImportanceEvaluator()
+        importance = optuna.importance.get_param_importances(study, evaluator=evaluator)
+    figure = Figure(figsize=(9, 4.2), layout="constrained", dpi=120)
+    FigureCanvasAgg(figure)
+    axes = figure.subplots()
+    _history(axes, study, finished, problem.maximise)
+    axes.set(
+        xlabel="trial", ylabel=problem.search.objective, title=f"{problem.search.name}: {len(study.trials)} trials"
+    )
+    figure.savefig(folder / "history.png")
+    if importance:
+        figure = Figure(figsize=(8, 0.5 * len(importance) + 1.3), layout="constrained", dpi=120)
+        FigureCanvasAgg(figure)
+        axes = figure.subplots()
+        names = list(importance)[::-1]
+        axes.barh(names, [importance[name] for name in names], color="#0072b2")
+        axes.set(xlabel="importance (PED-ANOVA), among the trials that were run", title=problem.search.name)
+        axes.spines[["top", "right"]].set_visible(False)
+        figure.savefig(folder / "importance.png")
+    return {name: float(value) for name, value in importance.items()}
+
+
+def _history(axes: Any, study: optuna.Study, finished: list[Any], maximise: bool) -> None:
+    numbers, values = np.array([t.number for t in finished]), np.array([t.value for t in finished], dtype=np.float64)
+    if len(values):
+        axes.plot(numbers, values, ".", color="#9aa5ad", label="tried")
+        axes.step(numbers, (np.maximum if maximise else np.minimum).accumulate(values), where="post", color="#0072b2",
+                  label="best so far")  # fmt: skip
+        low, high = np.percentile(values, [0, 90] if not maximise else [10, 100])
+        axes.set_ylim(low - 0.1 * (high - low) - 1e-9, high + 0.1 * (high - low) + 1e-9)
+    missed = [t.number for t in study.get_trials(deepcopy=False) if t.state == _STATE.PRUNED]
+    if missed:
+        axes.plot(missed, np.full(len(missed), axes.get_ylim()[0]), "|", color="#d55e00", ms=5, label="misses a margin")
+    axes.legend(frameon=False, fontsize=9)
+    axes.spines[["top", "right"]].set_visible(False)

@@ -1,0 +1,81 @@
+"""Independent work, spread over the cores of this machine or over a Dask cluster, in as many pieces as there are hands.
+
+The pieces are calls of one function with plain arguments; results come as they are done. Each process keeps to one
+thread, so that as many processes as cores don't get into each other's way.
+"""
+
+import multiprocessing
+import os
+from collections.abc import Callable, Iterable, Iterator
+from concurrent.futures import FIRST_COMPLETED, Executor, Future, ProcessPoolExecutor, wait
+from contextlib import contextmanager
+from typing import Any, TypeVar, cast
+
+from pkxyz_ctrl.config import ConfigError
+
+Item = TypeVar("Item")
+Result = TypeVar("Result")
+
+_THREADS = ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS", "NUMBA_NUM_THREADS")
+
+
+def cores() -> int:
+    """Cores that this process may use."""
+    return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
+
+
+@contextmanager
+def hands(workers: int, scheduler: str | None = None) -> Iterator[tuple[Executor, int]]:
+    """An executor and how many pieces it can work at: processes here, or the threads of a Dask cluster whose scheduler
+    has the address. Raises ``ConfigError`` for a scheduler that doesn't answer or has no workers.
+    """
+    if scheduler is None:
+        before = {name: os.environ.get(name) for name in _THREADS}
+        os.environ.update(dict.fromkeys(_THREADS, "1"))  # read by the libraries when a process starts
+        try:
+            with ProcessPoolExecutor(workers, multiprocessing.get_context("spawn")) as pool:
+                yield pool, workers
+        finally:
+            for name, value in before.items():
+                os.environ.pop(name) if value is None else os.environ.update({name: value})
+        return
+    try:
+        from distributed import Client as Connect
+    except ImportError:
+        raise ConfigError("--dask needs the package 'distributed'; install this one with its extra [cluster]") from None
+    try:
+        client: Any = cast(Any, Connect)(scheduler, timeout="10s", set_as_default=False)
+    except (OSError, ValueError) as error:
+        raise ConfigError(f"--dask: no scheduler answers at {scheduler}: {error}") from None
+    with client:
+        threads = sum(client.nthreads().values())
+        if threads == 0:
+            raise ConfigError(f"--dask: the scheduler at {scheduler} has no workers; start some with 'dask worker'")
+        yield client.get_executor(pure=False), threads
+
+
+def as_done(
+    pool: Executor, width: int, function: Callable[[Item], Result], items: Iterable[Item]
+) -> Iterator[tuple[Item, Result]]:
+    """(item, function(item)) in the order in which they are done. Items are taken from their iterator as hands get
+    free, so an iterator may look at the results so far. What a call raises is raised here.
+    """
+    waiting: dict[Future[Result], Item] = {}
+    source, more = iter(items), True
+    try:
+        while waiting or more:
+            while more and len(waiting) < width:
+                try:
+                    item = next(source)
+                except StopIteration:
+                    more = False
+                    break
+                waiting[pool.submit(function, item)] = item
+            if not waiting:
+                return
+            done, _ = wait(waiting, return_when=FIRST_COMPLETED)
+            for future in sorted(done, key=lambda f: list(waiting).index(f)):
+                yield waiting.pop(future), future.result()
+    finally:
+        for future in waiting:
+            future.cancel()
