@@ -76,7 +76,8 @@ def run_jobs(jobs: list[Job], end_s: float, workers: int) -> Iterator[tuple[Job,
 
     Shuffled, so that if the time is not enough, what was tried stands for the rest.
     """
-    preload(sorted({file for job in jobs for file in subject_of(job.module).files}))
+    if jobs:
+        preload(sorted({file for job in jobs for file in subject_of(job.module).files}))
     left = len(jobs)
     for module in dict.fromkeys(job.module for job in jobs):
         own = [job.mutant for job in jobs if job.module == module]
@@ -120,7 +121,7 @@ def _name(job: Job) -> str:
 
 
 def _name_with_tests(job: Job) -> str:
-    helpers = [path for path in TESTS.glob("*.py") if not path.name.startswith("test_")]
+    helpers = [path for path in TESTS.glob("*.py") if not path.name.startswith(("test_", "mut"))]
     return f"{_name(job)} {_digest(*sorted(helpers), *(TESTS / name for name in subject_of(job.module).files))}"
 
 
