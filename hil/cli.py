@@ -15,11 +15,13 @@ from rich.table import Table
 from hil import (
     bench_cli,
     check_amplifier_cli,
+    faults_cli,
     latency_cli,
     margins_cli,
     mechanics_cli,
     replay_cli,
     run_cli,
+    soak_cli,
     tune_cli,
 )
 from pkxyz_ctrl.config import CONFIG_DIR, ConfigError, names
@@ -95,13 +97,19 @@ def sil(
     plant: Annotated[str | None, typer.Option(help="Name or file, instead of the scenario's.")] = None,
     controller: Annotated[str | None, typer.Option(help="Name or file, instead of the scenario's.")] = None,
     bus: Annotated[str | None, typer.Option(help="Name or file, instead of the scenario's.")] = None,
+    fault: Annotated[
+        list[str] | None,
+        typer.Option(metavar="TARGET:KIND@S[+S][,NAME=VALUE]", help="Such as sense.2:stuck@0.3+0.05; may be repeated."),
+    ] = None,
     as_json: Annotated[bool, typer.Option("--json", help="Print the summary as JSON, and nothing else.")] = False,
 ) -> None:
     """Close the loop on a scenario; exit code 0 if its checks hold, 1 if not, 2 for bad input, 130 if interrupted."""
     _say_if_compiling(quiet=as_json)
+    from hil.faults.fault import parse
     from hil.scenario import load_scenario
 
-    loaded = load_scenario(scenario, seed=seed, stage=stage, plant=plant, controller=controller, bus=bus)
+    faults = [parse(text) for text in fault or ()]
+    loaded = load_scenario(scenario, seed=seed, stage=stage, plant=plant, controller=controller, bus=bus, faults=faults)
     from hil.recording import RecordingError
     from hil.run_folder import RunFolder, next_free
     from hil.sil import draw, require_bus
@@ -151,6 +159,8 @@ app.command("design")(mechanics_cli.design)
 app.command("linearisation")(mechanics_cli.linearisation)
 app.command("check-amplifier")(check_amplifier_cli.check_amplifier)
 app.command("bench")(bench_cli.bench)
+app.command("faults")(faults_cli.faults)
+app.command("soak")(soak_cli.soak)
 
 
 def _run_with_progress(folder: Any, scenario: Any, lane: str, *, quiet: bool) -> dict[str, Any]:

@@ -13,9 +13,11 @@ from numpy.typing import NDArray
 from hil.blocks import BLOCK_TICKS, Blocks
 from hil.clock import Lockstep
 from hil.endpoint import Endpoint
+from hil.faults.clock import ControllerKilledError
+from hil.faults.injection import Injection, plant_of
 from hil.frame_log import FrameLog
 from hil.node import AmplifierNode
-from hil.plant_on_bus import EXCHANGE, PlantOnBus
+from hil.plant_on_bus import EXCHANGE
 from hil.setup import Setup
 from hil.truth import TRUTH_BYTES
 from hil.wire import Wire
@@ -25,7 +27,7 @@ from pkxyz_ctrl.can.frame import Frame
 from pkxyz_ctrl.config import CONFIG_DIR, ConfigError
 from pkxyz_ctrl.controller import Controller
 from pkxyz_ctrl.row import ROW
-from pkxyz_ctrl.runtime import Port, run, start
+from pkxyz_ctrl.runtime import Clock, Port, run, start
 
 
 class WirePort:
@@ -49,6 +51,25 @@ class WirePort:
             self.send = send_late
 
 
+class _Draining:
+    """A clock for plain PDOs, which carry no counter: what came after a tick had given up is taken before the next
+    SYNC, or every later sense frame would be taken a tick too late.
+    """
+
+    def __init__(self, clock: Clock, endpoint: Endpoint, controller: Controller) -> None:
+        self._clock, self._endpoint, self._controller = clock, endpoint, controller
+        self.spend = clock.spend
+
+    @property
+    def now_us(self) -> int:
+        return self._clock.now_us
+
+    def wait_until(self, t_us: int) -> None:
+        self._clock.wait_until(t_us)
+        while (late := self._endpoint.receive_nowait()) is not None:
+            self._controller.receive(late[0], self._clock.now_us)
+
+
 class LockstepRig:
     """Everything between controller and plant, wired up for one run."""
 
@@ -61,7 +82,7 @@ class LockstepRig:
         self.setup = setup
         self.clock = Lockstep()
         self.wire = Wire(self.clock, can.nominal_bitrate_bit_per_s, can.data_bitrate_bit_per_s, setup.seed)
-        self.plant = PlantOnBus(setup.new_plant())
+        self.plant = plant_of(setup)
         amplifier = self.wire.attach("amplifier")
         self.node = AmplifierNode(
             can.driver.node_id, self.clock, amplifier.send, self.plant, CONFIG_DIR / "comb_amplifier.eds",
@@ -69,20 +90,35 @@ class LockstepRig:
         )  # fmt: skip
         amplifier.on_frame = self.node.on_frame
         latency_us = (setup.bus.delay_periods - 1) * setup.bus.period_us
-        self.port: Port = WirePort(self.wire.attach("controller"), self.clock, latency_us)
+        self._endpoint = self.wire.attach("controller")
+        self.port: Port = WirePort(self._endpoint, self.clock, latency_us)
         self.controller = Controller(setup.law, setup.bus, setup.gate, self.port.send)
+        self.injection = Injection(self) if setup.faults or setup.clear_s is not None else None
         self.log = FrameLog(frame_log, can.channel) if frame_log is not None else None
         if self.log is not None:
             self.log.attach(self.wire)
 
     def run(self, blocks: Blocks) -> tuple[int, float]:
         """Start the amplifier and run all ticks; returns how many were missed, and the bus load since the first."""
+        injection = self.injection
+        if injection is not None:
+            injection.before_power_on()
         self.node.power_on()
         start(self.clock, self.port, self.controller)
         before = self.wire.statistics()
         reference, record = _exchange_in_blocks(self, blocks)
+        missed = 0
         try:
-            missed = run(self.clock, self.port, self.controller, reference, blocks.ticks, record)
+            clock: Clock = self.clock
+            taking: Callable[[int], object] = record
+            if injection is not None:
+                clock, taking = injection.arm(), injection.clearing(record)
+            if not self.controller.can.driver.protection:
+                clock = _Draining(clock, self._endpoint, self.controller)
+            missed = run(clock, self.port, self.controller, reference, blocks.ticks, taking)
+        except ControllerKilledError:
+            assert injection is not None
+            injection.outlive(blocks.ticks)
         finally:
             record.finish()
             if self.log is not None:

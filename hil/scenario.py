@@ -5,12 +5,14 @@
 """
 
 import difflib
+from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, Self
 
 from pydantic import BaseModel, Field, field_validator, model_validator
 
+from hil.faults.fault import Fault
 from hil.metrics import METRICS
 from pkxyz_ctrl import config
 from pkxyz_ctrl.bus_config import BusConfig
@@ -59,6 +61,10 @@ class ScenarioConfig(FrozenModel):
     bus: Text
     reference: Annotated[tuple[Segment, ...], Field(min_length=1)]
     """starts when the controller starts to track"""
+    faults: tuple[Fault, ...] = ()
+    """what goes wrong, at times after the first tick"""
+    clear_s: Annotated[float, Field(gt=0)] | None = None
+    """how long after a fault decision somebody clears the fault; absent: nobody does"""
     checks: dict[str, Bound] = Field(default_factory=dict)
 
     @field_validator("checks", mode="after")
@@ -91,7 +97,7 @@ class Scenario:
 
         return Setup(
             self.stage, self.device, self.plant, self.controller, self.bus, self.trajectory,
-            self.config.duration_s, self.config.seed,
+            self.config.duration_s, self.config.seed, faults=self.config.faults, clear_s=self.config.clear_s,
         )  # fmt: skip
 
 
@@ -103,8 +109,10 @@ def load_scenario(
     plant: str | None = None,
     controller: str | None = None,
     bus: str | None = None,
+    faults: Sequence[Fault] = (),
 ) -> Scenario:
     """Read a scenario and all that it names, with what the caller wants otherwise (paths from the working folder).
+    ``faults`` come on top of the scenario's own.
 
     Raises ``ConfigError`` with one line for each thing that is wrong, over all the files; ``TrajectoryError``, which is
     one, for a reference that the stage can't follow.
@@ -113,6 +121,7 @@ def load_scenario(
     wanted = {"seed": seed, "stage": stage, "plant": plant, "controller": controller, "bus": bus}
     given = {key: value for key, value in wanted.items() if value is not None}
     scenario = config.parse({**config.read_toml(source), **given}, ScenarioConfig, str(source))
+    scenario = scenario.model_copy(update={"faults": (*scenario.faults, *faults)})
     parts: dict[str, Any] = {}
     models: dict[str, tuple[str, str, type[BaseModel]]] = {
         "stage": ("stages", scenario.stage, StageConfig),

@@ -7,6 +7,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from hil.excitation import Excitation
+from hil.faults.fault import Fault
 from pkxyz_ctrl.bus_config import BusConfig
 from pkxyz_ctrl.config import load
 from pkxyz_ctrl.controller_config import ControllerConfig
@@ -35,6 +36,10 @@ class Setup:
     seed: int
     excitation: Excitation | None = None
     """added to what the controller measures while it tracks"""
+    faults: tuple[Fault, ...] = ()
+    """what goes wrong; lockstep lane only"""
+    clear_s: float | None = None
+    """how long after a fault decision somebody clears the fault; None: nobody does"""
 
     @property
     def ticks(self) -> int:

@@ -58,6 +58,8 @@ def require_bus(scenario: Scenario, lane: str) -> None:
             f"bus {scenario.bus.name!r} has no [can] and carries no frames, which the lockstep lane needs; "
             "use --lane fast or another --bus"
         )
+    if lane != "lockstep" and (scenario.config.faults or scenario.config.clear_s is not None):
+        raise ConfigError(f"the {lane} lane has no frames and nobody in whom something could fail; use --lane lockstep")
 
 
 def draw(folder: RunFolder, summary: dict[str, Any]) -> None:

@@ -97,7 +97,7 @@ STATES: list[tuple[str, Changes, Trip]] = [
     *(
         ("unexplained_force_count", {"unexplained_force_n": beyond(comb, value)}, Trip(Trip.COMB_FORCE_1 << comb))
         for comb in range(3)
-        for value in (0.401e-3, -0.401e-3, math.nan, math.inf)
+        for value in (0.801e-3, -0.801e-3, math.nan, math.inf)
     ),
     ("saturation_count", {"saturated": 1}, Trip.SATURATION),
     ("solver_count", {"solver_ok": 0}, Trip.SOLVER),
@@ -201,7 +201,7 @@ def test_boundaries_themselves_are_permitted() -> None:
         "stroke_m": [limits["stroke_min_m"][0], limits["stroke_max_m"][0], 0.0],
         "sense_count": [-32767, 32766, 0],
         "innovation_m": [0.5e-6, -0.5e-6, 0.0],
-        "unexplained_force_n": [0.4e-3, -0.4e-3, 0.0],
+        "unexplained_force_n": [0.8e-3, -0.8e-3, 0.0],
         "voltage_step_v": [10.0, -10.0, 0.0],
     }
     assert Bench(limits=limits).tick(edge) == 0
@@ -271,15 +271,23 @@ def test_unknown_mode_owes_nothing(mode: int) -> None:
 def test_a_stroke_is_implausible_from_just_beyond_the_limit() -> None:
     limits = default_limits()
     limit = float(limits["residual_max_m"][0])
-    assert limit == 0.5e-6
+    assert limit == 0.7e-6
     for comb in range(3):
         for value in (math.nextafter(limit, 1.0), -math.nextafter(limit, 1.0), math.nan, math.inf, -math.inf):
             assert implausible_combs(limits[0], np.array(beyond(comb, value))) == 1 << comb
     assert implausible_combs(limits[0], np.array([limit, -limit, 0.0])) == 0
     assert implausible_combs(limits[0], np.array([1.0, math.nan, -1.0])) == 0b111
-    assert (
-        implausible_combs(np.zeros(1, LIMITS)[0], np.full(3, 1e-12)) == 0b111
-    )  # a limit never filled in believes nothing
+
+
+def test_a_comb_that_is_only_dragged_along_is_not_named() -> None:
+    limits = default_limits()[0]
+    assert implausible_combs(limits, np.array([9e-6, -2.9e-6, 1.1e-6])) == 0b001
+    assert implausible_combs(limits, np.array([9e-6, -3.0e-6, 3.1e-6])) == 0b111
+    assert implausible_combs(limits, np.array([-1.2e-6, 0.9e-6, 3.5e-6])) == 0b101
+
+
+def test_a_residual_limit_that_was_never_filled_in_believes_nothing() -> None:
+    assert implausible_combs(np.zeros(1, LIMITS)[0], np.full(3, 1e-12)) == 0b111
 
 
 @pytest.mark.parametrize("comb", [0, 1, 2])

@@ -225,7 +225,7 @@ def test_default_limits_of_the_monitors() -> None:
         "unexplained_force_count": 5,
     }  # fmt: skip
     assert limits["safe_cycles"] == 10
-    assert (limits["residual_max_m"], limits["unexplained_force_max_n"]) == (0.5e-6, 0.4e-3)
+    assert (limits["residual_max_m"], limits["unexplained_force_max_n"]) == (0.7e-6, 0.8e-3)
     assert (limits["stroke_min_m"], limits["stroke_max_m"], limits["voltage_step_max_v"]) == (-2e-6, 27e-6, 10.0)
     assert (limits["sense_count_min"], limits["sense_count_max"]) == (-32768, 32767)
     assert list(limits["innovation_max_m"]) == [0.5e-6] * 3

@@ -120,8 +120,9 @@ def default_limits() -> NDArray[np.void]:
     """(1,) of LIMITS, for a 25 um stage at 5 kHz with 2 nm rms of sense noise.
 
     The innovation is a few nm when all is well, up to 450 nm where a fast circle begins on the harsh plant, and the
-    shock of a snap is micrometres, hence 500 nm, for strokes as well as for axes. A disturbance of 0.2 mN is what ten
-    per cent of error in combs and springs amounts to in mid-workspace, a comb that fails there 1 mN. Identical counts
+    shock of a snap is micrometres, hence 500 nm for an axis in five ticks and 700 nm for a stroke. A disturbance of
+    0.2 mN is what ten per cent of error in combs and springs amounts to in mid-workspace, a comb that fails there 1 mN;
+    both are twice that at the end of the stroke. Identical counts
     for 50 ticks do not happen while noise spans several counts (0.2^50). 250 ticks at a bound are 50 ms, longer than
     any move across the workspace takes.
     """
@@ -129,8 +130,8 @@ def default_limits() -> NDArray[np.void]:
     limits["stroke_min_m"] = -2e-6
     limits["stroke_max_m"] = 27e-6
     limits["innovation_max_m"] = 0.5e-6
-    limits["residual_max_m"] = 0.5e-6
-    limits["unexplained_force_max_n"] = 0.4e-3
+    limits["residual_max_m"] = 0.7e-6
+    limits["unexplained_force_max_n"] = 0.8e-3
     limits["voltage_step_max_v"] = 10.0
     limits["sense_count_min"] = -32768
     limits["sense_count_max"] = 32767
@@ -233,11 +234,14 @@ def _clear_loop(memory: np.void) -> None:
 def implausible_combs(limits: np.void, residual_m: NDArray[np.float64]) -> int:
     """Combs whose measured stroke is further from the expected one than plausible, bit 0 for comb 1.
 
-    ``residual_m`` (3,): measured less expected strokes. While any bit is set the measurement is not to be used.
+    ``residual_m`` (3,): measured less expected strokes. While any bit is set the measurement is not to be used. Combs
+    that are less than a third as far off as the worst one are only dragged along by it, and not named.
     """
     combs: int = 0
+    widest = max(abs(residual_m[0]), abs(residual_m[1]), abs(residual_m[2]))
     for i in range(3):
-        if not abs(residual_m[i]) <= limits["residual_max_m"]:  # NaN counts as beyond
+        beyond = not abs(residual_m[i]) <= limits["residual_max_m"]  # NaN counts as beyond
+        if beyond and not abs(residual_m[i]) < widest / 3.0:
             combs |= 1 << i
     return combs
 

@@ -1,0 +1,90 @@
+"""Draws the matrix of faults, and fills in the tables of docs/faults.md. The matrix takes a minute or two.
+
+    python docs/figures/faults.py [SOAK.JSON]
+
+The soak's line is written only where the result of ``pkxyz soak --out`` is given: it takes ten minutes.
+"""
+
+import json
+import re
+import sys
+from pathlib import Path
+
+from hil.faults.catalogue import KINDS, PARTS
+from hil.faults.matrix import CASES
+from hil.faults.outcome import Outcome
+from hil.faults.picture import draw
+from hil.faults_cli import run_matrix
+from pkxyz_ctrl.config import names
+
+HERE = Path(__file__).parent
+PAGE = HERE.parent / "faults.md"
+
+
+def kinds() -> str:
+    """The catalogue as a table."""
+    rows = ["| target | kind | what it does | parameters |", "| --- | --- | --- | --- |"]
+    for family, its in KINDS.items():
+        target = f"{family}.{'/'.join(PARTS[family])}" if family in ("sense", "amplifier") else family
+        if family == "bus":
+            target = f"bus, bus.{'/'.join(PARTS[family])}"
+        for name, kind in its.items():
+            parameters = ", ".join(
+                f"{key} = {p.default:g} ({p.low:g} to {p.high:g}; {p.meaning})" for key, p in kind.parameters.items()
+            )
+            rows.append(f"| {target} | {name} | {kind.meaning} | {parameters} |")
+    return "\n".join(rows)
+
+
+def matrix(outcomes: list[Outcome]) -> str:
+    """What came of each fault under the default law."""
+    rows = [
+        "| fault | ticks | latched | 0 V after, ms | peak V | V in a tick | off by, um | |",
+        "| --- | --- | --- | --- | --- | --- | --- | --- |",
+    ]
+    for outcome, case in zip(outcomes, CASES, strict=True):
+        ticks = "-" if outcome.ticks is None else str(outcome.ticks)
+        zero = "-" if outcome.zero_ms is None else f"{outcome.zero_ms:.1f}"
+        rows.append(
+            f"| {outcome.case} | {ticks} | {', '.join(outcome.reason)} | {zero} | {outcome.voltage_max_v:.0f} "
+            f"| {outcome.slew_max_v:.1f} | {outcome.excursion_um:.2f} | {'; '.join(outcome.problems) or case.note} |"
+        )
+    return "\n".join(rows)
+
+
+def soaked(path: Path) -> str:
+    """The result of a soak in a sentence."""
+    s = json.loads(path.read_text(encoding="utf-8"))
+    reasons = ", ".join(f"{name} {count}" for name, count in list(s["reasons"].items())[:6])
+    return (
+        f"Measured (seed {s['seed']}, law {s['law']}): {s['ticks']} ticks at {s['realtime_factor']:.1f} times real "
+        f"time, {s['recorded_ticks']} of them read back; {s['faults']} faults, {s['decisions']} decisions, "
+        f"{s['returns']} times back to tracking; memory {s['memory_mb'][1]:.0f} MB after two minutes and "
+        f"{s['memory_mb'][-1]:.0f} MB at the end; damaged: {'yes' if s['damaged'] else 'no'}. The most frequent "
+        f"reasons: {reasons}."
+    )
+
+
+def filled_in(page: str, part: str, text: str) -> str:
+    """``page`` with one generated part."""
+    pattern = rf"(<!-- generated: {part} -->\n).*?(<!-- end -->)"
+    return re.sub(pattern, lambda match: f"{match[1]}{text}\n{match[2]}", page, flags=re.DOTALL)
+
+
+def main() -> None:
+    laws = names("controllers")
+    found, refused = run_matrix(laws, list(CASES), 0, quiet=False)
+    print("not run:", refused)
+    draw(found, CASES, HERE / "faults.png")
+    page = filled_in(PAGE.read_text(encoding="utf-8"), "kinds", kinds())
+    page = filled_in(page, "matrix", matrix([o for o in found if o.law == "lqg"]))
+    if len(sys.argv) > 1:
+        page = filled_in(page, "soak", soaked(Path(sys.argv[1])))
+    PAGE.write_text(page, encoding="utf-8")
+    for outcome in found:
+        if not outcome.ok:
+            print(outcome.law, outcome.case, "; ".join(outcome.problems))
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,49 @@
+"""Faults of the controller's own time: ticks that begin late, ticks that are lost, and the end of the program."""
+
+from collections.abc import Sequence
+
+from hil.clock import Lockstep
+from hil.faults.fault import Fault
+
+
+class ControllerKilledError(Exception):
+    """The controller's program has ended, as far as everybody else can tell."""
+
+
+class FaultyClock:
+    """``runtime.Clock`` over the scheduler's, which wakes the controller when the faults let it."""
+
+    def __init__(self, clock: Lockstep, faults: Sequence[Fault], origin_us: int, period_us: int) -> None:
+        self._clock = clock
+        self._period_us = period_us
+        self._faults = sorted((f for f in faults if f.family == "controller"), key=lambda f: f.at_us, reverse=True)
+        self._origin_us = origin_us
+        self._done: set[int] = set()
+        self.spend = clock.spend
+
+    @property
+    def now_us(self) -> int:
+        """As the clock below has it."""
+        return self._clock.now_us
+
+    def _due(self) -> list[Fault]:
+        """Those that are on; what is over is forgotten."""
+        now_us = self._clock.now_us - self._origin_us
+        if not self._faults or self._faults[-1].at_us > now_us:
+            return []
+        for fault in [f for f in self._faults if f.end_us is not None and f.end_us <= now_us]:
+            self._faults.remove(fault)
+        return [f for f in self._faults if f.is_on(now_us)]
+
+    def wait_until(self, t_us: int) -> None:
+        """Return at ``t_us``, or later; raises ``ControllerKilledError`` if there is nobody any more to return to."""
+        clock = self._clock
+        clock.wait_until(t_us)
+        for fault in self._due():
+            if fault.kind == "killed":
+                raise ControllerKilledError
+            if fault.kind == "late_tick":
+                clock.wait_until(clock.now_us + round(fault["late_us"]))
+            elif id(fault) not in self._done:
+                self._done.add(id(fault))
+                clock.wait_until(clock.now_us + round(fault["ticks"]) * self._period_us)

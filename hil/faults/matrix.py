@@ -1,0 +1,112 @@
+"""Every kind of fault once, with what has to come of it: who notices, how soon, and what the combs do meanwhile.
+
+Times in a case count from the first tick; the scan has been at mid-workspace for 60 ms by then. A fault that nobody can
+notice from inside says why, and is held to what is safe.
+"""
+
+from typing import Final, NamedTuple
+
+from hil.faults.fault import Fault, parse
+from pkxyz_ctrl.safety.trips import Trip
+
+ONSET_S: Final = 0.22
+LASTS_S: Final = 0.02
+CLEAR_S: Final = 0.05
+"""How long after the fault decision somebody clears it: the fault itself is over by then."""
+
+DEFAULT_WITHIN_TICKS: Final = 5
+
+
+class Case(NamedTuple):
+    """A fault and what it has to lead to."""
+
+    text: str
+    """as for ``parse``, without its time"""
+    reasons: Trip
+    """one of these has to be among those latched; none: it can't be noticed"""
+    within_ticks: int = DEFAULT_WITHIN_TICKS
+    note: str = ""
+    """why later than the default, or not at all"""
+    obeys: tuple[bool, bool, bool] = (True, True, True)
+    """which combs still do what the node tells them"""
+    discharged_within_ms: float | None = None
+    """where 0 V can't be sent: how soon the node goes there by itself; None: by the controller, within two ticks"""
+    may_go_on: bool = False
+    """not noticing it is as good, since it does no harm"""
+    lasts_s: float = LASTS_S
+
+    @property
+    def fault(self) -> Fault:
+        """At its time."""
+        head, comma, rest = self.text.partition(",")
+        return parse(f"{head}@{ONSET_S}+{self.lasts_s}{comma}{rest}")
+
+
+_STALE = Trip.SENSE_STALE
+_MISFIT = Trip.COMB_MISFIT_1 | Trip.COMB_MISFIT_2 | Trip.COMB_MISFIT_3
+_FORCE = Trip.COMB_FORCE_1 | Trip.COMB_FORCE_2 | Trip.COMB_FORCE_3
+_MOVED = Trip.INNOVATION_X | Trip.INNOVATION_Y | Trip.INNOVATION_Z
+_SMALL = "smaller than what tells a fault from an imperfect device; the stage is as far off as the sensor"
+_SLOWLY = "acts only as the scan moves on; noticed as a force that the comb lacks"
+_ENOUGH = "slow, and still fast enough for this scan"
+_ONE_MORE = "one more period of delay, which the loop bears; noticed by the node as it ends"
+_FIVE_SYNCS = "the node bears five SYNCs without a drive frame"
+_TEN_FRAMES = "good samples arrive all the while; ten odd frames are a fault"
+_CHANNEL_1 = Trip.COMB_FORCE_1 | Trip.COMB_MISFIT_1
+_NODE = Trip.HEARTBEAT_LOST | Trip.NODE_EMERGENCY | Trip.NODE_NOT_OPERATIONAL
+NOTHING: Final = Trip(0)
+HEARTBEAT_MS: Final = 51.0
+"""The node's consumer of our heartbeat, and the look a millisecond later."""
+
+CASES: Final[tuple[Case, ...]] = (
+    Case("sense.1:off", Trip.SENSE_RANGE_1 | Trip.COMB_MISFIT_1),
+    Case("sense.2:stuck", Trip.SENSE_FROZEN_2 | _MISFIT | _FORCE, 50, "50 equal counts, or sooner where it matters"),
+    Case("sense.3:garbage", Trip.SENSE_RANGE_3 | Trip.COMB_MISFIT_3),
+    Case("sense.1:wrong_gain", Trip.COMB_MISFIT_1),
+    Case("sense.2:wrong_gain,gain=1.02", NOTHING, note=_SMALL, may_go_on=True),
+    Case("sense.3:offset", Trip.COMB_MISFIT_3),
+    Case("sense.1:offset,offset_m=0.2e-6", NOTHING, note=_SMALL, may_go_on=True),
+    Case(
+        "sense.2:slow",
+        _MISFIT | _FORCE | _MOVED,
+        150,
+        "no sample is wrong by itself; the loop over it swings",
+        lasts_s=0.04,
+    ),
+    Case("sense.3:delayed", _MISFIT | _FORCE | _MOVED, 50, "a delay shows as the scan moves on", may_go_on=True),
+    Case("sense.1:intermittent", Trip.SENSE_RANGE_1 | Trip.COMB_MISFIT_1, 8, "three bad samples, good ones between"),
+    Case("sense.2:noise_burst", Trip.COMB_MISFIT_2 | Trip.SENSE_RANGE_2, 8, "three samples that cannot be"),
+    Case("amplifier.1:stuck", _CHANNEL_1, 250, _SLOWLY, (False, True, True), lasts_s=0.05),
+    Case("amplifier.2:dead", Trip.COMB_FORCE_2 | Trip.COMB_MISFIT_2),
+    Case("amplifier.3:offset", Trip.COMB_FORCE_3 | Trip.COMB_MISFIT_3, obeys=(True, True, False)),
+    Case("amplifier.1:slew_collapse", _CHANNEL_1, 150, _ENOUGH, (False, True, True), may_go_on=True),
+    Case("amplifier.2:trip", Trip.NODE_EMERGENCY, 2),
+    Case("amplifier.3:saturated", Trip.COMB_FORCE_3 | Trip.COMB_MISFIT_3, obeys=(True, True, False)),
+    Case("node:silent", _STALE),
+    Case("node:reset", _STALE | Trip.NODE_REBOOTED),
+    Case("node:reboot_loop", _STALE | Trip.NODE_REBOOTED),
+    Case("node:wrong_identity", _STALE | Trip.NODE_REBOOTED),
+    Case("node:wrong_configuration", _STALE | Trip.SENSE_SEQUENCE),
+    Case("bus:drop", _STALE, discharged_within_ms=HEARTBEAT_MS),
+    Case("bus.sense:drop", _STALE),
+    Case("bus.drive:drop", Trip.NODE_EMERGENCY, 8, _FIVE_SYNCS, discharged_within_ms=2.0),
+    Case("bus.sync:drop", _STALE, discharged_within_ms=HEARTBEAT_MS),
+    Case("bus.heartbeat:drop", _NODE, 260, "the heartbeat's time is 50 ms", lasts_s=0.06),
+    Case("bus.sense:duplicate", Trip.SENSE_SEQUENCE | _STALE, 12, _TEN_FRAMES),
+    Case("bus.drive:duplicate", Trip.NODE_EMERGENCY, 2),
+    Case("bus.sense:reorder", Trip.SENSE_SEQUENCE | _STALE, 12, _TEN_FRAMES),
+    Case("bus.sense:corrupt", Trip.SENSE_CRC | _STALE),
+    Case("bus.drive:corrupt", Trip.NODE_EMERGENCY, 2, discharged_within_ms=1.2),
+    Case("bus.sense:delay", _STALE),
+    Case("bus.drive:delay", Trip.NODE_EMERGENCY, 110, _ONE_MORE, discharged_within_ms=0.6, may_go_on=True),
+    Case("bus.sense:error_frames", _STALE, discharged_within_ms=HEARTBEAT_MS),
+    Case("bus:error_frames", _STALE, discharged_within_ms=HEARTBEAT_MS),
+    Case("bus:babbling", _STALE, discharged_within_ms=HEARTBEAT_MS),
+    Case("controller:late_tick,late_us=30", NOTHING, note="within what the bus has to spare", may_go_on=True),
+    Case("controller:late_tick,late_us=90", _STALE | Trip.OVERRUN, note="answers come after the deadline"),
+    Case("controller:lost_tick", Trip.OVERRUN | _STALE),
+    Case("controller:killed", NOTHING, note="nobody is left to notice; the node is", discharged_within_ms=HEARTBEAT_MS),
+    Case("plant:stiffness", _MISFIT | _FORCE | _MOVED),
+    Case("plant:snap", _MOVED | _MISFIT),
+    Case("plant:shock", _MOVED | _MISFIT),
+)

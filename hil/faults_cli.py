@@ -1,0 +1,158 @@
+"""``pkxyz faults``: everything that can go wrong, against every law."""
+
+import json
+from collections.abc import Callable
+from concurrent.futures import ProcessPoolExecutor, as_completed
+from multiprocessing import get_context
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated
+
+import typer
+from rich.console import Console
+from rich.table import Table
+
+from pkxyz_ctrl.config import ConfigError, names
+
+if TYPE_CHECKING:
+    from hil.faults.matrix import Case
+    from hil.faults.outcome import Outcome
+
+_screen = Console(highlight=False)
+_notes = Console(stderr=True, highlight=False)
+_CHUNKS = 3  # of the matrix for each law, so that the last process does not run alone for long
+
+
+def faults(
+    law: Annotated[
+        list[str] | None,
+        typer.Option(metavar="NAME", help="A controller's name or file; may be repeated. Default: every shipped one."),
+    ] = None,
+    only: Annotated[
+        list[str] | None,
+        typer.Option(metavar="TEXT", help="Faults whose name holds this, such as sense.2 or stuck; may be repeated."),
+    ] = None,
+    workers: Annotated[int, typer.Option(help="Processes; 0: one for each core.", min=0)] = 0,
+    out: Annotated[Path | None, typer.Option(help="Folder for faults.json and faults.png.")] = None,
+    as_json: Annotated[bool, typer.Option("--json", help="Print JSON, and nothing else.")] = False,
+) -> None:
+    """Break everything once under each law: who notices, after how many ticks, and what the combs did meanwhile.
+
+    Exit code 0 if every bound held, 1 if not, 2 for bad input.
+    """
+    from hil.faults.matrix import CASES
+    from hil.faults.outcome import as_json as plain
+
+    laws = law or names("controllers")
+    cases = [case for case in CASES if not only or any(text in case.text for text in only)]
+    if not cases:
+        raise ConfigError(
+            f"--only: no fault holds {' or '.join(only or [])}; there are {', '.join(c.text for c in CASES)}"
+        )
+    if out is not None:
+        _require_folder(out)
+    outcomes, refused = run_matrix(laws, cases, workers, quiet=as_json)
+    if law and refused:
+        raise ConfigError("\n".join(refused.values()))
+    laws = [name for name in laws if name not in refused]
+    result = {
+        "ok": all(o.ok for o in outcomes), "laws": laws, "refused": refused, "outcomes": [plain(o) for o in outcomes],
+    }  # fmt: skip
+    if out is not None:
+        from hil.faults.picture import draw
+
+        (out / "faults.json").write_text(json.dumps(result, indent=1) + "\n", encoding="utf-8")
+        draw(outcomes, cases, out / "faults.png")
+    if as_json:
+        print(json.dumps(result))
+    else:
+        _show(outcomes, cases, laws)
+        for name, reason in refused.items():
+            _screen.print(f"[dim]not run under {name}: {reason}[/]", soft_wrap=True)
+    raise typer.Exit(0 if result["ok"] else 1)
+
+
+def run_matrix(
+    laws: list[str], cases: "list[Case]", workers: int, *, quiet: bool
+) -> "tuple[list[Outcome], dict[str, str]]":
+    """Every case under every law, over processes, in the order of laws and cases; and the laws that can't be run here,
+    with the reason.
+    """
+    from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn
+
+    size = -(-len(cases) // _CHUNKS)
+    chunks = [(law, first, cases[first : first + size]) for law in laws for first in range(0, len(cases), size)]
+    found: dict[tuple[str, int], list[Outcome]] = {}
+    refused: dict[str, str] = {}
+    columns = (BarColumn(), MofNCompleteColumn(), TextColumn("{task.description}"), TimeRemainingColumn())
+    with Progress(*columns, console=_notes, transient=True, disable=quiet or not _notes.is_terminal) as progress:
+        task = progress.add_task("faults", total=len(laws) * len(cases))
+
+        def done(law: str, first: int, outcomes: "list[Outcome] | str") -> None:
+            if isinstance(outcomes, str):
+                refused[law] = outcomes
+            else:
+                found[law, first] = outcomes
+            progress.update(task, advance=size, description=law)
+
+        if workers == 1:
+            for law, first, some in chunks:
+                done(law, first, _run_chunk(law, some))
+        else:
+            _over_processes(chunks, workers, done)
+    keys = [(law, first) for law, first, _ in chunks if law not in refused]
+    return [outcome for key in keys for outcome in found[key]], refused
+
+
+def _over_processes(
+    chunks: "list[tuple[str, int, list[Case]]]", workers: int, done: "Callable[[str, int, list[Outcome] | str], None]"
+) -> None:
+    with ProcessPoolExecutor(workers or None, mp_context=get_context("spawn")) as pool:
+        waiting = {pool.submit(_run_chunk, law, some): (law, first) for law, first, some in chunks}
+        for future in as_completed(waiting):
+            done(*waiting[future], future.result())
+
+
+def _run_chunk(law: str, cases: "list[Case]") -> "list[Outcome] | str":
+    from hil.faults.outcome import run_case, setup_for
+    from pkxyz_ctrl.design.design_error import DesignError
+
+    try:
+        setup = setup_for(law)
+        assert setup.law is not None  # designed here, so that what refuses does so before anything is broken
+    except (ConfigError, DesignError) as error:
+        return str(error)
+    return [run_case(law, setup, case) for case in cases]
+
+
+def _show(outcomes: "list[Outcome]", cases: "list[Case]", laws: list[str]) -> None:
+    for law in laws:
+        table = Table(box=None, pad_edge=False, header_style="dim")
+        for heading, side in (
+            (law, "left"), ("ticks", "right"), ("latched", "left"), ("peak V", "right"), ("V/tick", "right"),
+            ("0 V ms", "right"), ("off um", "right"), ("", "left"),
+        ):  # fmt: skip
+            table.add_column(heading, justify=side)  # type: ignore[arg-type]
+        for outcome, case in zip((o for o in outcomes if o.law == law), cases, strict=True):
+            verdict = "[green]saved[/]" if outcome.ok else f"[bold red]{'; '.join(outcome.problems)}[/]"
+            reason = ", ".join(outcome.reason) or f"[dim]nothing: {case.note}[/]"
+            table.add_row(
+                outcome.case, _or_dash(outcome.ticks, "d"), reason, f"{outcome.voltage_max_v:.0f}",
+                f"{outcome.slew_max_v:.1f}", _or_dash(outcome.zero_ms, ".1f"), f"{outcome.excursion_um:.2f}", verdict,
+            )  # fmt: skip
+        _screen.print(table)
+    bad = sum(not o.ok for o in outcomes)
+    _screen.print(
+        f"{len(outcomes)} faults, {len(outcomes) - bad} as they have to be"
+        + (f", [bold red]{bad} not[/]" if bad else "")
+    )
+
+
+def _or_dash(value: float | None, form: str) -> str:
+    return "-" if value is None else format(value, form)
+
+
+def _require_folder(out: Path) -> None:
+    try:
+        out.mkdir(parents=True, exist_ok=True)
+    except OSError as error:
+        raise ConfigError(f"--out: {out}: {(error.strerror or str(error)).lower()}; give another folder") from None

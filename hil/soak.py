@@ -1,0 +1,197 @@
+"""A long run in lockstep under random faults: what is left of it, and whether anything was lost, grew or broke.
+
+One rig for the whole time. Its rows go to a recording a minute, which is closed, read again and checked before the
+next; then it is deleted, unless it is to be kept: half an hour is 3 GB.
+"""
+
+import dataclasses
+import random
+import time
+from collections import Counter
+from collections.abc import Callable
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from hil.blocks import Blocks
+from hil.faults.fault import Fault, parse
+from hil.faults.matrix import CASES
+from hil.lockstep import LockstepRig
+from hil.recording import Recording, RecordingWriter
+from hil.scenario import load_scenario
+from pkxyz_ctrl.safety.modes import Mode
+from pkxyz_ctrl.safety.trips import Trip
+
+SCENARIO = "faults"
+CLEAR_S = 0.02
+_GAP_S = (0.15, 0.7)  # between the beginnings of faults: some hit a scan, some a start-up, some a homing
+_LASTS_S = (0.0005, 0.06)
+_QUIET_S = 0.05  # at the end, so that the last one is not cut off
+_DEADLY = ("controller:killed",)  # would end the run
+_ROWS_EACH = 300_000  # of one recording: a minute at 5 kHz
+
+
+@dataclass
+class Soaked:
+    """What came of it."""
+
+    seed: int
+    law: str
+    ticks: int = 0
+    recorded_ticks: int = 0
+    """read back from the recordings, in one unbroken sequence"""
+    interrupted: bool = False
+    """by the keyboard: the figures are those of the time until then"""
+    faults: int = 0
+    decisions: int = 0
+    returns: int = 0
+    """how often it was tracking again after a fault decision"""
+    reasons: dict[str, int] = field(default_factory=dict)
+    voltage_max_v: float = 0.0
+    slew_max_v: float = 0.0
+    """most that a comb's voltage rose in a tick; releases fall at once"""
+    damaged: bool = False
+    """fingers snapped or the mechanism broken"""
+    memory_mb: list[float] = field(default_factory=list)
+    """resident, after each recording"""
+    realtime_factor: float = 0.0
+    problems: list[str] = field(default_factory=list)
+
+    @property
+    def ok(self) -> bool:
+        """Whether nothing was lost, nothing broke and nothing grew."""
+        return not self.problems
+
+
+def random_faults(duration_s: float, seed: int) -> tuple[Fault, ...]:
+    """Faults from power-on to shortly before the end: every kind of the matrix but the end of the controller."""
+    dice = random.Random(seed)
+    texts = [case.text for case in CASES if case.text not in _DEADLY]
+    faults = []
+    at_s = 0.1
+    while at_s < duration_s - _QUIET_S - _LASTS_S[1]:
+        head, comma, rest = dice.choice(texts).partition(",")
+        faults.append(parse(f"{head}@{at_s:.6f}+{dice.uniform(*_LASTS_S):.6f}{comma}{rest}"))
+        at_s += dice.uniform(*_GAP_S)
+    return tuple(faults)
+
+
+def soak(
+    duration_s: float,
+    seed: int,
+    law: str,
+    folder: Path,
+    *,
+    keep: bool = False,
+    rows_each: int = _ROWS_EACH,
+    on_progress: Callable[[int, int], None] = lambda done, total: None,
+) -> Soaked:
+    """Run for ``duration_s`` of stage time, or until Ctrl-C. Raises ``RecordingError`` when the disk fails."""
+    scenario = load_scenario(SCENARIO, controller=law, seed=seed)
+    setup = dataclasses.replace(
+        scenario.setup(), duration_s=duration_s, clear_s=CLEAR_S, faults=random_faults(duration_s, seed)
+    )
+    rig = LockstepRig(setup)
+    soaked = Soaked(seed, law, setup.ticks, faults=len(setup.faults))
+    log = _Log(soaked, rig, folder, rows_each, keep)
+    blocks = Blocks(setup.trajectory, setup.bus.period_us, setup.ticks, log.take, on_progress)
+    begin_s = time.perf_counter()
+    try:
+        rig.run(blocks)
+    except KeyboardInterrupt:
+        soaked.interrupted = True
+        soaked.ticks = blocks.done
+        soaked.faults = sum(f.at_us < blocks.done * setup.bus.period_us for f in setup.faults)
+    log.close()
+    soaked.realtime_factor = blocks.done * setup.bus.period_s / (time.perf_counter() - begin_s)
+    _judge(soaked, setup.controller.limits.voltage_max_v, setup.controller.limits.slew_max_v_per_s * setup.bus.period_s)
+    return soaked
+
+
+class _Log:
+    """Takes the rows: into recordings that are checked one by one, and into the figures."""
+
+    def __init__(self, soaked: Soaked, rig: LockstepRig, folder: Path, rows_each: int, keep: bool) -> None:
+        self._soaked, self._rig, self._folder, self._rows_each, self._keep = soaked, rig, folder, rows_each, keep
+        self._reasons: Counter[str] = Counter()
+        self._writer: RecordingWriter | None = None
+        self._last_mode = int(Mode.IDLE)
+        self._last_v: NDArray[np.float64] = np.zeros(3)
+        self._was_faulted = False
+        self._parts = 0
+
+    def take(self, rows: NDArray[np.void]) -> None:
+        if self._writer is None:
+            self._parts += 1
+            meta = {"scenario": "soak", "part": self._parts, "seed": self._soaked.seed}
+            self._writer = RecordingWriter(self._folder / f"soak-{self._parts:03d}.parquet", meta)
+        self._writer.write(rows)
+        self._observe(rows)
+        if self._writer.ticks >= self._rows_each:
+            self.close()
+
+    def close(self) -> None:
+        """Close the present recording, and read it again."""
+        if self._writer is None:
+            return
+        writer, self._writer = self._writer, None
+        writer.close()
+        recording = Recording.open(writer.path)
+        ticks = recording["tick"]
+        expected = np.arange(self._soaked.recorded_ticks, self._soaked.recorded_ticks + len(ticks))
+        if not np.array_equal(ticks, expected):
+            self._soaked.problems.append(f"{writer.path.name}: its ticks are not {expected[0]} to {expected[-1]}")
+        self._soaked.recorded_ticks += len(ticks)
+        if not self._keep:
+            writer.path.unlink()
+        self._soaked.memory_mb.append(_resident_mb())
+
+    def _observe(self, rows: NDArray[np.void]) -> None:
+        soaked = self._soaked
+        mode = np.concatenate([[self._last_mode], rows["mode"]])
+        entered = np.flatnonzero((mode[1:] == Mode.FAULT) & (mode[:-1] != Mode.FAULT))
+        for row in rows[entered]:
+            self._reasons.update(str(trip.name) for trip in Trip if trip & int(row["trips"]))
+        soaked.decisions += len(entered)
+        soaked.returns += int(np.count_nonzero((mode[1:] == Mode.TRACKING) & (mode[:-1] == Mode.ENABLED)))
+        soaked.reasons = dict(self._reasons.most_common())
+        volts = np.concatenate([[self._last_v], rows["comb_voltage_v"]])
+        soaked.voltage_max_v = max(soaked.voltage_max_v, float(volts.max()))
+        soaked.slew_max_v = max(soaked.slew_max_v, float(np.diff(volts, axis=0).max()))
+        state = self._rig.plant.plant.state[0]
+        soaked.damaged = soaked.damaged or bool(state["broken"] or state["held"].any())
+        self._rig.controller.faults.clear()  # counted; the words of a thousand faults are of no use
+        self._last_mode, self._last_v = int(mode[-1]), volts[-1].copy()
+
+
+def _judge(soaked: Soaked, voltage_max_v: float, step_max_v: float) -> None:
+    problems = soaked.problems
+    if soaked.recorded_ticks != soaked.ticks:
+        problems.append(f"{soaked.recorded_ticks} ticks recorded of {soaked.ticks}")
+    if soaked.damaged:
+        problems.append("the stage is damaged")
+    offsets_v = 31.0  # what an amplifier with an offset of 30 V adds by itself
+    if soaked.voltage_max_v > voltage_max_v + offsets_v:
+        problems.append(f"{soaked.voltage_max_v:.1f} V at a comb")
+    if soaked.slew_max_v > step_max_v + offsets_v:
+        problems.append(f"a comb's voltage rose by {soaked.slew_max_v:.1f} V in a tick")
+    if soaked.decisions == 0 or soaked.returns == 0:
+        problems.append("no fault was decided, or none recovered from")
+    if len(soaked.memory_mb) > 4:
+        early, late = soaked.memory_mb[1], soaked.memory_mb[-1]
+        if late > early + 20.0:
+            problems.append(f"memory grew from {early:.0f} to {late:.0f} MB")
+
+
+def _resident_mb() -> float:
+    """Resident memory of this process, Linux."""
+    pages = int(Path("/proc/self/statm").read_text(encoding="ascii").split()[1])
+    return pages * 4096 / 1e6
+
+
+def as_json(soaked: Soaked) -> dict[str, Any]:
+    """Plain data."""
+    return dataclasses.asdict(soaked) | {"ok": soaked.ok}

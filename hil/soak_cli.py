@@ -1,0 +1,81 @@
+"""``pkxyz soak``: half an hour of stage time under random faults."""
+
+import json
+import shutil
+import tempfile
+from pathlib import Path
+from typing import Annotated
+
+import typer
+from rich.console import Console
+
+from pkxyz_ctrl.config import ConfigError
+
+_screen = Console(highlight=False)
+_notes = Console(stderr=True, highlight=False)
+
+
+def soak(
+    minutes: Annotated[float, typer.Option(help="Of stage time.", min=0.01, max=600)] = 30.0,
+    seed: Annotated[int, typer.Option(help="Of noise and faults.", min=0)] = 1,
+    law: Annotated[str, typer.Option(help="A controller's name or file.")] = "lqg",
+    out: Annotated[Path | None, typer.Option(help="Folder for soak.json and, with --keep, the recordings.")] = None,
+    keep: Annotated[bool, typer.Option("--keep", help="Keep the recordings, 100 MB a minute.")] = False,
+    as_json: Annotated[bool, typer.Option("--json", help="Print JSON, and nothing else.")] = False,
+) -> None:
+    """Run in lockstep under random faults and clears: is anything lost, does anything grow, does anything break?
+
+    Exit code 0 if not, 1 if so, 2 for bad input. Some minutes for half an hour.
+    """
+    from rich.progress import BarColumn, Progress, TextColumn, TimeRemainingColumn
+
+    from hil import soak as soaking
+
+    if keep and out is None:
+        raise ConfigError("--keep: needs --out, the folder to keep the recordings in")
+    folder = _folder(out)
+    columns = (TextColumn("soak"), BarColumn(), TextColumn("{task.percentage:3.0f} %"), TimeRemainingColumn())
+    try:
+        with Progress(*columns, console=_notes, transient=True, disable=as_json or not _notes.is_terminal) as progress:
+            task = progress.add_task("", total=None)
+            soaked = soaking.soak(
+                60.0 * minutes, seed, law, folder, keep=keep,
+                on_progress=lambda done, total: progress.update(task, completed=done, total=total),
+            )  # fmt: skip
+        if out is not None:
+            text = json.dumps(soaking.as_json(soaked), indent=1) + "\n"
+            (out / "soak.json").write_text(text, encoding="utf-8")
+    finally:
+        if out is None:
+            shutil.rmtree(folder, ignore_errors=True)
+    if as_json:
+        print(json.dumps(soaking.as_json(soaked)))
+    else:
+        until = " until interrupted" if soaked.interrupted else ""
+        _screen.print(
+            f"{soaked.ticks} ticks{until}, {soaked.realtime_factor:.1f} times real time; {soaked.faults} faults, "
+            f"{soaked.decisions} decisions, {soaked.returns} times back to tracking",
+            soft_wrap=True,
+        )
+        _screen.print(
+            f"{soaked.recorded_ticks} ticks read back from the recordings; memory {soaked.memory_mb[0]:.0f} to "
+            f"{soaked.memory_mb[-1]:.0f} MB; at most {soaked.voltage_max_v:.1f} V, and {soaked.slew_max_v:.1f} V up "
+            "in a tick",
+            soft_wrap=True,
+        )
+        _screen.print(
+            "reasons: " + ", ".join(f"{name} {count}" for name, count in soaked.reasons.items()), soft_wrap=True
+        )
+        for problem in soaked.problems:
+            _screen.print(f"[bold red]{problem}[/]")
+    raise typer.Exit(130 if soaked.interrupted else 0 if soaked.ok else 1)
+
+
+def _folder(out: Path | None) -> Path:
+    if out is None:
+        return Path(tempfile.mkdtemp(prefix="pkxyz-soak-"))
+    try:
+        out.mkdir(parents=True, exist_ok=True)
+    except OSError as error:
+        raise ConfigError(f"--out: {out}: {(error.strerror or str(error)).lower()}; give another folder") from None
+    return out

@@ -1,0 +1,44 @@
+"""Five seconds of what `pkxyz soak` does for half an hour."""
+
+import numpy as np
+import pytest
+
+from hil.faults.catalogue import KINDS
+from hil.recording import Recording
+from hil.soak import random_faults, soak
+
+
+@pytest.fixture(scope="module")
+def soaked(tmp_path_factory):
+    folder = tmp_path_factory.mktemp("soak")
+    return soak(5.0, 3, "lqg", folder, keep=True, rows_each=8192), folder
+
+
+def test_nothing_is_lost_and_nothing_breaks(soaked):
+    found, folder = soaked
+    assert found.problems == []
+    assert found.ticks == found.recorded_ticks == 25_000
+    assert found.faults >= 8
+    assert found.decisions >= 4
+    assert found.returns >= 4
+    assert sum(found.reasons.values()) >= found.decisions
+    assert 100.0 < found.voltage_max_v < 231.0
+    parts = sorted(folder.glob("*.parquet"))
+    assert len(parts) == len(found.memory_mb) == 4
+    ticks = np.concatenate([Recording.open(part)["tick"] for part in parts])
+    assert np.array_equal(ticks, np.arange(25_000))
+
+
+def test_time_is_that_of_the_ticks_whatever_failed(soaked):
+    _, folder = soaked
+    t_us = np.concatenate([Recording.open(part)["t_us"] for part in sorted(folder.glob("*.parquet"))])
+    assert np.array_equal(np.diff(t_us), np.full(24_999, 200))
+
+
+def test_faults_are_those_of_the_seed_and_of_every_family():
+    faults = random_faults(600.0, 1)
+    assert [str(f) for f in faults] == [str(f) for f in random_faults(600.0, 1)]
+    assert [str(f) for f in faults] != [str(f) for f in random_faults(600.0, 2)]
+    assert {f.family for f in faults} == set(KINDS)
+    assert all(f.end_us is not None and f.end_us < 600e6 for f in faults)
+    assert not any(f.kind == "killed" for f in faults)
