@@ -19,6 +19,7 @@ from hil import (
     latency_cli,
     margins_cli,
     mechanics_cli,
+    montecarlo_cli,
     replay_cli,
     run_cli,
     soak_cli,
@@ -152,6 +153,7 @@ app.command("plant")(run_cli.plant)
 app.command("replay")(replay_cli.replay)
 app.command("latency")(latency_cli.latency)
 app.command("margins")(margins_cli.margins)
+app.command("montecarlo")(montecarlo_cli.montecarlo)
 app.command("tune")(tune_cli.tune)
 app.command("paper")(mechanics_cli.paper)
 app.command("workspace")(mechanics_cli.workspace)

@@ -1,0 +1,216 @@
+"""A law against plants that were drawn from tolerances: one closed-loop run and one Ms each, kept line by line.
+
+Plant n is drawn by seed n, which also seeds its noise, so any of them runs again alone and gives the same bits.
+"""
+
+import json
+import math
+from collections.abc import Callable, Iterator, Sequence
+from dataclasses import dataclass, replace
+from functools import partial
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from hil import lanes
+from hil.loop_margins import Loop
+from hil.metrics import Metrics
+from hil.scenario import Scenario, resolve
+from hil.workers import as_done, hands
+from pkxyz_ctrl import config
+from pkxyz_ctrl.config import ConfigError
+from pkxyz_ctrl.design.loop_plant import Perturbation
+from pkxyz_ctrl.design.tolerances import Tolerances
+from pkxyz_ctrl.stage import Stage
+from sim.config import PlantConfig
+
+FIGURES = {"rms_error_nm": "nm", "hold_noise_nm": "nm", "peak_s": ""}
+"""Figures of a plant that distributions are drawn of, with their units. Of axes, the worst one."""
+
+
+@dataclass(frozen=True)
+class Study:
+    """What is run."""
+
+    scenario: Scenario
+    tolerances: Tolerances
+
+    def digest(self) -> str:
+        """Of all that decides about a result, seed and count apart."""
+        data = resolve(self.scenario)
+        return config.digest({"scenario": data, "tolerances": config.plain(self.tolerances)})
+
+    def drawn(self, seed: int) -> Scenario:
+        """The scenario on the plant of a seed."""
+        case = self.tolerances.draw(seed)
+        return replace(
+            self.scenario,
+            config=self.scenario.config.model_copy(update={"seed": seed}),
+            plant=changed_plant(self.scenario.plant, case.perturbation),
+        )
+
+
+def changed_plant(plant: PlantConfig, change: Perturbation) -> PlantConfig:
+    """The software plant with the perturbation of the linear one, in place of its own errors of these kinds."""
+    data = plant.model_dump()
+    chains = (change.stiffness,) * 3
+    data["stiffness_mismatch"] |= {"on": True, "leaf": chains, "crank_hinge": chains, "link_hinge": chains}
+    data["mass_error"] |= {"on": True, "relative": change.mass}
+    data["comb_mismatch"] |= {"on": True, "relative": change.comb_gain}
+    if change.quality_factor is not None:
+        data["damping"] |= {"on": True, "quality_factor": change.quality_factor}
+    return PlantConfig.model_validate(data)
+
+
+@dataclass(frozen=True)
+class Result:
+    """Of one plant. A figure is None where the run ended in a fault, or where the loop is unstable (peak_s)."""
+
+    seed: int
+    rms_error_nm: float | None
+    hold_noise_nm: float | None
+    peak_s: float | None
+    saturated_ticks: int
+    fault: str | None
+
+    @property
+    def ok(self) -> bool:
+        """Whether the loop held."""
+        return self.fault is None and self.peak_s is not None
+
+
+def run_one(study: Study, seed: int) -> Result:
+    """Run the plant of a seed on the fast lane; its Ms is that of the linear loop at the point that was drawn."""
+    scenario = study.drawn(seed)
+    setup = scenario.setup()
+    metrics = Metrics(setup.trajectory, setup.bus.period_us)
+    result = lanes.run(setup, "fast", on_block=metrics.update)
+    figures = metrics.figures()
+    case = study.tolerances.draw(seed)
+    peak = Loop(Stage(setup.stage), setup.bus, setup.law).peak_sensitivity(case)
+
+    def worst(name: str) -> float | None:
+        values = figures[name]
+        return None if values is None or result.faults else max(values.values())
+
+    return Result(
+        seed,
+        worst("rms_error_nm"),
+        worst("hold_noise_nm"),
+        peak if math.isfinite(peak) else None,
+        int(figures["saturated_ticks"]),
+        result.faults[0] if result.faults else None,
+    )
+
+
+class Results:
+    """The file of results: a line of JSON for each plant, after one that says what study it is."""
+
+    def __init__(self, path: Path, study: Study) -> None:
+        """Read what is there. Raises ``ConfigError`` for another study's file; a line cut off at the end is dropped."""
+        self._path = path
+        self.found: dict[int, Result] = {}
+        head = {"digest": study.digest(), "scenario": study.scenario.config.name, "tolerances": study.tolerances.name}
+        try:
+            lines = path.read_text(encoding="utf-8").splitlines(keepends=True) if path.exists() else []
+            complete = [line for line in lines if line.endswith("\n")]
+            if complete and json.loads(complete[0]).get("digest") != head["digest"]:
+                raise ConfigError(
+                    f"{path}: holds results of another study (a file of it has changed since); give another --out"
+                )
+            for line in complete[1:]:
+                result = Result(**json.loads(line))
+                self.found[result.seed] = result
+            path.write_text("".join(complete) or json.dumps(head) + "\n", encoding="utf-8")
+        except (ValueError, TypeError, AttributeError) as error:
+            if isinstance(error, ConfigError):
+                raise
+            raise ConfigError(f"{path}: is not a file of results: {error}; give another --out") from None
+        except OSError as error:
+            raise ConfigError(f"{path}: {(error.strerror or str(error)).lower()}; give another --out") from None
+
+    def add(self, result: Result) -> None:
+        """Keep a result, at once."""
+        self.found[result.seed] = result
+        with self._path.open("a", encoding="utf-8") as file:
+            file.write(json.dumps(vars(result), allow_nan=False) + "\n")
+
+
+def run_study(
+    study: Study,
+    seeds: Sequence[int],
+    results: Results,
+    workers: int,
+    scheduler: str | None = None,
+    on_progress: Callable[[int, int], None] = lambda done, total: None,
+) -> None:
+    """Run the seeds that have no result yet. Interrupted, it keeps those that are done."""
+    left = [seed for seed in seeds if seed not in results.found]
+    done = len(seeds) - len(left)
+    on_progress(done, len(seeds))
+    if not left:
+        return
+    with hands(workers, scheduler) as (pool, width):
+        for n, (_, result) in enumerate(_all_done(pool, width, study, left), start=1):
+            results.add(result)
+            on_progress(done + n, len(seeds))
+
+
+def _all_done(pool: Any, width: int, study: Study, seeds: list[int]) -> Iterator[tuple[int, Result]]:
+    return as_done(pool, width, partial(run_one, study), seeds)
+
+
+def summary(results: Sequence[Result]) -> dict[str, Any]:
+    """Distributions (median, 95 %, largest), how many loops did not hold, and the worst plant's seed: one that did not
+    hold if there is one, else that with the largest error.
+    """
+    found: dict[str, Any] = {"plants": len(results), "not_held": sum(not r.ok for r in results)}
+    for name in FIGURES:
+        values = np.array([v for r in results if (v := getattr(r, name)) is not None], dtype=np.float64)
+        found[name] = (
+            {
+                "median": float(np.median(values)),
+                "p95": float(np.percentile(values, 95)),
+                "max": float(values.max()),
+                "max_seed": next(r.seed for r in results if getattr(r, name) == values.max()),
+            }
+            if len(values)
+            else None
+        )
+    return found | {"worst_seed": worst(results).seed}
+
+
+def worst(results: Sequence[Result]) -> Result:
+    """The plant to look at first."""
+    return max(results, key=lambda r: (r.fault is not None, r.peak_s is None, r.rms_error_nm or 0.0, -r.seed))
+
+
+def draw(study: Study, results: Sequence[Result], path: Path) -> None:
+    """Histograms of the figures, and the error over the stiffness and the quality factor that were drawn."""
+    from matplotlib.backends.backend_agg import FigureCanvasAgg
+    from matplotlib.figure import Figure
+
+    figure = Figure(figsize=(12.5, 6.4), layout="constrained", dpi=120)
+    FigureCanvasAgg(figure)
+    panels = figure.subplots(2, 3)
+    for axes, (name, unit) in zip(panels[0], FIGURES.items(), strict=True):
+        values = [v for r in results if (v := getattr(r, name)) is not None]
+        axes.hist(values, bins=min(40, max(5, len(values) // 5)), color="#0072b2")
+        axes.set(xlabel=name.replace("_", " ").removesuffix(" nm") + (f" ({unit})" if unit else ""), ylabel="plants")
+    held = [r for r in results if r.rms_error_nm is not None]
+    drawn = [study.tolerances.draw(r.seed) for r in held]
+    errors = [r.rms_error_nm for r in held]
+    for axes, label, values in (
+        (panels[1, 0], "stiffness (%)", [100 * c.perturbation.stiffness for c in drawn]),
+        (panels[1, 1], "quality factor", [c.perturbation.quality_factor for c in drawn]),
+        (panels[1, 2], "spread of the combs (%)", [100 * float(np.ptp(c.perturbation.comb_gain)) for c in drawn]),
+    ):
+        axes.plot(values, errors, ".", ms=4, color="#d55e00", alpha=0.7)
+        axes.set(xlabel=label, ylabel="rms error (nm)")
+    panels[1, 1].set_xscale("log")
+    for axes in panels.ravel():
+        axes.spines[["top", "right"]].set_visible(False)
+    lost = sum(not r.ok for r in results)
+    figure.suptitle(f"{study.scenario.controller.name} on {len(results)} plants; {lost} did not hold", fontsize=12)
+    figure.savefig(path)

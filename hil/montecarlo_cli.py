@@ -1,0 +1,118 @@
+"""``pkxyz montecarlo``: a law against many plants, and any one of them again."""
+
+import dataclasses
+import json
+from pathlib import Path
+from typing import Annotated, Any
+
+import typer
+from rich.console import Console
+from rich.table import Table
+
+from pkxyz_ctrl.config import ConfigError
+
+_screen = Console(highlight=False)
+_notes = Console(stderr=True, highlight=False)
+
+
+def montecarlo(
+    scenario: Annotated[str, typer.Argument(help="A shipped scenario's name or a TOML file.")] = "raster",
+    plants: Annotated[int, typer.Option(min=1, help="How many, drawn by the seeds from --seed on.")] = 200,
+    seed: Annotated[int, typer.Option(min=0, help="The first plant's.")] = 1,
+    tolerances: Annotated[str, typer.Option(help="Name or file of what they are drawn from.")] = "wide",
+    controller: Annotated[str | None, typer.Option(help="Name or file, instead of the scenario's.")] = None,
+    plant: Annotated[str | None, typer.Option(help="Name or file of the plant that is changed.")] = None,
+    bus: Annotated[str | None, typer.Option(help="Name or file, instead of the scenario's.")] = None,
+    workers: Annotated[int | None, typer.Option(min=1, help="Processes; default: as many as cores.")] = None,
+    dask: Annotated[
+        str | None, typer.Option(metavar="ADDRESS", help="Scheduler of a Dask cluster to work on instead.")
+    ] = None,
+    replay: Annotated[
+        int | None, typer.Option(metavar="SEED", min=0, help="Run this plant alone, with a recording and a report.")
+    ] = None,
+    out: Annotated[Path, typer.Option(help="Folder for results.jsonl, summary.json and distributions.png.")] = Path(
+        "montecarlo"
+    ),
+    as_json: Annotated[bool, typer.Option("--json", help="Print JSON, and nothing else.")] = False,
+) -> None:
+    """Run a law against plants drawn from tolerances, on the fast lane. Call it again to go on, or for more plants.
+
+    Exit code 0 if every loop held, 1 if one did not, 2 for bad input, 130 if interrupted (what is done is kept).
+    """
+    from hil.montecarlo import Results, Study, draw, run_study, summary
+    from hil.scenario import load_scenario
+    from hil.workers import cores
+    from pkxyz_ctrl.config import load
+    from pkxyz_ctrl.design.tolerances import Tolerances
+
+    loaded = load_scenario(scenario, controller=controller, plant=plant, bus=bus)
+    study = Study(loaded, load("tolerances", tolerances, Tolerances))
+    if replay is not None:
+        _replay(study, replay, out, as_json=as_json)
+    try:
+        out.mkdir(parents=True, exist_ok=True)
+    except OSError as error:
+        raise ConfigError(f"--out: {out}: {(error.strerror or str(error)).lower()}; give another folder") from None
+    results = Results(out / "results.jsonl", study)
+    seeds, interrupted = range(seed, seed + plants), False
+    from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn
+
+    columns = (TextColumn("{task.description}"), BarColumn(), MofNCompleteColumn(), TimeRemainingColumn())
+    with Progress(*columns, console=_notes, transient=True, disable=as_json or not _notes.is_terminal) as progress:
+        task = progress.add_task("plants", total=plants)
+        try:
+            run_study(
+                study, seeds, results, workers or cores(), dask,
+                lambda done, total: progress.update(task, completed=done, total=total),
+            )  # fmt: skip
+        except KeyboardInterrupt:
+            interrupted = True
+    found = [results.found[n] for n in seeds if n in results.found]
+    if not found:
+        raise typer.Exit(130)
+    data = summary(found) | {
+        "controller": loaded.controller.name, "scenario": loaded.config.name, "tolerances": tolerances,
+        "digest": study.digest(), "first_seed": seed, "interrupted": interrupted, "folder": str(out),
+    }  # fmt: skip
+    (out / "summary.json").write_text(json.dumps(data, indent=2, allow_nan=False) + "\n", encoding="utf-8")
+    draw(study, found, out / "distributions.png")
+    if as_json:
+        print(json.dumps(data, allow_nan=False))
+    else:
+        _show(data)
+    raise typer.Exit(130 if interrupted else 1 if data["not_held"] else 0)
+
+
+def _replay(study: Any, seed: int, out: Path, *, as_json: bool) -> None:
+    """One plant with everything a run leaves; the figures are those of the study, bit for bit."""
+    from hil.montecarlo import run_one
+    from hil.run_folder import RunFolder
+    from hil.sil import draw, run_into
+
+    scenario = study.drawn(seed)
+    folder = RunFolder(out / f"seed-{seed}")
+    ran = run_into(folder, scenario, "fast", lambda done, total: None)
+    draw(folder, ran)
+    result, case = run_one(study, seed), study.tolerances.draw(seed)
+    data = vars(result) | {"drawn": dataclasses.asdict(case.perturbation), "folder": str(folder.path)}
+    data["strokes_um"] = [float(q) * 1e6 for q in case.strokes_m]
+    if as_json:
+        print(json.dumps(data, allow_nan=False))
+    else:
+        for name, value in data.items():
+            _screen.print(f"{name}: {value}", soft_wrap=True)
+    raise typer.Exit(0 if result.ok else 1)
+
+
+def _show(data: dict[str, Any]) -> None:
+    _screen.print(f"{data['controller']}, {data['scenario']}, {data['plants']} plants of {data['tolerances']!r}")
+    table = Table(box=None, pad_edge=False, header_style="dim")
+    for n, heading in enumerate(("", "median", "95 %", "largest", "its seed")):
+        table.add_column(heading, justify="right" if n else "left")
+    for name in ("rms_error_nm", "hold_noise_nm", "peak_s"):
+        if (d := data[name]) is not None:
+            table.add_row(name, *(f"{d[key]:.3g}" for key in ("median", "p95", "max")), str(d["max_seed"]))
+    _screen.print(table)
+    if data["not_held"]:
+        _screen.print(f"[bold red]{data['not_held']} did not hold[/]", markup=True)
+    _screen.print(f"the worst one alone: pkxyz montecarlo ... --replay {data['worst_seed']}", soft_wrap=True)

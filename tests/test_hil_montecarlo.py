@@ -1,0 +1,85 @@
+"""Monte Carlo: plants drawn by seeds, kept line by line, resumed, and run again alone to the bit."""
+
+import json
+
+import pytest
+from loop_rig import setup
+from typer.testing import CliRunner
+
+from hil.cli import app
+from hil.montecarlo import Result, Results, Study, changed_plant, draw, run_one, run_study, summary, worst
+from hil.recording import Recording
+from hil.scenario import load_scenario
+from pkxyz_ctrl.config import ConfigError, load
+from pkxyz_ctrl.design.loop_plant import Perturbation
+from pkxyz_ctrl.design.tolerances import Tolerances
+
+
+def a_study(controller="lqg"):
+    return Study(load_scenario("raster", controller=controller), load("tolerances", "wide", Tolerances))
+
+
+def a_result(seed, error=1.0, peak=1.6, fault=None):
+    return Result(seed, error, 0.8, peak, 0, fault)
+
+
+def test_the_drawn_plant_has_what_was_drawn_and_otherwise_what_it_had():
+    change = Perturbation(0.1, -0.05, 50.0, (0.01, -0.02, 0.03))
+    plant = changed_plant(setup().plant, change)
+    assert plant.stiffness_mismatch.on
+    assert plant.stiffness_mismatch.leaf == plant.stiffness_mismatch.link_hinge == (0.1, 0.1, 0.1)
+    assert (plant.mass_error.on, plant.mass_error.relative) == (True, -0.05)
+    assert (plant.damping.on, plant.damping.quality_factor) == (True, 50.0)
+    assert plant.comb_mismatch.relative == (0.01, -0.02, 0.03)
+    assert plant.sense_noise == setup().plant.sense_noise
+    assert changed_plant(setup().plant, Perturbation()).damping == setup().plant.damping
+
+
+def test_a_study_goes_on_where_it_was_and_every_plant_runs_again_to_the_bit(tmp_path):
+    study, path = a_study(), tmp_path / "results.jsonl"
+    results = Results(path, study)
+    run_study(study, range(3, 5), results, 1)
+    text = path.read_text()
+    path.write_text(text + '{"seed": 5, "rms_err')  # as a killed process leaves it
+    again = Results(path, study)
+    assert again.found == results.found
+    assert path.read_text() == text
+    told = []
+    run_study(study, range(3, 5), again, 1, on_progress=lambda done, total: told.append((done, total)))
+    assert told == [(2, 2)]  # nothing was left to do
+    for seed, result in again.found.items():
+        assert run_one(study, seed) == result
+        assert result.ok
+        assert 0.3 < result.rms_error_nm < 200.0
+    assert again.found[3] != again.found[4]
+    with pytest.raises(ConfigError, match="another study"):
+        Results(path, a_study("lqg_wide"))
+    path.write_text("no JSON\n")
+    with pytest.raises(ConfigError, match="not a file of results"):
+        Results(path, study)
+    draw(study, list(again.found.values()), tmp_path / "p.png")
+    assert (tmp_path / "p.png").stat().st_size > 10_000
+
+
+def test_the_worst_is_a_fault_then_an_unstable_loop_then_the_largest_error():
+    calm, wild, unstable = a_result(1, 1.0), a_result(2, 9.0), a_result(3, 2.0, None)
+    lost = Result(4, None, None, 1.6, 0, "at 1 s: sensor")
+    assert worst([calm, wild]) is wild
+    assert worst([calm, wild, unstable]) is unstable
+    assert worst([unstable, lost, calm]) is lost
+    found = summary([calm, wild, unstable, lost])
+    assert found["not_held"] == 2
+    assert found["worst_seed"] == 4
+    assert found["rms_error_nm"] == {"median": 2.0, "p95": pytest.approx(8.3), "max": 9.0, "max_seed": 2}
+    assert summary([lost])["rms_error_nm"] is None
+
+
+def test_one_plant_alone_leaves_a_run_folder(tmp_path):
+    done = CliRunner().invoke(app, ["montecarlo", "--replay", "3", "--out", str(tmp_path), "--json"])
+    assert done.exit_code == 0, done.output
+    data = json.loads(done.stdout)
+    recorded = json.loads((tmp_path / "seed-3" / "summary.json").read_text())
+    assert max(recorded["rms_error_nm"].values()) == data["rms_error_nm"]
+    assert Recording.open(tmp_path / "seed-3" / "recording.parquet").metadata["seed"] == 3
+    drawn = a_study().tolerances.draw(3).perturbation
+    assert data["drawn"]["stiffness"] == drawn.stiffness
