@@ -9,6 +9,7 @@ import os
 import re
 import shutil
 import sys
+import time
 from pathlib import Path
 
 _PACKAGES = ("pkxyz_ctrl", "hil", "sim")
@@ -57,10 +58,13 @@ def _digest_of_kernels() -> str:
 
 
 def _forget_old(home: Path) -> None:
-    """Keep the folders used last; a developer makes a new one with every edit of a kernel."""
+    """Keep the folders used last, as a developer makes a new one with every edit of a kernel; and all that another
+    process may be using.
+    """
     try:
-        by_use = sorted((p for p in home.iterdir() if p.is_dir()), key=lambda p: p.stat().st_mtime)
+        used_s = {folder: folder.stat().st_mtime for folder in home.iterdir() if folder.is_dir()}
     except OSError:
         return
-    for folder in by_use[:-_KEPT]:
-        shutil.rmtree(folder, ignore_errors=True)
+    for folder in sorted(used_s, key=used_s.__getitem__)[:-_KEPT]:
+        if time.time() - used_s[folder] > _KEPT_S:
+            shutil.rmtree(folder, ignore_errors=True)
