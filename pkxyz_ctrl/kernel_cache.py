@@ -14,7 +14,7 @@ from pathlib import Path
 
 _PACKAGES = ("pkxyz_ctrl", "hil", "sim")
 _IMPORT = re.compile(r"^from ((?:pkxyz_ctrl|hil|sim)[\w.]*) import (.*)", re.MULTILINE)
-_KEPT = 12  # several checkouts of one developer, a few edits each
+_KEPT, _KEPT_S = 4, 24 * 3600  # so many folders, and all that were used within a day
 
 
 def choose_kernel_cache() -> None:
