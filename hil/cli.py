@@ -15,6 +15,7 @@ from rich.table import Table
 from hil import (
     bench_cli,
     check_amplifier_cli,
+    compare_cli,
     faults_cli,
     latency_cli,
     margins_cli,
@@ -155,6 +156,7 @@ app.command("latency")(latency_cli.latency)
 app.command("margins")(margins_cli.margins)
 app.command("montecarlo")(montecarlo_cli.montecarlo)
 app.command("tune")(tune_cli.tune)
+app.command("compare")(compare_cli.compare)
 app.command("paper")(mechanics_cli.paper)
 app.command("workspace")(mechanics_cli.workspace)
 app.command("design")(mechanics_cli.design)

@@ -1,0 +1,79 @@
+"""``pkxyz compare``: several laws on one scenario and plant, one table and one picture."""
+
+import json
+from enum import StrEnum
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated
+
+import typer
+from rich.console import Console
+from rich.table import Table
+
+if TYPE_CHECKING:
+    from hil.compare import Compared
+
+_screen = Console(highlight=False)
+_notes = Console(stderr=True, highlight=False)
+
+
+class Lane(StrEnum):
+    """In which lane the laws run; both have the same bits."""
+
+    FAST = "fast"
+    LOCKSTEP = "lockstep"
+
+
+def compare(
+    scenario: Annotated[str, typer.Argument(help="A shipped scenario's name or a TOML file.")] = "raster",
+    controllers: Annotated[
+        str, typer.Option(metavar="A,B,...", help="Names or files, separated by commas; default: one for each law.")
+    ] = "",
+    plant: Annotated[str | None, typer.Option(help="Name or file, instead of the scenario's.")] = None,
+    seed: Annotated[int | None, typer.Option(min=0, help="Instead of the scenario's.")] = None,
+    lane: Annotated[
+        Lane, typer.Option(help="lockstep: over the simulated bus; fast: compiled, no frames.")
+    ] = Lane.FAST,
+    out: Annotated[Path, typer.Option(help="The picture to write.")] = Path("compare.png"),
+    as_json: Annotated[bool, typer.Option("--json", help="Print JSON, and nothing else.")] = False,
+) -> None:
+    """Run all laws on one scenario and plant. Exit code 0 if each ran without a fault, 1 if not, 2 for bad input."""
+    from rich.progress import Progress
+
+    from hil.compare import DEFAULT
+    from hil.compare import compare as run_all
+    from hil.compare_figure import draw
+
+    names = tuple(name.strip() for name in controllers.split(",") if name.strip()) or DEFAULT
+    with Progress(console=_notes, transient=True, disable=as_json or not _notes.is_terminal) as progress:
+        task = progress.add_task("laws", total=len(names))
+        runs = run_all(
+            scenario, names, plant=plant, seed=seed, lane=lane.value,
+            on_progress=lambda done, total: progress.update(task, completed=done, total=total),
+        )  # fmt: skip
+    title = f"{scenario}{f' on {plant}' if plant else ''}"
+    draw(runs, title, out)
+    if as_json:
+        data = {"scenario": scenario, "plant": plant, "seed": seed, "lane": lane.value, "picture": str(out)}
+        print(json.dumps(data | {"laws": [run.as_dict() for run in runs]}, allow_nan=False))
+    else:
+        _show(runs, title, out)
+    raise typer.Exit(0 if all(run.problem is None for run in runs) else 1)
+
+
+def _show(runs: "list[Compared]", title: str, out: Path) -> None:
+    table = Table(box=None, pad_edge=False, header_style="dim", title=title, title_justify="left")
+    for heading in ("controller", "rms x / y / z (nm)", "largest (nm)", "hold (nm)", "at a limit", "gave up", ""):
+        table.add_column(heading, justify="left" if heading in ("controller", "") else "right")
+    for run in runs:
+        found = run.figures
+        worst = {k: max(found[k].values()) if found.get(k) else None for k in ("max_error_nm", "hold_noise_nm")}
+        rms = " / ".join(f"{v:.2f}" for v in found["rms_error_nm"].values()) if found.get("rms_error_nm") else "none"
+        cells = [f"{worst[k]:.2f}" if worst[k] is not None else "none" for k in worst]
+        ticks = [str(found["saturated_ticks"]), str(run.gave_up)] if found else ["", ""]
+        verdict = "" if run.problem is None else ("[bold red]fault[/]" if found else "[bold red]refused[/]")
+        table.add_row(run.controller, rms, *cells, *ticks, verdict)
+    _screen.print(table)
+    for run in runs:
+        if run.problem is not None:
+            _screen.print(f"[red]{run.controller}[/]: {run.problem}", soft_wrap=True)
+    _screen.print(f"picture: {out}", soft_wrap=True)

@@ -1,0 +1,71 @@
+"""The picture of a comparison: each law's error over time, and its figures as bars."""
+
+from collections.abc import Sequence
+from pathlib import Path
+
+import numpy as np
+from matplotlib.backends.backend_agg import FigureCanvasAgg
+from matplotlib.figure import Figure
+from numpy.typing import NDArray
+
+from hil.compare import Compared
+
+COLOURS = ("#0072B2", "#56B4E9", "#009E73", "#D55E00", "#8a8a8a", "#CC79A7", "#E69F00", "#2b2b2b")
+_BINS = 700
+
+
+def draw(runs: Sequence[Compared], title: str, path: Path) -> None:
+    """Write the picture of those runs that have figures."""
+    shown = [run for run in runs if run.figures.get("rms_error_nm")]
+    figure = Figure(figsize=(11, 1.6 + 1.05 * max(len(shown), 2)), layout="constrained", dpi=130)
+    FigureCanvasAgg(figure)
+    grid = figure.add_gridspec(max(len(shown), 1), 2, width_ratios=(2.2, 1))
+    largest = _scale(shown)
+    first = None
+    for n, run in enumerate(shown):
+        axes = figure.add_subplot(grid[n, 0], sharex=first)
+        first = first or axes
+        size = np.linalg.norm(run.error_nm, axis=1)
+        t_s, top = _envelope(run.t_s, size)
+        axes.fill_between(t_s, np.minimum(top, largest), color=COLOURS[n % len(COLOURS)], lw=0)
+        axes.set_ylim(0, largest)
+        axes.set_ylabel(run.controller, rotation=0, ha="right", va="center", fontsize=9)
+        axes.spines[["top", "right"]].set_visible(False)
+        axes.tick_params(labelbottom=n == len(shown) - 1, labelsize=8)
+        if n == 0:
+            axes.set_title(f"{title}: distance from the reference (nm)", fontsize=10, loc="left")
+    if first is not None:
+        figure.axes[len(shown) - 1].set_xlabel("time of the trajectory (s)", fontsize=9)
+        _bars(figure, grid, shown)
+    figure.savefig(path)
+
+
+def _bars(figure: Figure, grid: object, shown: Sequence[Compared]) -> None:
+    axes = figure.add_subplot(grid[:, 1])  # type: ignore[index]
+    rows = np.arange(len(shown))
+    for k, (name, words) in enumerate((("rms_error_nm", "rms while scanning"), ("hold_noise_nm", "hold noise"))):
+        values = [max(run.figures[name].values()) if run.figures.get(name) else np.nan for run in shown]
+        alpha = 1.0 if k == 0 else 0.45
+        colours = [COLOURS[n % len(COLOURS)] for n in range(len(shown))]
+        bars = axes.barh(rows + 0.2 - 0.4 * k, values, 0.36, color=colours, alpha=alpha)
+        axes.bar_label(bars, [f" {v:.2g} {words}" for v in values], fontsize=8)
+    axes.set_yticks(rows, [run.controller for run in shown], fontsize=9)
+    axes.set_xscale("log")
+    left, right = axes.get_xlim()
+    axes.set_xlim(left, right * (right / left) ** 0.9)  # room for the words
+    axes.invert_yaxis()
+    axes.set_xlabel("nm, worst axis", fontsize=9)
+    axes.spines[["top", "right"]].set_visible(False)
+
+
+def _scale(shown: Sequence[Compared]) -> float:
+    """So that the laws that work fill their rows: those that do not are cut off."""
+    sizes = sorted(np.quantile(np.linalg.norm(run.error_nm, axis=1), 0.99) for run in shown if len(run.error_nm))
+    return 1.3 * float(sizes[len(sizes) // 2]) if sizes else 1.0
+
+
+def _envelope(t_s: NDArray[np.float64], values: NDArray[np.float64]) -> tuple[NDArray[np.float64], ...]:
+    """Largest value in each of at most ``_BINS`` equal stretches."""
+    every = max(1, -(-len(values) // _BINS))
+    starts = np.arange(0, len(values), every)
+    return t_s[starts], np.maximum.reduceat(values, starts)
