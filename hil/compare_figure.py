@@ -48,7 +48,7 @@ def _bars(figure: Figure, grid: object, shown: Sequence[Compared]) -> None:
         alpha = 1.0 if k == 0 else 0.45
         colours = [COLOURS[n % len(COLOURS)] for n in range(len(shown))]
         bars = axes.barh(rows + 0.2 - 0.4 * k, values, 0.36, color=colours, alpha=alpha)
-        axes.bar_label(bars, [f" {v:.2g} {words}" for v in values], fontsize=8)
+        axes.bar_label(bars, [f" {v:.3g} {words}" for v in values], fontsize=8)
     axes.set_yticks(rows, [run.controller for run in shown], fontsize=9)
     axes.set_xscale("log")
     left, right = axes.get_xlim()
