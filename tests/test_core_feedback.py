@@ -24,7 +24,7 @@ def polynomial(state, jerk, t):
 @given(
     st.tuples(*[st.floats(-1, 1)] * 9).map(np.array),
     st.tuples(*[st.floats(-300, 300)] * 3).map(np.array),
-    st.floats(0, 3),
+    st.floats(0, 1),
 )
 def test_ahead_is_the_polynomial_of_constant_jerk(unit, jerk, periods):
     gains, out = tick_law()["feedback"], np.zeros(9)

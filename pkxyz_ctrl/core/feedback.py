@@ -28,19 +28,33 @@ FEEDBACK = np.dtype(
 )
 
 
+_JUMP_M = 1e-9
+
+
 @njit(cache=True)
 def ahead(feedback: np.void, now: Array, after: Array, out: Array) -> None:
-    """Reference row (9,) at ``lead_s`` past the row ``now``: constant jerk towards the row ``after``, one period later.
+    """Reference row (9,) at ``lead_s`` past the row ``now``, on the quintic that joins it to the row ``after``, one
+    period later.
 
-    A row is position m, velocity m/s, acceleration m/s^2.
+    A row is position m, velocity m/s, acceleration m/s^2. Of a sine of 4 samples a period the quintic's acceleration in
+    mid-interval is right to 0.4 %, where one between the two accelerations would be 30 % too small. Where the position
+    jumps, which no motion explains, the jerk is taken as constant.
     """
-    h = feedback["lead_s"]
-    per_period = 1.0 / feedback["period_s"]
+    period, h = feedback["period_s"], feedback["lead_s"]
+    s = h / period
     for i in range(3):
-        jerk = (after[6 + i] - now[6 + i]) * per_period
-        out[i] = now[i] + h * (now[3 + i] + h * (0.5 * now[6 + i] + h * jerk / 6.0))
-        out[3 + i] = now[3 + i] + h * (now[6 + i] + 0.5 * h * jerk)
-        out[6 + i] = now[6 + i] + h * jerk
+        v, a = period * now[3 + i], period * period * now[6 + i]
+        way = after[i] - now[i] - v - 0.5 * a  # what third and higher orders make of position, velocity, acceleration
+        speed = period * after[3 + i] - v - a
+        bend = period * period * after[6 + i] - a
+        cubic, quartic, quintic = bend / 6.0, 0.0, 0.0
+        if abs(way) <= abs(speed) + abs(bend) + _JUMP_M:
+            cubic = 10.0 * way - 4.0 * speed + 0.5 * bend
+            quartic = -15.0 * way + 7.0 * speed - bend
+            quintic = 6.0 * way - 3.0 * speed + 0.5 * bend
+        out[i] = now[i] + s * (v + s * (0.5 * a + s * (cubic + s * (quartic + s * quintic))))
+        out[3 + i] = (v + s * (a + s * (3.0 * cubic + s * (4.0 * quartic + s * 5.0 * quintic)))) / period
+        out[6 + i] = (a + s * (6.0 * cubic + s * (12.0 * quartic + s * 20.0 * quintic))) / (period * period)
 
 
 @njit(cache=True)
