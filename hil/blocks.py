@@ -1,4 +1,7 @@
-"""A run in blocks of ticks: so many rows of the reference handed out, so many rows of the record handed on."""
+"""A run in blocks of ticks: so many rows of the reference handed out, so many rows of the record handed on.
+
+Where the run learns, a block ends when a window of it does, so that what was seen can act on the rows that follow.
+"""
 
 from collections.abc import Callable
 
@@ -6,6 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from hil.excitation import Excitation
+from pkxyz_ctrl.learning import Learner
 from pkxyz_ctrl.row import ROW
 from pkxyz_ctrl.trajectory import Trajectory
 
@@ -15,6 +19,49 @@ BLOCK_TICKS = 4096
 PREVIEW_ROWS = 25
 """Rows of the reference that the law may look at past its own: two periods of delay, the longest horizon of a plan, and
 the intervals after them."""
+
+
+class Handout:
+    """The rows of the reference that a stretch of ticks needs."""
+
+    def __init__(
+        self,
+        trajectory: Trajectory,
+        period_us: int,
+        excitation: Excitation | None = None,
+        learner: Learner | None = None,
+    ) -> None:
+        self._trajectory = trajectory
+        self._period_us = period_us
+        self._excitation = excitation
+        self._learner = learner
+
+    def ticks(self, memory: NDArray[np.void], most: int) -> int:
+        """How many ticks the next stretch may have, at most ``most``."""
+        if self._learner is None:
+            return most
+        left = self._learner.due - int(memory["reference_tick"][0])
+        return min(most, left) if left > 0 else most  # a hold has carried the path past it: nothing is learnt then
+
+    def rows(self, memory: NDArray[np.void], ticks: int) -> NDArray[np.float64]:
+        """Rows (n, 9) of the trajectory that so many ticks may need, (n, 12) with an excitation, (n, 15) with learning;
+        says in ``memory`` (1,) where they begin.
+        """
+        first, count = int(memory["reference_tick"][0]), ticks + PREVIEW_ROWS
+        memory["input"]["reference_base"] = first
+        rows = self._trajectory.sample(first, count, self._period_us)
+        if self._excitation is None and self._learner is None:
+            return rows
+        added = np.zeros((count, 3)) if self._excitation is None else self._excitation.sample(first, count)
+        if self._learner is None:
+            return np.hstack([rows, added])
+        self._learner.finish()
+        return np.hstack([rows + self._learner.shift(first, count), added, rows[:, 0:3]])
+
+    def see(self, rows: NDArray[np.void]) -> None:
+        """The rows of the record that came of it, in order."""
+        if self._learner is not None:
+            self._learner.see(rows)
 
 
 class Blocks:
@@ -28,32 +75,27 @@ class Blocks:
         on_block: Callable[[NDArray[np.void]], None],
         on_progress: Callable[[int, int], None],
         excitation: Excitation | None = None,
+        learner: Learner | None = None,
     ) -> None:
         self.ticks = ticks
         self.rows = np.zeros(BLOCK_TICKS, ROW)
         self.done = 0
-        self._trajectory = trajectory
-        self._period_us = period_us
-        self._excitation = excitation
+        self._handout = Handout(trajectory, period_us, excitation, learner)
         self._on_block = on_block
         self._on_progress = on_progress
 
-    def next_count(self) -> int:
+    def next_count(self, memory: NDArray[np.void]) -> int:
         """Ticks of the next block, 0 at the end."""
-        return min(BLOCK_TICKS, self.ticks - self.done)
+        return self._handout.ticks(memory, min(BLOCK_TICKS, self.ticks - self.done))
 
     def reference(self, memory: NDArray[np.void]) -> NDArray[np.float64]:
-        """Rows (n, 9) of the trajectory that the next block may need, or (n, 12) with an excitation; says in
-        ``memory`` (1,) where they begin.
-        """
-        first, count = int(memory["reference_tick"][0]), BLOCK_TICKS + PREVIEW_ROWS
-        memory["input"]["reference_base"] = first
-        rows = self._trajectory.sample(first, count, self._period_us)
-        return rows if self._excitation is None else np.hstack([rows, self._excitation.sample(first, count)])
+        """``Handout.rows`` of the next block."""
+        return self._handout.rows(memory, BLOCK_TICKS)
 
     def hand_on(self, count: int) -> None:
         """The first ``count`` rows are complete."""
         self.done += count
         if count:
+            self._handout.see(self.rows[:count])
             self._on_block(self.rows[:count])
         self._on_progress(self.done, self.ticks)

@@ -103,6 +103,9 @@ def sil(
         list[str] | None,
         typer.Option(metavar="TARGET:KIND@S[+S][,NAME=VALUE]", help="Such as sense.2:stuck@0.3+0.05; may be repeated."),
     ] = None,
+    learn: run_cli.Learn = False,
+    replay: run_cli.Replay = None,
+    refresh: run_cli.Refresh = None,
     as_json: Annotated[bool, typer.Option("--json", help="Print the summary as JSON, and nothing else.")] = False,
 ) -> None:
     """Close the loop on a scenario; exit code 0 if its checks hold, 1 if not, 2 for bad input, 130 if interrupted."""
@@ -111,7 +114,10 @@ def sil(
     from hil.scenario import load_scenario
 
     faults = [parse(text) for text in fault or ()]
-    loaded = load_scenario(scenario, seed=seed, stage=stage, plant=plant, controller=controller, bus=bus, faults=faults)
+    learning = run_cli.learning_of(learn, replay, refresh)
+    loaded = load_scenario(
+        scenario, seed=seed, stage=stage, plant=plant, controller=controller, bus=bus, faults=faults, learning=learning
+    )
     from hil.recording import RecordingError
     from hil.run_folder import RunFolder, next_free
     from hil.sil import draw, require_bus

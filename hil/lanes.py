@@ -15,6 +15,7 @@ from hil.lockstep import LockstepRig
 from hil.setup import Setup
 from pkxyz_ctrl.can.frame import Frame
 from pkxyz_ctrl.cycle import new_memory
+from pkxyz_ctrl.learning import Learner
 from pkxyz_ctrl.safety.modes import Mode
 from pkxyz_ctrl.safety.trips import explain
 from sim.plant import Plant
@@ -32,6 +33,8 @@ class LaneResult:
     faults: tuple[str, ...]
     realtime_factor: float
     """stage time over the machine's time"""
+    learner: Learner | None = None
+    """what was learnt, where the run learns"""
 
 
 def run(
@@ -48,7 +51,10 @@ def run(
     all. What was run before an exception (Ctrl-C) has been handed on. Raises ``ConfigError`` for a bus that the lane
     can't use and ``StartUpError`` where the amplifier doesn't start.
     """
-    blocks = Blocks(setup.trajectory, setup.bus.period_us, setup.ticks, on_block, on_progress, setup.excitation)
+    learner = setup.new_learner()
+    blocks = Blocks(
+        setup.trajectory, setup.bus.period_us, setup.ticks, on_block, on_progress, setup.excitation, learner
+    )
     law = setup.law
     if lane == "fast":
         plant, memory = setup.new_plant(), new_memory(Mode.IDLE)
@@ -65,13 +71,13 @@ def run(
     else:
         raise ValueError(f"no lane is called {lane!r}; there are lockstep and fast")
     factor = setup.ticks * setup.bus.period_s / (time.perf_counter() - begin_s)
-    return LaneResult(setup.ticks, missed, load, tuple(faults), factor)
+    return LaneResult(setup.ticks, missed, load, tuple(faults), factor, learner)
 
 
 def _run_fast(setup: Setup, run_block: RunBlock, memory: NDArray[np.void], plant: Plant, blocks: Blocks) -> list[str]:
     faults: list[str] = []
     law, mode = setup.law, int(Mode.IDLE)
-    while count := blocks.next_count():
+    while count := blocks.next_count(memory):
         reference = blocks.reference(memory)
         run_block(
             law, memory, reference, plant.params, plant.state, _sample_us(setup, blocks.done, count), blocks.rows, count

@@ -10,7 +10,7 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from hil.blocks import BLOCK_TICKS, Blocks
+from hil.blocks import Blocks
 from hil.clock import Lockstep
 from hil.endpoint import Endpoint
 from hil.faults.clock import ControllerKilledError
@@ -140,8 +140,6 @@ class _Recorder:
         waiting = self._waiting
         waiting.append(self._row.tobytes())
         waiting.append(self._truth.tobytes())
-        if len(waiting) == 2 * BLOCK_TICKS:
-            self.finish()
 
     def finish(self) -> None:
         """Hand on the rows that wait."""
@@ -153,15 +151,19 @@ class _Recorder:
 
 
 class _Reference:
-    """The rows of the trajectory for the present block."""
+    """The rows of the trajectory for the present block; the record of the one before is handed on first."""
 
-    def __init__(self, rig: LockstepRig, blocks: Blocks) -> None:
+    def __init__(self, rig: LockstepRig, blocks: Blocks, recorder: _Recorder) -> None:
         self._memory = rig.controller.memory
         self._blocks = blocks
+        self._finish = recorder.finish
+        self._next = 0
         self._rows: NDArray[np.float64] = np.empty((0, 9))
 
     def __call__(self, tick: int) -> NDArray[np.float64]:
-        if tick % BLOCK_TICKS == 0:
+        if tick == self._next:
+            self._finish()
+            self._next += self._blocks.next_count(self._memory)
             self._rows = self._blocks.reference(self._memory)
         return self._rows
 
@@ -169,4 +171,5 @@ class _Reference:
 def _exchange_in_blocks(rig: LockstepRig, blocks: Blocks) -> tuple[_Reference, _Recorder]:
     leads, ends = (dict(d.fields or {})["position_m"][1] for d in (EXCHANGE, ROW))
     assert (leads, ends) == (0, ROW.itemsize - TRUTH_BYTES), "the truth leads the exchange and ends the row"
-    return _Reference(rig, blocks), _Recorder(rig, blocks)
+    recorder = _Recorder(rig, blocks)
+    return _Reference(rig, blocks, recorder), recorder

@@ -13,10 +13,10 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from hil.blocks import PREVIEW_ROWS
+from hil.blocks import Handout
 from hil.recording import Recording, RecordingError
-from hil.run_folder import versions
 from hil.scenario import Scenario, resolve, restore
+from hil.versions import versions
 from pkxyz_ctrl import cycle as cycling
 from pkxyz_ctrl.controller_config import ControllerConfig
 from pkxyz_ctrl.period import period_of
@@ -106,7 +106,7 @@ class _Player:
         setup = scenario.setup()
         self._law = setup.law
         self._memory = cycling.new_memory(Mode.IDLE)
-        self._trajectory, self._period_us = scenario.trajectory, scenario.bus.period_us
+        self._handout = Handout(scenario.trajectory, scenario.bus.period_us, learner=setup.new_learner())
         self._cycle = period_of(self._law, np.zeros((1, 9)))
 
     def play(self, recorded: Rows) -> Rows:
@@ -116,14 +116,18 @@ class _Player:
         inputs = np.zeros(len(recorded), cycling.INPUT)
         for row_name, name in _INPUTS.items():
             inputs[name] = recorded[row_name]
-        first = int(memory["reference_tick"][0])
-        inputs["reference_base"] = first
-        reference = self._trajectory.sample(first, len(recorded) + PREVIEW_ROWS, self._period_us)
         seen, row = memory["input"], memory["row"]
-        for n in range(len(recorded)):
-            seen[0] = inputs[n]
-            cycle(law, memory, reference)
-            replayed[n] = row[0]
+        begin = 0
+        while begin < len(recorded):
+            count = self._handout.ticks(memory, len(recorded) - begin)
+            reference = self._handout.rows(memory, count)
+            inputs["reference_base"] = seen["reference_base"]
+            for n in range(begin, begin + count):
+                seen[0] = inputs[n]
+                cycle(law, memory, reference)
+                replayed[n] = row[0]
+            self._handout.see(replayed[begin : begin + count])
+            begin += count
         return replayed
 
 

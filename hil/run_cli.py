@@ -12,6 +12,13 @@ from pkxyz_ctrl.config import ConfigError
 Scenario = Annotated[str, typer.Argument(help="A shipped scenario's name or a TOML file.")]
 Bus = Annotated[str, typer.Option(help="Name or file of the bus to meet on.")]
 Json = Annotated[bool, typer.Option("--json", help="Print JSON, and nothing else.")]
+Learn = Annotated[bool, typer.Option("--learn", help="Learn what errs alike in every period of the scan.")]
+Replay = Annotated[
+    str | None, typer.Option(metavar="FILE", help="Correct by what a run has learnt (its learnt.json), as it is.")
+]
+Refresh = Annotated[
+    str | None, typer.Option(metavar="FILE", help="Begin with what a run has learnt, and go on learning.")
+]
 _DEFAULT_BUS = "unix_2k"
 
 
@@ -22,6 +29,9 @@ def run(
     stage: Annotated[str | None, typer.Option(help="Name or file, instead of the scenario's.")] = None,
     controller: Annotated[str | None, typer.Option(help="Name or file, instead of the scenario's.")] = None,
     duration_s: Annotated[float | None, typer.Option("--seconds", help="Instead of the scenario's.")] = None,
+    learn: Learn = False,
+    replay: Replay = None,
+    refresh: Refresh = None,
     as_json: Json = False,
 ) -> None:
     """Control an amplifier at rate; exit code 0 if the checks hold, 1 if not, 2 for bad input, 128 + signal if ended.
@@ -34,7 +44,8 @@ def run(
     from pkxyz_ctrl.controller import StartUpError
     from pkxyz_ctrl.design.design_error import DesignError
 
-    loaded = _load(scenario, duration_s, stage=stage, controller=controller, bus=bus)
+    learning = learning_of(learn, replay, refresh)
+    loaded = _load(scenario, duration_s, stage=stage, controller=controller, bus=bus, learning=learning)
     require_real_bus(loaded.bus)
     folder = RunFolder(out if out is not None else next_free(Path("runs"), loaded.config.name, LANE))
     try:
@@ -43,6 +54,10 @@ def run(
             from hil.wall_figure import draw_wall
 
             draw_wall(folder.recording, summary, result.lateness_us, folder.picture)
+            if summary.get("learning_factor") is not None:
+                from hil.learning_figure import draw_learning
+
+                draw_learning(folder.recording, summary, folder.learning_picture)
     except (RecordingError, StartUpError, DesignError) as error:
         print(f"pkxyz: {error}", file=sys.stderr)
         raise typer.Exit(1) from None
@@ -99,12 +114,21 @@ def plant(
         raise ConfigError(f"--truth: {truth}: {(error.strerror or str(error)).lower()}") from None
 
 
-def _load(scenario: str, duration_s: float | None, **instead: str | None) -> Any:
+def learning_of(learn: bool, replay: str | None, refresh: str | None) -> dict[str, str] | None:
+    """What the options say in place of a scenario's [learning]; None if none is given."""
+    asked: list[dict[str, str]] = [{"mode": "learn"}] if learn else []
+    asked += [{"mode": mode, "file": f} for mode, f in (("replay", replay), ("refresh", refresh)) if f is not None]
+    if len(asked) > 1:
+        raise ConfigError("--learn, --replay and --refresh: give one of them")
+    return asked[0] if asked else None
+
+
+def _load(scenario: str, duration_s: float | None, **instead: Any) -> Any:
     import dataclasses
 
     from hil.scenario import load_scenario
 
-    loaded = load_scenario(scenario, **instead)  # type: ignore[arg-type]
+    loaded = load_scenario(scenario, **instead)
     if duration_s is None:
         return loaded
     if not 0 < duration_s <= 36_000:

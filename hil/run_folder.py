@@ -1,16 +1,14 @@
 """The folder that a run leaves: recording, frame log, configuration, summary and picture."""
 
-import importlib.metadata
 import json
-import platform
 import re
 import shutil
-import sys
 from pathlib import Path
 from typing import Any
 
 from hil.metrics import evaluate
-from hil.scenario import Scenario, resolve, tables
+from hil.scenario import LEARNT_FROM, Scenario, resolve, tables
+from hil.versions import versions
 from pkxyz_ctrl.config import ConfigError, write_toml
 
 RECORDING, FRAMES, CONFIG, SUMMARY, PICTURE = (
@@ -20,7 +18,11 @@ RECORDING, FRAMES, CONFIG, SUMMARY, PICTURE = (
     "summary.json",
     "report.png",
 )
-_OURS = {RECORDING, FRAMES, CONFIG, SUMMARY, PICTURE, RECORDING + ".journal", RECORDING + ".part"}
+LEARNT, LEARNING_PICTURE = "learnt.json", "learning.png"
+_OURS = {
+    RECORDING, FRAMES, CONFIG, SUMMARY, PICTURE, RECORDING + ".journal", RECORDING + ".part", LEARNT, LEARNT_FROM,
+    LEARNING_PICTURE,
+}  # fmt: skip
 _TABLE = re.compile(r"reference\.\d+\.csv")
 
 
@@ -52,6 +54,8 @@ class RunFolder:
         self.config = path / CONFIG
         self.summary = path / SUMMARY
         self.picture = path / PICTURE
+        self.learnt = path / LEARNT
+        self.learning_picture = path / LEARNING_PICTURE
 
     def write_config(self, scenario: Scenario) -> dict[str, Any]:
         """Write everything that decides about the run, and return it."""
@@ -126,14 +130,3 @@ def summarise(
     summary["ok"] = not interrupted and all(check["ok"] is not False for check in checks)
     summary["versions"] = versions()
     return summary
-
-
-def versions() -> dict[str, str]:
-    """Versions of what computes the numbers of a run."""
-    found = {"python": platform.python_version(), "platform": sys.platform}
-    for package in ("pkxyz-ctrl", "numpy", "numba", "scipy"):
-        try:
-            found[package] = importlib.metadata.version(package)
-        except importlib.metadata.PackageNotFoundError:
-            found[package] = "not installed"
-    return found

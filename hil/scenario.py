@@ -5,6 +5,7 @@
 """
 
 import difflib
+import hashlib
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -13,11 +14,14 @@ from typing import TYPE_CHECKING, Annotated, Any, Self
 from pydantic import BaseModel, Field, field_validator, model_validator
 
 from hil.faults.fault import Fault
+from hil.learning_run import belongs, stored_for
 from hil.metrics import METRICS
 from pkxyz_ctrl import config
 from pkxyz_ctrl.bus_config import BusConfig
 from pkxyz_ctrl.config import ConfigError, FrozenModel
 from pkxyz_ctrl.controller_config import ControllerConfig
+from pkxyz_ctrl.learning import LearningConfig
+from pkxyz_ctrl.learning.store import Stored
 from pkxyz_ctrl.stage import Stage
 from pkxyz_ctrl.stage_config import StageConfig
 from pkxyz_ctrl.trajectory import Segment, Trajectory, TrajectoryError
@@ -29,6 +33,9 @@ if TYPE_CHECKING:
     from hil.setup import Setup
 
 Text = Annotated[str, Field(min_length=1)]
+
+LEARNT_FROM = "learnt_from.json"
+"""Name in a run's folder of the correction that it began with."""
 
 
 class Bound(FrozenModel):
@@ -65,6 +72,8 @@ class ScenarioConfig(FrozenModel):
     """what goes wrong, at times after the first tick"""
     clear_s: Annotated[float, Field(gt=0)] | None = None
     """how long after a fault decision somebody clears the fault; absent: nobody does"""
+    learning: LearningConfig | None = None
+    """for a reference that repeats; unset: nothing is learnt"""
     checks: dict[str, Bound] = Field(default_factory=dict)
 
     @field_validator("checks", mode="after")
@@ -90,6 +99,8 @@ class Scenario:
     controller: ControllerConfig
     bus: BusConfig
     trajectory: Trajectory
+    stored_file: Path | None = None
+    """of a learnt correction that the run begins with"""
 
     def setup(self) -> "Setup":
         """What the lanes are handed."""
@@ -98,7 +109,15 @@ class Scenario:
         return Setup(
             self.stage, self.device, self.plant, self.controller, self.bus, self.trajectory,
             self.config.duration_s, self.config.seed, faults=self.config.faults, clear_s=self.config.clear_s,
+            learning=self.config.learning, stored=self.stored(),
         )  # fmt: skip
+
+    def stored(self) -> Stored | None:
+        """The correction that the run begins with. Raises ``LearningError`` for one that belongs to another run."""
+        if self.config.learning is None:
+            return None
+        here = belongs(self.trajectory, self.stage, self.controller, self.bus)
+        return stored_for(self.config.learning, self.stored_file, here)
 
 
 def load_scenario(
@@ -110,6 +129,7 @@ def load_scenario(
     controller: str | None = None,
     bus: str | None = None,
     faults: Sequence[Fault] = (),
+    learning: dict[str, str] | None = None,
 ) -> Scenario:
     """Read a scenario and all that it names, with what the caller wants otherwise (paths from the working folder).
     ``faults`` come on top of the scenario's own.
@@ -120,7 +140,11 @@ def load_scenario(
     source = config.find("scenarios", name_or_path)
     wanted = {"seed": seed, "stage": stage, "plant": plant, "controller": controller, "bus": bus}
     given = {key: value for key, value in wanted.items() if value is not None}
-    scenario = config.parse({**config.read_toml(source), **given}, ScenarioConfig, str(source))
+    data = {**config.read_toml(source), **given}
+    if learning is not None:
+        own = data.get("learning", {})
+        data["learning"] = {key: value for key, value in own.items() if key != "file"} | learning
+    scenario = config.parse(data, ScenarioConfig, str(source))
     scenario = scenario.model_copy(update={"faults": (*scenario.faults, *faults)})
     parts: dict[str, Any] = {}
     models: dict[str, tuple[str, str, type[BaseModel]]] = {
@@ -147,7 +171,11 @@ def load_scenario(
         check_against(Stage(parts["stage"]), trajectory, drive)
     except TrajectoryError as error:
         raise TrajectoryError(f"{source}: {error}") from None
-    return Scenario(source, scenario, trajectory=trajectory, **parts)
+    file = scenario.learning.file if scenario.learning is not None else None
+    stored_file = None if file is None else (Path() if learning is not None else source.parent) / file
+    loaded = Scenario(source, scenario, trajectory=trajectory, stored_file=stored_file, **parts)
+    loaded.stored()
+    return loaded
 
 
 def _part(kind: str, name_or_path: str, model: type[BaseModel], folder: Path) -> BaseModel:
@@ -163,6 +191,9 @@ def resolve(scenario: Scenario) -> dict[str, Any]:
     for key in ("stage", "plant", "controller", "bus"):
         data[key] = config.plain(getattr(scenario, key))
     tables = {f"reference.{n}": s.source_sha256 for n, s in enumerate(scenario.trajectory.segments) if s.source_sha256}
+    if scenario.stored_file is not None:
+        data["learning"]["file"] = LEARNT_FROM
+        tables["learning"] = hashlib.sha256(scenario.stored_file.read_bytes()).hexdigest()
     if tables:
         data["sha256"] = tables
     return {**data, "digest": config.digest(data)}
@@ -174,9 +205,12 @@ def table_name(n: int) -> str:
 
 
 def tables(scenario: Scenario) -> dict[str, Path]:
-    """The files that the reference is read from, by their names in a run's folder."""
+    """The files that the reference and its correction are read from, by their names in a run's folder."""
     folder = scenario.source.parent
-    return {table_name(n): folder / s.file for n, s in enumerate(scenario.config.reference) if isinstance(s, Table)}
+    learnt = {} if scenario.stored_file is None else {LEARNT_FROM: scenario.stored_file}
+    return learnt | {
+        table_name(n): folder / s.file for n, s in enumerate(scenario.config.reference) if isinstance(s, Table)
+    }
 
 
 def restore(resolved: dict[str, Any], folder: Path) -> Scenario:
@@ -201,7 +235,8 @@ def restore(resolved: dict[str, Any], folder: Path) -> Scenario:
         if segment.source_sha256 != resolved.get("sha256", {}).get(f"reference.{n}"):
             raise ConfigError(f"{folder}: reference.{n}: its table is not the one of the run")
     device = config.parse(resolved["stage"], Device, source)
-    return Scenario(folder, scenario, device=device, trajectory=trajectory, **parts)
+    begins_with = folder / LEARNT_FROM if scenario.learning is not None and scenario.learning.file else None
+    return Scenario(folder, scenario, device=device, trajectory=trajectory, stored_file=begins_with, **parts)
 
 
 def _check_duration(source: Path, scenario: ScenarioConfig, trajectory: Trajectory) -> None:

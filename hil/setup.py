@@ -1,7 +1,7 @@
 """Everything that a run consists of, resolved: what the lanes are handed."""
 
 from dataclasses import dataclass
-from functools import cached_property
+from functools import cached_property, partial
 
 import numpy as np
 from numpy.typing import NDArray
@@ -13,10 +13,13 @@ from pkxyz_ctrl.config import load
 from pkxyz_ctrl.controller_config import ControllerConfig
 from pkxyz_ctrl.drive_limits import count_max, slew_counts
 from pkxyz_ctrl.law_store import law_of
+from pkxyz_ctrl.learning import Learner, LearningConfig, timetable
+from pkxyz_ctrl.learning.store import Stored
 from pkxyz_ctrl.safety.gate import GateConfig
 from pkxyz_ctrl.stage import Stage
 from pkxyz_ctrl.stage_config import StageConfig
 from pkxyz_ctrl.trajectory import Hold, Trajectory
+from pkxyz_ctrl.trajectory.check import DriveLimits, within_limits
 from sim.config import Device, PlantConfig
 from sim.plant import Plant
 
@@ -40,6 +43,9 @@ class Setup:
     """what goes wrong; lockstep lane only"""
     clear_s: float | None = None
     """how long after a fault decision somebody clears the fault; None: nobody does"""
+    learning: LearningConfig | None = None
+    stored: Stored | None = None
+    """the correction of ``learning.file``"""
 
     @property
     def ticks(self) -> int:
@@ -65,6 +71,22 @@ class Setup:
             protection=driver.protection,
             fd=driver.fd,
             drive_timeout_syncs=driver.drive_timeout_syncs,
+        )
+
+    def new_learner(self) -> Learner | None:
+        """One that has seen nothing yet; None for a run that doesn't learn."""
+        if self.learning is None:
+            return None
+        limits, period_us = self.controller.limits, self.bus.period_us
+        drive = DriveLimits(limits.voltage_max_v, limits.slew_max_v_per_s, period_us)
+        return Learner(
+            self.learning,
+            timetable(self.trajectory, period_us),
+            self.trajectory,
+            period_us,
+            partial(within_limits, Stage(self.stage), drive=drive),
+            float(self.law["tick"]["estimator"]["sense_delay_s"][0]),
+            self.stored,
         )
 
     def new_plant(self) -> Plant:

@@ -7,6 +7,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from hil import lanes
+from hil.learning_run import Learning
 from hil.metrics import Metrics
 from hil.recording import RecordingWriter
 from hil.run_folder import RunFolder, metadata_of, summarise
@@ -25,6 +26,7 @@ def run_into(
     require_bus(scenario, lane)
     resolved = folder.write_config(scenario)
     metrics = Metrics(scenario.trajectory, scenario.bus.period_us)
+    learning = Learning(scenario) if scenario.config.learning is not None else None
     result: lanes.LaneResult | None = None
     interrupted = False
     with RecordingWriter(folder.recording, metadata_of(scenario, lane, resolved)) as recording:
@@ -32,6 +34,8 @@ def run_into(
         def on_block(block: NDArray[np.void]) -> None:
             recording.write(block)
             metrics.update(block)
+            if learning is not None:
+                learning.errors.update(block)
 
         try:
             setup = scenario.setup()
@@ -46,6 +50,8 @@ def run_into(
             "bus_load": result.bus_load,
             "realtime_factor": result.realtime_factor,
         }
+    if learning is not None:
+        figures |= learning.close(folder, result.learner if result is not None else None, resolved["digest"])
     summary = summarise(scenario, lane, resolved["digest"], figures, interrupted=interrupted)
     folder.write_summary(summary)
     return summary
@@ -69,3 +75,7 @@ def draw(folder: RunFolder, summary: dict[str, Any]) -> None:
     from hil.report import draw_report  # matplotlib takes as long to import as a run takes
 
     draw_report(folder.recording, folder.frames, summary, folder.picture)
+    if summary.get("learning_factor") is not None:
+        from hil.learning_figure import draw_learning
+
+        draw_learning(folder.recording, summary, folder.learning_picture)

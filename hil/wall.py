@@ -9,11 +9,13 @@ import numpy as np
 
 from hil.blocks import PREVIEW_ROWS
 from hil.ending import Ended, Ending
+from hil.learning_run import Learning
 from hil.metrics import Metrics
 from hil.recording import Recording
 from hil.run_folder import RunFolder, metadata_of, summarise
 from hil.scenario import Scenario
 from hil.setup import Setup
+from hil.wall_learning import LiveReference
 from hil.wall_recorder import WallRecorder
 from pkxyz_ctrl import cycle as cycling
 from pkxyz_ctrl.bus_config import BusConfig, CanConfig
@@ -23,6 +25,7 @@ from pkxyz_ctrl.controller import Controller
 from pkxyz_ctrl.io.can_port import CanPort, open_bus
 from pkxyz_ctrl.io.clocks import TickClock, WallClock, percentile_us
 from pkxyz_ctrl.io.realtime import go_real_time, leave_real_time, settle_memory
+from pkxyz_ctrl.learning import Learner
 from pkxyz_ctrl.row import ROW, TRUTH_FIELDS
 from pkxyz_ctrl.runtime import run, start
 from pkxyz_ctrl.safety.gate import GateConfig
@@ -45,6 +48,7 @@ class WallResult:
     lateness_us: list[int] = dataclasses.field(default_factory=list)
     """wake-ups by whole microseconds of lateness"""
     refused_frames: int = 0
+    learner: Learner | None = None
 
 
 def require_real_bus(bus: BusConfig) -> CanConfig:
@@ -99,6 +103,10 @@ class WallRig:
         self._reference = setup.trajectory.sample(
             0, setup.trajectory.duration_us // setup.bus.period_us + PREVIEW_ROWS + 1, setup.bus.period_us
         )
+        learner = setup.new_learner()
+        self.live = None if learner is None else LiveReference(setup.trajectory, setup.bus.period_us, learner)
+        if self.live is not None:
+            self._reference = self.live.rows
         _warm_up(law, self._reference)
         self._bus = open_bus(can_config, setup.bus.name)
         self.clock = WallClock()
@@ -123,7 +131,15 @@ class WallRig:
         self._started = True
         start(self.clock, _Interruptible(self.port, self._ending), self.controller)
         reference, row, take = self._reference, self.controller.row, self._recorder.row
-        run(self.ticks, self.port, self.controller, lambda tick: reference, self.setup.ticks, lambda tick: take(row))
+        live, memory = self.live, self.controller.memory
+
+        def record_and_learn(tick: int) -> None:
+            take(row)
+            if live is not None:
+                live.after(memory)
+
+        record = record_and_learn if live is not None else lambda tick: take(row)
+        run(self.ticks, self.port, self.controller, lambda tick: reference, self.setup.ticks, record)
 
     def close(self) -> None:
         """0 V, pre-operational, and off the bus."""
@@ -177,9 +193,12 @@ def run_into(folder: RunFolder, scenario: Scenario, say: Any) -> tuple[dict[str,
             result.ended_by = end.signal_number
         finally:
             recorder.close()
-    summary = summarise(
-        scenario, LANE, resolved["digest"], _figures(folder, scenario, result), interrupted=bool(result.ended_by)
-    )
+    figures = _figures(folder, scenario, result)
+    if scenario.config.learning is not None:
+        learning = Learning(scenario)
+        learning.errors.look_at(Recording.open(folder.recording))
+        figures |= learning.close(folder, result.learner, resolved["digest"])
+    summary = summarise(scenario, LANE, resolved["digest"], figures, interrupted=bool(result.ended_by))
     folder.write_summary(summary)
     return summary, result
 
@@ -200,6 +219,7 @@ def _run(rig: WallRig, result: WallResult, say: Any) -> None:
             result.faults = tuple(rig.controller.faults)
             result.lateness_us = rig.ticks.lateness_us
             result.refused_frames = rig.can_port.refused
+            result.learner = rig.live.learner if rig.live is not None else None
 
 
 def _figures(folder: RunFolder, scenario: Scenario, result: WallResult) -> dict[str, Any]:

@@ -20,6 +20,11 @@ from pkxyz_ctrl.safety.trips import Trip, explain
 
 Array = NDArray[np.float64]
 Send = Callable[[Frame], object]
+_WIDTHS = (
+    9,
+    12,
+    15,
+)  # of a reference: the trajectory, an excitation, what was asked for where the trajectory is shifted
 
 _IDLE = int(Mode.IDLE)
 
@@ -206,9 +211,9 @@ class Controller:
 
 def _require_rows(reference: Array) -> None:
     """The compiled cycle doesn't look at what it is given, so it is looked at here, once for each block of rows."""
-    if reference.dtype != np.float64 or reference.ndim != 2 or reference.shape[1] not in (9, 12) or len(reference) == 0:
+    if reference.dtype != np.float64 or reference.ndim != 2 or reference.shape[1] not in _WIDTHS or len(reference) == 0:
         raise ValueError(
-            f"a reference is (n, 9) or (n, 12) float64 with n > 0, not {reference.shape} {reference.dtype}"
+            f"a reference is (n, 9), (n, 12) or (n, 15) float64 with n > 0, not {reference.shape} {reference.dtype}"
         )
     if not reference.flags.c_contiguous:
         raise ValueError("the rows of a reference must follow one another in memory (numpy.ascontiguousarray)")

@@ -61,6 +61,7 @@ MEMORY = np.dtype(
         ("observation", OBSERVATION),
         ("row", ROW),
         ("setpoint", "f8", (9,)),  # what is held while enabled and not tracking
+        ("asked_m", "f8", (3,)),  # position that is asked for at this sample: "here" without a learnt shift
         ("here", "f8", (9,)),  # rows of the reference: at this sample ...
         ("now", "f8", (9,)),  # ... and where this tick's force begins and ends to act
         ("after", "f8", (9,)),
@@ -84,6 +85,7 @@ MEMORY = np.dtype(
 )
 
 _ROW_LENGTH = 9
+_ASKED = 12  # column of the reference from which on the unshifted position stands
 _UNUSABLE = int(SenseStatus.MISSING | SenseStatus.CRC | SenseStatus.LENGTH | SenseStatus.DUPLICATE)
 _IMPLAUSIBLE = int(SenseStatus.IMPLAUSIBLE)
 _NONE, _HOME, _HOMED, _ENABLE, _TRACK, _TRIP, _CLEAR = (
@@ -104,7 +106,7 @@ def new_memory(mode: Mode = Mode.BOOT) -> NDArray[np.void]:
 @njit(cache=True)
 def cycle(law_array: Records, memory_array: Records, reference: Array) -> None:
     """One period. ``law_array`` (1,) of ``LAW``, ``memory_array`` (1,) of ``MEMORY``, ``reference`` (n, 9) rows of
-    the trajectory, or (n, 12) with an excitation.
+    the trajectory, or (n, 12) with an excitation, or (n, 15) where the rows are shifted: last the position asked for.
 
     Row ``reference_tick - reference_base`` is the set-point at this sample; the law looks up to four rows further.
     Rows before the first and past the last are taken as the first and the last. The excitation, in m, is added to
@@ -135,6 +137,7 @@ def observe(law_array: Records, memory_array: Records, reference: Array) -> None
         memory["tick"]["estimate"]["innovation_m"][:] = memory["surprise_m"]
     delay = law["tick"]["delay_periods"]
     reference_row(law, memory, reference, 0, memory["here"])
+    _asked_for(memory, reference)
     reference_row(law, memory, reference, delay, memory["now"])
     reference_row(law, memory, reference, delay + 1, memory["after"])
     reference_row(law, memory, reference, delay + 2, memory["later"])
@@ -330,6 +333,18 @@ def reference_row(law: np.void, memory: np.void, reference: Array, ahead: int, o
 
 
 @njit(cache=True)
+def _asked_for(memory: np.void, reference: Array) -> None:
+    """Note the position asked for at this sample, for the record; while the path stops or starts, with its shift."""
+    asked = memory["asked_m"]
+    asked[:] = memory["here"][0:3]
+    on_time = memory["pace"] == pace.STEADY and memory["phase"] == 0.0
+    if reference.shape[1] > _ASKED and memory["mode"] == _TRACKING and on_time:
+        index = min(max(memory["reference_tick"] - memory["input"]["reference_base"], 0), len(reference) - 1)
+        for i in range(3):
+            asked[i] = reference[index, _ASKED + i]
+
+
+@njit(cache=True)
 def _monitor(law: np.void, memory: np.void, saturated: int) -> int:
     """Let the monitors look at this tick; a trip takes the voltages of this very tick to 0."""
     seen, state, obs = memory["input"], memory["tick"], memory["observation"]
@@ -358,7 +373,7 @@ def _monitor(law: np.void, memory: np.void, saturated: int) -> int:
 def _write_row(law: np.void, memory: np.void, trips: int, saturated: int) -> None:
     row, seen, state = memory["row"], memory["input"], memory["tick"]
     estimate, drive, origin = state["estimate"], law["tick"]["drive"], law["tick"]["estimator"]["operating_point_m"]
-    setpoint = memory["here"]
+    asked = memory["asked_m"]
     row["t_us"] = memory["tick_index"] * law["period_us"]
     row["tick"] = memory["tick_index"]
     row["reference_tick"] = memory["reference_tick"] if memory["mode"] == _TRACKING else -1
@@ -371,7 +386,7 @@ def _write_row(law: np.void, memory: np.void, trips: int, saturated: int) -> Non
     for i in range(3):
         row["sense_count"][i] = seen["sense_count"][i]
         row["drive_count"][i] = state["count"][0, i]
-        row["reference_m"][i] = setpoint[i]
+        row["reference_m"][i] = asked[i]
         row["measurement_m"][i] = state["measurement_m"][i]
         row["estimate_m"][i] = origin[i] + estimate["filtered"][i]
         row["estimate_m_per_s"][i] = estimate["filtered"][3 + i]

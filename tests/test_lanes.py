@@ -9,7 +9,6 @@ import pytest
 from loop_rig import bus, first_difference, rows_of, setup, shortened
 
 import hil.blocks
-import hil.lockstep
 from hil import lanes
 from hil.blocks import Blocks
 from hil.lockstep import LockstepRig
@@ -87,7 +86,6 @@ def test_the_ends_of_blocks_do_not_show(lane, length, monkeypatch):
     short = shortened(setup("mild"), 1300)
     whole, _ = rows_of(short, lane)
     monkeypatch.setattr(hil.blocks, "BLOCK_TICKS", length)
-    monkeypatch.setattr(hil.lockstep, "BLOCK_TICKS", length)
     sizes, done = [], []
     blocks = []
 

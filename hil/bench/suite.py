@@ -6,9 +6,9 @@ from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import Any
 
-from hil.bench import control, lanes, limits, parts, plant, quality, startup, tick
+from hil.bench import control, lanes, learning, limits, parts, plant, quality, startup, tick
 from hil.bench.figure import Figure
-from hil.run_folder import versions
+from hil.versions import versions
 from pkxyz_ctrl.config import ConfigError
 
 Measurement = Callable[[], list[Figure]]
@@ -22,6 +22,7 @@ MEASUREMENTS: dict[str, Measurement] = {
     "nominal": quality.nominal,
     "mild": quality.mild,
     "harsh": quality.harsh,
+    "learning": learning.learning,
     "control": control.control,
     "controller": parts.controller,
     "codec": parts.codec,

@@ -59,6 +59,8 @@ class TimedSegment:
     """of a periodic motion; 0 for others"""
     source_sha256: str | None = None
     """digest of the file that it was read from, if there is one"""
+    period_s: float | None = None
+    """after which the scan repeats itself, if it does"""
 
 
 class Trajectory:
@@ -99,6 +101,7 @@ class Trajectory:
                     tuple(start_us + math.ceil(t * 1e6 - 1e-3) for t in plan.jumps_s),
                     plan.highest_hz,
                     plan.source_sha256,
+                    plan.period_s,
                 )
             )
             start_us += length_us

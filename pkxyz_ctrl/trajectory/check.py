@@ -86,6 +86,18 @@ def comb_forces(stage: Stage, rows: Array) -> Array:
     return np.linalg.solve(np.swapaxes(stage.jacobian(position), -1, -2), demand[..., None])[..., 0]
 
 
+def within_limits(stage: Stage, rows: Array, drive: DriveLimits) -> bool:
+    """Whether rows (n, 9), a period of the drive apart, keep strokes, pulls, voltages and slew within the limits."""
+    if _first_outside(stage, rows[:, 0:3]) is not None:
+        return False
+    force = comb_forces(stage, rows)
+    limit_v = min(stage.voltage_max_v, drive.voltage_max_v)
+    if _first_beyond(stage, rows, np.zeros(len(rows), np.int64), force, limit_v) is not None:
+        return False
+    change_v = np.abs(np.diff(np.sqrt(np.maximum(force, 0.0) / stage.force_gain_n_per_v2), axis=0))
+    return bool((change_v <= drive.slew_max_v_per_s * drive.period_us * 1e-6).all())
+
+
 _Refusal = tuple[int, Array, str]
 
 

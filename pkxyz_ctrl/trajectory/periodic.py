@@ -4,6 +4,7 @@ The amplitude grows from nothing and goes back to nothing, so each starts and en
 """
 
 import math
+from fractions import Fraction
 from typing import Annotated, Literal, Self
 
 import numpy as np
@@ -116,4 +117,15 @@ def unit(axis: Axis) -> Array:
 def planned(tones: Tones) -> Plan:
     """The scan is the full amplitude."""
     scan_s = (tones.lead_s, tones.lead_s + tones.full_s)
-    return Plan((tones,), tones.centre_m, scan_s=scan_s, highest_hz=float(np.abs(tones.frequency_hz).max()))
+    highest_hz = float(np.abs(tones.frequency_hz).max())
+    return Plan((tones,), tones.centre_m, scan_s=scan_s, highest_hz=highest_hz, period_s=common_period_s(tones))
+
+
+def common_period_s(tones: Tones) -> float | None:
+    """The shortest time in which every tone, its frequency as it is written in decimals, does whole periods."""
+    moving = (tones.amplitude_m != 0) & (tones.frequency_hz != 0)
+    written = [Fraction(repr(abs(f))) for f in tones.frequency_hz[moving].tolist()]
+    if not written:
+        return None
+    denominator = math.lcm(*(f.denominator for f in written))
+    return float(denominator / math.gcd(*(int(f * denominator) for f in written)))

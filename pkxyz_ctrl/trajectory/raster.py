@@ -1,9 +1,10 @@
 """Raster scan in three dimensions: lines along x, steps along y during the turn-around, layers along z, to and fro."""
 
 import math
-from typing import Literal, NamedTuple
+from typing import Literal, NamedTuple, Self
 
 import numpy as np
+from pydantic import model_validator
 
 from pkxyz_ctrl.config import FrozenModel
 from pkxyz_ctrl.trajectory.motion import Array, TrajectoryError, at_rest
@@ -28,11 +29,22 @@ class Raster(FrozenModel):
     line_pitch_m: NotNegative
     layers: Count = 1
     layer_pitch_m: NotNegative = 0.0
+    frames: Count = 1
+    """how often the block is scanned; from its last line the scan goes back to its first, in one turn-around"""
     line_rate_hz: Positive
     """lines a second; a line's period holds one pass and one turn-around"""
     velocity_max_m_per_s: Positive
     acceleration_max_m_per_s2: Positive
     jerk_max_m_per_s3: Positive
+
+    @model_validator(mode="after")
+    def _comes_back(self) -> Self:
+        if self.frames > 1 and self.lines * self.layers % 2:
+            raise ValueError(
+                f"{self.lines * self.layers} lines end on the far side of the first one; with frames, the number of "
+                "lines in all layers has to be even"
+            )
+        return self
 
     def plan(self, start_m: Array) -> Plan:
         """Lead-in, lines and turn-arounds, lead-out to the centre."""
@@ -41,7 +53,7 @@ class Raster(FrozenModel):
         speed = self.line_speed_m_per_s()
         line_s = self.line_length_m / speed
         turn_s = 1 / self.line_rate_hz - line_s
-        starts = self._line_starts(centre, speed)
+        starts = self._line_starts(centre, speed) * self.frames
         lead_in = travel(at_rest(start_m), starts[0], limits)
         parts: list[Pieces] = [lead_in]
         for n, start in enumerate(starts):
@@ -54,12 +66,13 @@ class Raster(FrozenModel):
         lines = tuple(
             (begin + n / self.line_rate_hz, begin + n / self.line_rate_hz + line_s) for n in range(len(starts))
         )
-        return Plan((joined(parts),), centre, scan_s=(begin, lines[-1][1]), lines_s=lines)
+        period_s = self.lines * self.layers / self.line_rate_hz if self.frames > 1 else None
+        return Plan((joined(parts),), centre, scan_s=(begin, lines[-1][1]), lines_s=lines, period_s=period_s)
 
     def line_speed_m_per_s(self) -> float:
         """Least speed at which pass and turn-around fit the line's period; ``TrajectoryError`` if none does."""
         v_max, a, j = limits = self._limits()
-        step_s = step_time_s(max(self.line_pitch_m, self.layer_pitch_m if self.layers > 1 else 0.0), limits)
+        step_s = step_time_s(self._longest_step_m(), limits)
 
         def period_s(v: float) -> float:
             return self.line_length_m / v + max(reversal_time_s(v, a, j), step_s)
@@ -80,6 +93,13 @@ class Raster(FrozenModel):
 
     def _limits(self) -> Limits:
         return Limits(self.velocity_max_m_per_s, self.acceleration_max_m_per_s2, self.jerk_max_m_per_s3)
+
+    def _longest_step_m(self) -> float:
+        """Along y or z, in a turn-around."""
+        steps = [self.line_pitch_m, self.layer_pitch_m if self.layers > 1 else 0.0]
+        if self.frames > 1:
+            steps += [(self.lines - 1) * self.line_pitch_m, (self.layers - 1) * self.layer_pitch_m]
+        return max(steps)
 
     def _line_starts(self, centre: Array, speed: float) -> list[Array]:
         """State (3, 3) at the start of each line."""

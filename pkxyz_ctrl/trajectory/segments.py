@@ -41,6 +41,8 @@ class Plan(NamedTuple):
     """the highest frequency of a periodic motion: a check has to look as closely as that"""
     source_sha256: str | None = None
     """digest of the file that it was read from"""
+    period_s: float | None = None
+    """after which the scan repeats itself, if it does"""
 
 
 class Hold(FrozenModel):

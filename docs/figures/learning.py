@@ -1,0 +1,15 @@
+"""Writes docs/figures/learning.png: what a run of ``frames_harsh`` learns."""
+
+import shutil
+import tempfile
+from pathlib import Path
+
+from hil.run_folder import RunFolder
+from hil.scenario import load_scenario
+from hil.sil import draw, run_into
+
+if __name__ == "__main__":
+    with tempfile.TemporaryDirectory() as scratch:
+        folder = RunFolder(Path(scratch) / "frames")
+        draw(folder, run_into(folder, load_scenario("frames_harsh"), "fast", lambda done, total: None))
+        shutil.copy(folder.learning_picture, Path(__file__).with_suffix(".png"))
