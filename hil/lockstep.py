@@ -40,6 +40,7 @@ class WirePort:
         self.send: Callable[[Frame], object] = endpoint.send
         self.receive = endpoint.receive
         self.unsent = endpoint.pending
+        self.discard_unsent = endpoint.flush
         if clock is not None and latency_us > 0:
 
             def send_late(frame: Frame) -> None:
@@ -92,7 +93,7 @@ class LockstepRig:
         latency_us = (setup.bus.delay_periods - 1) * setup.bus.period_us
         self._endpoint = self.wire.attach("controller")
         self.port: Port = WirePort(self._endpoint, self.clock, latency_us)
-        self.controller = Controller(setup.law, setup.bus, setup.gate, self.port.send)
+        self.controller = Controller(setup.law, setup.bus, setup.gate, self.port.send, self.port.discard_unsent)
         self.injection = Injection(self) if setup.faults or setup.clear_s is not None else None
         self.log = FrameLog(frame_log, can.channel) if frame_log is not None else None
         if self.log is not None:

@@ -165,7 +165,7 @@ class AmplifierNode:
         self.emergency.reset()
         for code in sorted(self._holds):
             self.emergency.begin(code)
-        self._drive.configure()
+        self._drive.reset()
         self._sense.configure()
         self._boot_alarm.set(self._clock.now_us + self._boot_us)
 
@@ -244,6 +244,7 @@ class AmplifierNode:
         if silent == self.od[0x2010, 0] and any(self.outputs):
             self._drive_errors.bad(ErrorCode.DRIVE_MISSING, t_us, bytes((silent,)))
             self._outputs_to_error_value()
+            self._drive.demand_zero()
 
     def _set_outputs(self, counts: Counts, t_us: int) -> None:
         self._drive.pending = None
@@ -268,6 +269,8 @@ class AmplifierNode:
     def _release(self, code: int) -> None:
         self._holds.discard(code)
         self._drive.start()
+        if self.state is NmtState.OPERATIONAL:
+            self._drive.demand_zero()
         self._admit()
         self.emergency.end(code)
 

@@ -20,6 +20,9 @@ class DriveReceiver:
     A count is valid from 0 to the high limit that the EDS gives to object 0x6411. The alive counter must be one more
     than that of the last frame with a correct CRC, whether that one passed or not: after a lost frame one more is
     refused, and the sequence goes on. The first frame after `start` may carry any.
+
+    Once the node has released the combs by itself (`demand_zero`), only 0 V passes first: what was queued somewhere on
+    the way while the bus was blocked comes late, and must not energise them again.
     """
 
     def __init__(
@@ -33,6 +36,7 @@ class DriveReceiver:
         self.pending: Counts | None = None
         self.counter: int | None = None  # of the last frame with a correct CRC
         self.crc = 0
+        self._is_zero_due = False
         self.configure()
 
     def configure(self) -> None:
@@ -49,6 +53,17 @@ class DriveReceiver:
         """Forget what came before: nothing pending, and any alive counter may come next."""
         self.pending = None
         self.counter = None
+
+    def reset(self) -> None:
+        """As after power-up."""
+        self.start()
+        self.configure()
+        self._is_zero_due = False
+
+    def demand_zero(self) -> None:
+        """Let nothing pass until a frame with 0 V has."""
+        self.pending = None
+        self._is_zero_due = True
 
     def _receive_protected(self, data: bytes, t_us: int) -> None:
         try:
@@ -67,9 +82,15 @@ class DriveReceiver:
         if a > limit or b > limit or c > limit:
             self._errors.bad(ErrorCode.DRIVE_VALUE, t_us, _channels_over((a, b, c), limit))
             return
+        if self._is_zero_due and not self._zeroed((a, b, c)):
+            return
         self.pending = (a, b, c)
         if self._errors.present:
             self._errors.good(t_us)
+
+    def _zeroed(self, counts: Counts) -> bool:
+        self._is_zero_due = any(counts)
+        return not self._is_zero_due
 
     def _receive_mapped(self, data: bytes, t_us: int) -> None:
         """The same for any mapping; a channel that is not mapped keeps its value."""
@@ -94,6 +115,8 @@ class DriveReceiver:
                 words[subindex - 1] = value & 0xFFFF
         if max(words) > self._limit:
             self._errors.bad(ErrorCode.DRIVE_VALUE, t_us, _channels_over(words, self._limit))
+            return
+        if self._is_zero_due and not self._zeroed((words[0], words[1], words[2])):
             return
         self.pending = (words[0], words[1], words[2])
         if self._errors.present:

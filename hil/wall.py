@@ -112,7 +112,9 @@ class WallRig:
         self.clock = WallClock()
         self.can_port = CanPort(self._bus, self.clock, can_config.sense_deadline_us // 2)
         self.port = _LoggedPort(self.can_port, self.clock, recorder)
-        self.controller = Controller(law, setup.bus, wall_gate(setup.gate), self.port.send)
+        self.controller = Controller(
+            law, setup.bus, wall_gate(setup.gate), self.port.send, self.can_port.discard_unsent
+        )
         for name, *_ in TRUTH_FIELDS:
             self.controller.memory["row"][name] = np.nan  # nobody here knows it
         self._guard_us = setup.bus.period_us // _GUARDS_PER_PERIOD

@@ -36,11 +36,19 @@ class StartUpError(RuntimeError):
 class Controller:
     """One stage under control.
 
-    ``send`` takes every frame that may go out. ``faults`` collects a sentence for each fault decision. ``memory`` is
+    ``send`` takes every frame that may go out; ``discard_unsent`` drops those that still wait, so that no voltage of
+    before follows a fault decision. ``faults`` collects a sentence for each fault decision. ``memory`` is
     the (1,) array of ``cycle.MEMORY`` that the cycle works on, ``row`` the bytes of its latest record.
     """
 
-    def __init__(self, law: NDArray[np.void], bus: BusConfig, gate: GateConfig, send: Send) -> None:
+    def __init__(
+        self,
+        law: NDArray[np.void],
+        bus: BusConfig,
+        gate: GateConfig,
+        send: Send,
+        discard_unsent: Callable[[], object] = lambda: None,
+    ) -> None:
         if bus.can is None:
             raise ValueError(f"bus {bus.name!r} has no [can]: nothing to control over")
         self.can: CanConfig = bus.can
@@ -51,6 +59,7 @@ class Controller:
         self.law = law
         self.memory = cycling.new_memory(Mode.BOOT)
         self._send = send
+        self._discard_unsent = discard_unsent
         row_at = dict(cycling.MEMORY.fields or {})["row"][1]
         self.row = self.memory.view(np.uint8).data[row_at : row_at + ROW.itemsize]
         self.mode = int(Mode.BOOT)
@@ -202,6 +211,7 @@ class Controller:
         if was == Mode.FAULT:
             self._restart_due = True
         if mode == Mode.FAULT:
+            self._discard_unsent()
             row = self.memory["row"][0]
             reason = explain(int(row["trips"]))
             emergencies = "".join(f"; {e}" for e in self.driver.emergencies)

@@ -3,7 +3,9 @@
 import numpy as np
 import pytest
 
+from hil.endpoint import Endpoint
 from hil.faults.catalogue import KINDS
+from hil.node_drive import DriveReceiver
 from hil.recording import Recording
 from hil.soak import random_faults, soak
 
@@ -42,3 +44,18 @@ def test_faults_are_those_of_the_seed_and_of_every_family():
     assert {f.family for f in faults} == set(KINDS)
     assert all(f.end_us is not None and f.end_us < 600e6 for f in faults)
     assert not any(f.kind == "killed" for f in faults)
+
+
+@pytest.mark.parametrize("missing", ["nothing", "the controller's part", "the node's part"])
+def test_no_voltage_of_before_follows_a_blocked_bus(tmp_path, monkeypatch, missing):
+    """Frames that waited while somebody babbled would come after the fault decision: the controller drops them, and the
+    node takes none before one with 0 V. Either is enough; without both a comb goes from 0 to 135 V in a tick.
+    """
+    if missing == "the controller's part":
+        monkeypatch.setattr(Endpoint, "flush", lambda self: None)
+    if missing == "the node's part":
+        monkeypatch.setattr(DriveReceiver, "demand_zero", lambda self: None)
+    found = soak(3.2, 1, "lqg", tmp_path)
+    assert found.decisions >= 3
+    assert found.voltage_max_v > 100.0
+    assert found.slew_max_v < 31.0  # an amplifier's offset of 30 V is among the faults

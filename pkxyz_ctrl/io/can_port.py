@@ -1,6 +1,7 @@
 """Any python-can bus as ``runtime.Port``. The only place in this package that knows python-can."""
 
 import time
+from contextlib import suppress
 from typing import Any, Protocol
 
 import can
@@ -111,3 +112,8 @@ class CanPort:
     def unsent(self) -> int:
         """0: python-can doesn't tell what still waits."""
         return 0
+
+    def discard_unsent(self) -> None:
+        """Empty the transmit queue of interfaces that can; the kernel's sockets can't."""
+        with suppress(can.CanError, OSError, NotImplementedError):
+            self._bus.flush_tx_buffer()
