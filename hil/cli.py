@@ -17,6 +17,7 @@ from hil import (
     check_amplifier_cli,
     compare_cli,
     faults_cli,
+    identify_cli,
     latency_cli,
     margins_cli,
     mechanics_cli,
@@ -163,6 +164,7 @@ app.command("margins")(margins_cli.margins)
 app.command("montecarlo")(montecarlo_cli.montecarlo)
 app.command("tune")(tune_cli.tune)
 app.command("compare")(compare_cli.compare)
+app.command("identify")(identify_cli.identify)
 app.command("paper")(mechanics_cli.paper)
 app.command("workspace")(mechanics_cli.workspace)
 app.command("design")(mechanics_cli.design)

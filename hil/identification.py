@@ -1,0 +1,219 @@
+"""Identification of a stage in its running loop: the excitation that does it, its response, its modes."""
+
+import importlib.metadata
+from collections.abc import Callable
+from dataclasses import dataclass
+from typing import Any, Literal
+
+import numpy as np
+from numpy.typing import NDArray
+
+from hil.excitation import Excitation, excitation, tones
+from hil.measured_loop import at_point
+from hil.outside_scale import OutsideScale
+from hil.plant_response import PlantResponse, measure_plant
+from hil.setup import Setup
+from pkxyz_ctrl.config import digest, plain
+from pkxyz_ctrl.design.loop_plant import loop_plant
+from pkxyz_ctrl.design.modal_fit import MODES, ModalFit, fit_modes
+from pkxyz_ctrl.stage import Stage
+
+Array = NDArray[np.float64]
+
+
+@dataclass(frozen=True)
+class Identification:
+    """What was found, and from what: the setup as it was run, on its point, with its excitation."""
+
+    setup: Setup
+    lane: str
+    kind: Literal["multisine", "stepped"]
+    response: PlantResponse
+    modes: ModalFit
+    outside: OutsideScale | None = None
+    """what an instrument saw, if there was one"""
+
+    @property
+    def chain_gain(self) -> tuple[Array, Array]:
+        """(3,) sense gain times comb gain over mass of each chain, relative to the stage file, and its deviation."""
+        stage, analog = Stage(self.setup.stage), self.setup.bus.analog
+        j = stage.jacobian(stage.forward_kinematics(self.response.strokes_m))
+        drawn = np.diag(j @ j.T) * stage.force_gain_n_per_v2 / stage.config.dynamics.mass_kg
+        drawn = drawn * stage.sense_gradient_f_per_m / analog.sense_farad_per_count
+        found = self.modes
+        return np.diag(found.acceleration_gain) / drawn, np.diag(found.acceleration_gain_deviation) / drawn
+
+    @property
+    def comb_gain(self) -> tuple[Array, Array] | None:
+        """(3,) comb gains relative to the stage file, if its mass is right, and their deviation; None without an
+        outside reference. What lifts the combs' fingers counts as pull.
+        """
+        if self.outside is None:
+            return None
+        product, deviation = self.chain_gain
+        gain, relative = (
+            product / self.outside.sense_gain,
+            np.hypot(deviation / product, self.outside.deviation / self.outside.sense_gain),
+        )
+        return gain, gain * relative
+
+    @property
+    def drawn_hz(self) -> Array:
+        """(3,) modes of the stage file at that point, under the forces that hold it."""
+        return modes_hz(self.setup, self.response.strokes_m)
+
+
+def modes_hz(setup: Setup, strokes_m: Array) -> Array:
+    """Natural frequencies (3,) in ascending order by the stage file, about a point, under the forces that hold it."""
+    stage = Stage(setup.stage)
+    held = loop_plant(stage, setup.bus, strokes_m).stiffness_n_per_m
+    return np.asarray(np.sqrt(np.linalg.eigvalsh(held) / stage.config.dynamics.mass_kg) / (2.0 * np.pi))
+
+
+def exciting(
+    setup: Setup, strokes_m: Array, kind: Literal["multisine", "stepped"], amplitude_m: float, periods: int
+) -> Excitation:
+    """All tones at once in periods of 1 s, or, in periods of 0.1 s, one after another, more of them about the modes."""
+    seconds = 1.0 if kind == "multisine" else 0.1
+    period_ticks = round(seconds / setup.bus.period_s)
+    bins = tones(period_ticks, 120, 5) if kind == "multisine" else tones(period_ticks, 14, 1)
+    if kind == "stepped":
+        hz = modes_hz(setup, strokes_m)
+        near = np.linspace(0.85 * hz.min(), 1.15 * hz.max(), 24) * seconds
+        bins = np.unique(np.r_[bins, np.round(near).astype(np.int64)])
+        bins = bins[bins < period_ticks // 2]
+    return excitation(
+        kind, bins, period_ticks=period_ticks, periods=periods, amplitude_m=amplitude_m, first_tick=0, seed=setup.seed
+    )
+
+
+def identify(
+    setup: Setup,
+    strokes_m: Array,
+    lane: str,
+    *,
+    kind: Literal["multisine", "stepped"] = "multisine",
+    amplitude_m: float = 5e-9,
+    periods: int = 6,
+    on_progress: Callable[[int, int], None] = lambda done, total: None,
+) -> Identification:
+    """Excite the loop of a setup about the position of ``strokes_m`` (3,) and fit the modes. Raises
+    ``MeasurementError`` where the loop opens, ``FitError`` where the response doesn't tell the modes.
+    """
+    run = at_point(setup, strokes_m, exciting(setup, strokes_m, kind, amplitude_m, periods))
+    response = measure_plant(run, lane, on_progress)
+    modes = fit_modes(
+        response.frequency_hz,
+        response.drive_v2,
+        response.sense_count,
+        response.noise_count,
+        period_s=response.period_s,
+        delay_periods=response.delay_periods,
+        start_hz=modes_hz(run, strokes_m),
+        start_damping=0.5 / setup.stage.dynamics.quality_factor,
+    )
+    return Identification(run, lane, kind, response, modes)
+
+
+def provenance(found: Identification) -> dict[str, Any]:
+    """What decides about the result, with a digest of all of it: equal digest, equal bits."""
+    setup, added = found.setup, found.setup.excitation
+    assert added is not None
+    inputs = {
+        "stage": plain(setup.stage), "plant": setup.plant.model_dump(mode="json"), "bus": plain(setup.bus),
+        "controller": plain(setup.controller), "seed": setup.seed, "tones": found.kind,
+        "bins": [p.bins.tolist() for p in added.passages], "period_ticks": added.period_ticks,
+        "periods": added.periods, "amplitude_m": added.amplitude_m,
+        "strokes_m": [float(q) for q in found.response.strokes_m],
+    }  # fmt: skip
+    return {
+        "stage": setup.stage.name, "plant": setup.plant.name, "controller": setup.controller.name,
+        "bus": setup.bus.name, "lane": found.lane, "seed": setup.seed, "tones": found.kind,
+        "amplitude_nm": added.amplitude_m * 1e9, "periods": added.periods, "digest": digest(inputs),
+        "versions": {name: importlib.metadata.version(name) for name in ("pkxyz-ctrl", "numpy", "scipy")},
+    }  # fmt: skip
+
+
+def as_data(found: Identification) -> dict[str, Any]:
+    """Plain data of all that was found, with standard errors."""
+    modes, response, zero = found.modes, found.response, found.response.zero
+    return provenance(found) | {
+        "strokes_um": _list(response.strokes_m * 1e6),
+        "voltage_v": _list(np.sqrt(response.mean_v2)),
+        "modes": [
+            {
+                "frequency_hz": float(modes.frequency_hz[i]),
+                "frequency_error_hz": float(modes.frequency_deviation_hz[i]),
+                "drawn_hz": float(found.drawn_hz[i]),
+                "damping": float(modes.damping[i]),
+                "damping_error": float(modes.damping_deviation[i]),
+                "quality_factor": float(0.5 / modes.damping[i]),
+            }
+            for i in range(MODES)
+        ],
+        "static_gain_count_per_v2": [_list(row) for row in modes.static_gain],
+        "static_gain_error_count_per_v2": [_list(row) for row in modes.static_gain_deviation],
+        "sense_zero": {
+            "offset_f": _list(zero.offset_f),
+            "offset_count": _list(zero.offset_count),
+            "error_f": _list(zero.deviation_f),
+            "samples": zero.samples,
+        },
+        "fit": {
+            "chi_square": modes.chi_square,
+            "noise_alone": modes.noise_alone,
+            "tones": len(response.frequency_hz),
+            "lowest_hz": modes.used_hz[0],
+            "highest_hz": modes.used_hz[1],
+            "least_coherence": float(response.coherence[response.frequency_hz <= modes.used_hz[1]].min()),
+        },
+        "chain_gain": _list(found.chain_gain[0]),
+        "chain_gain_error": _list(found.chain_gain[1]),
+        "known_from_inside": KNOWN,
+        "not_known_from_inside": NOT_KNOWN,
+        "reference": None if found.outside is None else _outside_data(found),
+    }
+
+
+def _outside_data(found: Identification) -> dict[str, Any]:
+    outside, comb = found.outside, found.comb_gain
+    assert outside is not None
+    assert comb is not None
+    stage = Stage(found.setup.stage)
+    return {
+        "points": outside.points,
+        "residual_nm": outside.residual_m * 1e9,
+        "origin_um": _list(outside.origin_m * 1e6),
+        "sense_gain": _list(outside.sense_gain),
+        "sense_gain_error": _list(outside.deviation),
+        "sense_f_per_m": _list(stage.sense_gradient_f_per_m * outside.sense_gain),
+        "comb_gain": _list(comb[0]),
+        "comb_gain_error": _list(comb[1]),
+        "comb_n_per_v2": _list(stage.force_gain_n_per_v2 * comb[0]),
+        "assumed_mass_kg": stage.config.dynamics.mass_kg,
+    }
+
+
+KNOWN = "offsets, resonances, dampings, counts per V^2, and of each chain sense gain times comb gain over mass"
+NOT_KNOWN = "metres per count and newtons per V^2 by themselves; --reference FILE.csv of an instrument outside tells"
+
+
+def _list(values: Array) -> list[float]:
+    return [float(v) for v in values]
+
+
+def response_csv(found: Identification) -> str:
+    """The measured response as a table: a line for each tone and entry."""
+    r, fitted = found.response, found.modes.response(found.response.frequency_hz)
+    lines = [
+        "frequency_hz,chain,comb,real_count_per_v2,imag_count_per_v2,deviation_count_per_v2,coherence,fit_real,fit_imag"
+    ]
+    for k, f in enumerate(r.frequency_hz):
+        for i in range(3):
+            for j in range(3):
+                p, m = r.p[k, i, j], fitted[k, i, j]
+                lines.append(
+                    f"{f:.6g},{i + 1},{j + 1},{p.real:.8g},{p.imag:.8g},{r.deviation[k, i, j]:.4g},"
+                    f"{r.coherence[k, i]:.6f},{m.real:.8g},{m.imag:.8g}"
+                )
+    return "\n".join(lines) + "\n"

@@ -1,0 +1,212 @@
+"""``pkxyz identify``: what the stage really is, measured in its running loop."""
+
+import json
+from collections.abc import Iterator
+from contextlib import contextmanager
+from enum import StrEnum
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, Any
+
+import typer
+from rich.console import Console
+from rich.table import Table
+
+from pkxyz_ctrl.config import ConfigError, load
+
+if TYPE_CHECKING:
+    from collections.abc import Callable
+
+    from hil.identification import Identification
+
+_screen = Console(highlight=False)
+_notes = Console(stderr=True, highlight=False)
+
+AMPLITUDE_NM = {"multisine": 5.0, "stepped": 25.0}
+"""Of each tone, by default: one alone may be larger than a hundred at once."""
+
+
+class Lane(StrEnum):
+    """Where the loop runs."""
+
+    FAST = "fast"
+    LOCKSTEP = "lockstep"
+
+
+class Tones(StrEnum):
+    """What is added to the measurement."""
+
+    MULTISINE = "multisine"
+    STEPPED = "stepped"
+
+
+def identify(
+    stage: Annotated[str, typer.Option(help="Name or file.")] = "reconstructed",
+    plant: Annotated[str, typer.Option(help="Name or file of the plant that is identified.")] = "nominal",
+    controller: Annotated[str, typer.Option(help="Name or file.")] = "lqg",
+    bus: Annotated[str, typer.Option(help="Name or file.")] = "fd_5k",
+    lane: Annotated[
+        Lane, typer.Option(help="lockstep: over the simulated bus; fast: compiled, no frames, the same bits.")
+    ] = Lane.FAST,
+    tones: Annotated[Tones, typer.Option(help="All tones at once, or one after another.")] = Tones.MULTISINE,
+    amplitude_nm: Annotated[
+        float | None,
+        typer.Option("--amplitude", min=0.1, max=200.0, help="Of each tone in nm; default: 5 at once, 25 alone."),
+    ] = None,
+    periods: Annotated[
+        int, typer.Option(min=3, max=1000, help="Of 1 s (multisine) or 0.1 s (stepped), measured on each axis.")
+    ] = 6,
+    at_um: Annotated[
+        tuple[float, float, float] | None,
+        typer.Option("--at", metavar="Q1 Q2 Q3", help="Strokes in um; default: mid-workspace."),
+    ] = None,
+    seed: Annotated[int, typer.Option(min=0, help="Of the noise and of the tones' phases.")] = 1,
+    reference: Annotated[
+        Path | None,
+        typer.Option(help="CSV of what an instrument outside saw (docs/identification.md): fixes the scale."),
+    ] = None,
+    out: Annotated[
+        Path | None, typer.Option(help="Folder to write; default: runs/identify_<plant>-<lane>-<n>.")
+    ] = None,
+    as_json: Annotated[bool, typer.Option("--json", help="Print JSON, and nothing else.")] = False,
+) -> None:
+    """Frequency response from squared voltages to sense counts, modes, static gains and offsets, in the closed loop.
+
+    Exit code 0 if the fit leaves nothing but noise, 1 if it leaves more (then the errors are no bounds), 2 for bad
+    input.
+    """
+    from dataclasses import replace
+
+    import numpy as np
+
+    from hil.identification import as_data
+    from hil.identification import identify as identified
+    from hil.outside_scale import outside_scale, read_points
+    from hil.setup import bare_setup
+    from pkxyz_ctrl.bus_config import BusConfig
+    from pkxyz_ctrl.controller_config import ControllerConfig
+    from pkxyz_ctrl.stage import Stage
+
+    on_bus, config = load("buses", bus, BusConfig), load("controllers", controller, ControllerConfig)
+    if lane is Lane.LOCKSTEP and on_bus.can is None:
+        raise ConfigError(f"bus {on_bus.name!r} has no [can] and carries no frames; use --lane fast")
+    strokes = np.full(3, 12.5e-6) if at_um is None else np.array(at_um) * 1e-6
+    outside = None if reference is None else outside_scale(Stage.load(stage), *read_points(reference))
+    amplitude = AMPLITUDE_NM[tones.value] if amplitude_nm is None else amplitude_nm
+    with _one_line_errors(), _progress("exciting the loop", quiet=as_json) as tell:
+        found = identified(
+            bare_setup(stage, plant, config, on_bus, seed), strokes, lane.value, kind=tones.value,
+            amplitude_m=amplitude * 1e-9, periods=periods, on_progress=tell,
+        )  # fmt: skip
+    found = replace(found, outside=outside)
+    data = as_data(found)
+    folder = _write(out, found, data)
+    if as_json:
+        print(json.dumps(data, allow_nan=False))
+    else:
+        _show(found, data, folder)
+    raise typer.Exit(0 if found.modes.noise_alone else 1)
+
+
+@contextmanager
+def _one_line_errors() -> "Iterator[None]":
+    from hil.measured_loop import MeasurementError
+    from pkxyz_ctrl.design.design_error import DesignError
+    from pkxyz_ctrl.design.modal_fit import FitError
+    from pkxyz_ctrl.stage import StageDomainError
+
+    try:
+        yield
+    except (FitError, DesignError, StageDomainError, MeasurementError) as error:
+        raise ConfigError(str(error)) from None
+
+
+@contextmanager
+def _progress(words: str, *, quiet: bool) -> "Iterator[Callable[[int, int], None]]":
+    from rich.progress import BarColumn, Progress, TextColumn, TimeRemainingColumn
+
+    columns = (TextColumn("{task.description}"), BarColumn(), TimeRemainingColumn())
+    with Progress(*columns, console=_notes, transient=True, disable=quiet or not _notes.is_terminal) as progress:
+        task = progress.add_task(words, total=None)
+        yield lambda done, total: progress.update(task, completed=done, total=total)
+
+
+def _write(out: Path | None, found: "Identification", data: dict[str, Any]) -> Path:
+    from hil.identification import response_csv
+    from hil.identify_figures import draw_response
+    from hil.run_folder import next_free
+
+    folder = out or next_free(Path("runs"), f"identify_{found.setup.plant.name}", found.lane)
+    try:
+        folder.mkdir(parents=True, exist_ok=True)
+        text = json.dumps(data, indent=2, allow_nan=False) + "\n"
+        (folder / "identification.json").write_text(text, encoding="utf-8")
+        (folder / "response.csv").write_text(response_csv(found), encoding="utf-8")
+        draw_response(found, folder / "response.png")
+    except OSError as error:
+        raise ConfigError(f"--out: {folder}: {(error.strerror or str(error)).lower()}; give another folder") from None
+    return folder
+
+
+def _show(found: "Identification", data: dict[str, Any], folder: Path) -> None:
+    modes, zero = found.modes, found.response.zero
+    strokes = " / ".join(f"{q:.2f}" for q in data["strokes_um"])
+    _screen.print(
+        f"{data['stage']} on plant {data['plant']}, {data['controller']} on {data['bus']}, strokes {strokes} um"
+    )
+    table = _table("mode", "frequency (Hz)", "by the stage file", "damping ratio", "Q")
+    for n, mode in enumerate(data["modes"]):
+        table.add_row(
+            f"{n + 1}", _pm(mode["frequency_hz"], mode["frequency_error_hz"]), f"{mode['drawn_hz']:.1f}",
+            _pm(mode["damping"], mode["damping_error"]), f"{mode['quality_factor']:.1f}",
+        )  # fmt: skip
+    _screen.print(table)
+    table = _table("chain", "own comb (counts/V^2)", "comb 1", "comb 2", "comb 3", "sense zero (fF)", "counts")
+    for i in range(3):
+        entries = [f"{v:.3f}" for v in modes.static_gain[i]]
+        table.add_row(
+            f"{i + 1}", _pm(modes.static_gain[i, i], modes.static_gain_deviation[i, i]), *entries,
+            _pm(zero.offset_f[i] * 1e15, zero.deviation_f[i] * 1e15), f"{zero.offset_count[i]:.1f}",
+        )  # fmt: skip
+    _screen.print(table)
+    fit = data["fit"]
+    verdict = (
+        "noise alone is left" if modes.noise_alone else "[bold red]more than noise is left: the errors are no bounds[/]"
+    )
+    _screen.print(
+        f"{fit['tones']} tones, fitted to {fit['highest_hz']:.0f} Hz: chi-square {fit['chi_square']:.2f}, {verdict}; "
+        f"coherence there at least {fit['least_coherence']:.3f}",
+        soft_wrap=True,
+    )
+    _show_gains(found)
+    if found.outside is None:
+        _screen.print(f"not known from inside: {data['not_known_from_inside']}", soft_wrap=True)
+    _screen.print(f"written: {folder}", soft_wrap=True)
+
+
+def _show_gains(found: "Identification") -> None:
+    """Of each chain relative to the stage file; apart from each other with an outside reference only."""
+    outside, comb, (product, deviation) = found.outside, found.comb_gain, found.chain_gain
+    table = _table("chain", "sense x comb / mass", "sense", "comb")
+    for i in range(3):
+        sense = "?" if outside is None else _pm(outside.sense_gain[i], outside.deviation[i])
+        pull = "?" if comb is None else _pm(comb[0][i], comb[1][i])
+        table.add_row(f"{i + 1}", _pm(product[i], deviation[i]), sense, pull)
+    _screen.print("relative to the stage file, the combs if its mass is right:")
+    _screen.print(table)
+    if outside is not None:
+        _screen.print(f"reference: {outside.points} points, {outside.residual_m * 1e9:.2f} nm rms left")
+
+
+def _table(*headings: str) -> Table:
+    table = Table(box=None, pad_edge=False, header_style="dim")
+    for n, heading in enumerate(headings):
+        table.add_column(heading, justify="right" if n else "left", no_wrap=True)
+    return table
+
+
+def _pm(value: float, error: float) -> str:
+    """A number with its standard error, to two digits of the latter."""
+    import math
+
+    digits = max(0, 1 - math.floor(math.log10(error))) if error > 0 else 6
+    return f"{value:.{digits}f} +- {error:.{digits}f}"

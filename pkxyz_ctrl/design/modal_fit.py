@@ -1,0 +1,246 @@
+"""Modes of the stage from its measured response: three pairs of poles that all nine entries share, all else free.
+
+    P(z) = sum over i of (B_i + C_i z^-1) z^-n / (1 - 2 Re(p_i) z^-1 + |p_i|^2 z^-2)  +  D z^-n,    p_i = exp(s_i T)
+
+n = d + 1: what is asked for at a sample acts d periods later and is seen at the sample after that. B_i, C_i and D
+(3, 3) are free real matrices: whatever amplifier, delays within a period and faster modes do to the
+stage's own modes is in them, and nothing needs to be assumed of it. The fit is of y to P u, output by output, each tone
+with the weight of the noise there; for given poles it is linear, so only frequencies and dampings are searched for
+(variable projection).
+"""
+
+import math
+from collections.abc import Callable
+from dataclasses import dataclass
+
+import numpy as np
+import scipy.linalg
+import scipy.optimize
+from numpy.typing import NDArray
+
+Array = NDArray[np.float64]
+Complex = NDArray[np.complex128]
+
+MODES = 3
+
+STARTS = ((0.97, 1.03, 1.0), (0.9, 1.1, 1.05), (0.97, 1.0, 0.95), (1.1, 1.2, 1.1))
+"""What the drawing's modes are multiplied with to begin the search; the next is tried where more than noise is left."""
+
+NOISE_ALONE = 1.5
+"""Mean square of the weighted residual up to which noise explains it."""
+
+
+class FitError(ValueError):
+    """A response that doesn't tell the modes; the message says what to change."""
+
+
+@dataclass(frozen=True)
+class ModalFit:
+    """Natural frequencies |s| / 2 pi in ascending order, damping ratios, and the response at frequency 0."""
+
+    frequency_hz: Array
+    """(3,)"""
+    damping: Array
+    """(3,) -Re(s) / |s| = 1 / 2Q"""
+    static_gain: Array
+    """(3, 3) in counts per V^2: P(z = 1), chains' counts down, combs across"""
+    acceleration_gain: Array
+    """(3, 3) in counts/s^2 per V^2: how fast a step of V^2 sets the chains in motion, springs aside. The modes'
+    numerators add up to M^-1, so that is the sense gains times J J^T over the mass times the comb gains.
+    """
+    frequency_deviation_hz: Array
+    damping_deviation: Array
+    static_gain_deviation: Array
+    acceleration_gain_deviation: Array
+    """standard deviations, shapes as above"""
+    chi_square: float
+    """weighted residual's mean square, 1 where noise alone is left"""
+    used_hz: tuple[float, float]
+    """lowest and highest tone that was fitted"""
+    _coefficients: Array
+    _period_s: float
+    _delay_periods: int
+
+    @property
+    def noise_alone(self) -> bool:
+        """Whether the fit leaves nothing but noise."""
+        return self.chi_square < NOISE_ALONE
+
+    def response(self, frequency_hz: Array) -> Complex:
+        """P (k, 3, 3) in counts per V^2 at frequencies (k,)."""
+        basis = _basis(frequency_hz, self.frequency_hz, self.damping, self._period_s, self._delay_periods)
+        return np.asarray(np.einsum("kb,bij->kij", basis, self._coefficients))
+
+
+def fit_modes(
+    frequency_hz: Array,
+    drive_v2: Complex,
+    sense_count: Complex,
+    noise_count: Array,
+    *,
+    period_s: float,
+    delay_periods: int,
+    start_hz: Array,
+    start_damping: float,
+) -> ModalFit:
+    """Fit to spectra U, Y (k, 3, 3) (last axis: the excitation) with the standard deviations (k, 3) of Y's distance in
+    the plane; ``start_hz`` (3,) is where the search begins, and twice its highest is how far tones count.
+    """
+    low, high = float(frequency_hz.min()), min(2.0 * float(start_hz.max()), 0.45 / period_s)
+    used = frequency_hz <= high
+    unknowns = 3 * (2 * MODES + 1)
+    if 2 * 3 * int(used.sum()) < 2 * (unknowns + 2 * MODES):
+        raise FitError(
+            f"{int(used.sum())} tones up to {high:.0f} Hz are too few for {MODES} modes; give more tones or periods"
+        )
+    f, u, y = frequency_hz[used], drive_v2[used], sense_count[used]
+    sigma = noise_count[used] / math.sqrt(2.0)  # of the real and of the imaginary part
+
+    def columns(modes: Array) -> Array:
+        """(2 k 3, unknowns): real and imaginary parts of basis times U, per tone and passage."""
+        basis = _basis(f, np.exp(modes[:MODES]), np.exp(modes[MODES:]), period_s, delay_periods)
+        regressors = np.einsum("kb,kjp->kpbj", basis, u).reshape(3 * len(f), unknowns)
+        return np.concatenate([regressors.real, regressors.imag])
+
+    weight = np.repeat(1.0 / sigma, 3, axis=0)  # (k passages, chains)
+    weight = np.concatenate([weight, weight])
+    flat = np.swapaxes(y, 1, 2).reshape(3 * len(f), 3)
+    seen = np.concatenate([flat.real, flat.imag])
+
+    def solved(modes: Array) -> tuple[Array, Array]:
+        matrix = columns(modes)
+        theta = np.stack([_least_squares(matrix * w[:, None], seen[:, i] * w) for i, w in enumerate(weight.T)], axis=1)
+        return theta, (seen - matrix @ theta) * weight
+
+    def searched(split: tuple[float, float, float]) -> "scipy.optimize.OptimizeResult":
+        return scipy.optimize.least_squares(
+            lambda modes: solved(modes)[1].ravel(),
+            np.log(np.concatenate([np.array(split) * start_hz, np.full(MODES, start_damping)])),
+            x_scale=0.01,
+            bounds=(math.log(1e-5), math.log(0.5 / period_s)),
+        )
+
+    best = searched(STARTS[0])
+    for split in STARTS[1:]:
+        if 2.0 * float(best.cost) < NOISE_ALONE * seen.size:
+            break
+        best = min(best, searched(split), key=lambda found: float(found.cost))
+    order = np.argsort(best.x[:MODES])
+    modes = np.concatenate([best.x[:MODES][order], best.x[MODES:][order]])
+    theta, residual = solved(modes)
+    spare = residual.size - 3 * unknowns - 2 * MODES
+    chi_square = float((residual**2).sum() / spare)
+    covariance = _covariance(modes, theta, columns, weight) * max(1.0, chi_square)
+    static, static_deviation = _propagated(_static_gain, modes, theta, covariance, period_s, delay_periods)
+    acceleration, acceleration_deviation = _propagated(
+        _acceleration_gain, modes, theta, covariance, period_s, delay_periods
+    )
+    deviation = np.sqrt(np.diag(covariance))
+    hz, ratio = np.exp(modes[:MODES]), np.exp(modes[MODES:])
+    if not (hz.min() > low and hz.max() < high):
+        raise FitError(
+            f"modes were found at {hz.min():.0f} to {hz.max():.0f} Hz, the tones lie from {low:.0f} to {high:.0f} Hz; "
+            "raise the amplitude or the periods"
+        )
+    return ModalFit(
+        frequency_hz=hz,
+        damping=ratio,
+        static_gain=static,
+        acceleration_gain=acceleration,
+        frequency_deviation_hz=hz * deviation[:MODES],
+        damping_deviation=ratio * deviation[MODES : 2 * MODES],
+        static_gain_deviation=static_deviation,
+        acceleration_gain_deviation=acceleration_deviation,
+        chi_square=chi_square,
+        used_hz=(low, float(f.max())),
+        _coefficients=_per_input(theta),
+        _period_s=period_s,
+        _delay_periods=delay_periods,
+    )
+
+
+def _least_squares(matrix: Array, right: Array) -> Array:
+    q, r = np.linalg.qr(matrix)
+    return np.asarray(scipy.linalg.solve_triangular(r, q.T @ right))
+
+
+def _basis(f: Array, hz: Array, damping: Array, period_s: float, delay_periods: int) -> Complex:
+    """(k, 2 modes + 1) functions of z at frequencies (k,)."""
+    back = np.exp(-2j * math.pi * f * period_s)
+    s = 2.0 * math.pi * hz * (-damping + 1j * np.sqrt(np.maximum(1.0 - damping**2, 0.0)))
+    pole = np.exp(s * period_s)
+    out = np.empty((len(f), 2 * len(hz) + 1), np.complex128)
+    for i, p in enumerate(pole):
+        resonance = back ** (delay_periods + 1) / (1.0 - 2.0 * p.real * back + abs(p) ** 2 * back**2)
+        out[:, 2 * i], out[:, 2 * i + 1] = resonance, resonance * back
+    out[:, -1] = back ** (delay_periods + 1)
+    return out
+
+
+def _per_input(theta: Array) -> Array:
+    """(basis, outputs, inputs) from the columns (basis * inputs, outputs) of the fit."""
+    return np.ascontiguousarray(np.moveaxis(theta.reshape(-1, 3, 3), 2, 1))
+
+
+def _static_gain(modes: Array, theta: Array, period_s: float, delay_periods: int) -> Array:
+    """P(z = 1), (3, 3)."""
+    basis = _basis(np.zeros(1), np.exp(modes[:MODES]), np.exp(modes[MODES:]), period_s, delay_periods)[0].real
+    return np.asarray(np.einsum("b,bij->ij", basis, _per_input(theta)))
+
+
+def _acceleration_gain(modes: Array, theta: Array, period_s: float, delay_periods: int) -> Array:
+    """Sum of the modes' numerators, (3, 3), from their residues. The lag of amplifier and sense chain within a period
+    turns those of a mode by a common angle, which is taken back.
+    """
+    coefficients, total = _per_input(theta), np.zeros((3, 3))
+    for i in range(MODES):
+        w, d = 2.0 * math.pi * math.exp(modes[i]), math.exp(modes[MODES + i])
+        s = w * complex(-d, math.sqrt(1.0 - d * d))
+        p = np.exp(s * period_s)
+        residue = p ** (1 - delay_periods) * (coefficients[2 * i] + coefficients[2 * i + 1] / p) / (p - p.conjugate())
+        numerator = residue * p**delay_periods * s / (p - 1.0) * (s - s.conjugate())
+        lag_s = max(0.0, -0.5 * float(np.angle((numerator**2).sum())) / s.imag)
+        total += (numerator * np.exp(s * lag_s)).real
+    return total
+
+
+def _propagated(
+    of: Callable[[Array, Array, float, int], Array], modes: Array, theta: Array, covariance: Array, period_s: float,
+    delay_periods: int,
+) -> tuple[Array, Array]:  # fmt: skip
+    """A function (3, 3) of the fit and its standard deviation, by central differences."""
+    slopes = np.zeros((3, 3, len(covariance)))
+    for n in range(len(covariance)):
+        step = np.zeros(len(covariance))
+        linear = n - 2 * MODES
+        step[n] = 1e-6 if linear < 0 else 1e-6 * max(1.0, float(np.abs(theta).max()))
+        pair = [
+            of(
+                modes + sign * step[: 2 * MODES],
+                theta + sign * step[2 * MODES :].reshape(3, -1).T,
+                period_s,
+                delay_periods,
+            )
+            for sign in (1.0, -1.0)
+        ]
+        slopes[:, :, n] = (pair[0] - pair[1]) / (2.0 * step[n])
+    variance = np.einsum("ijn,nm,ijm->ij", slopes, covariance, slopes)
+    return of(modes, theta, period_s, delay_periods), np.sqrt(variance)
+
+
+def _covariance(modes: Array, theta: Array, columns: Callable[[Array], Array], weight: Array) -> Array:
+    """Of log frequencies, log dampings and the linear unknowns of output 1, 2, 3, for unit weights."""
+    here, unknowns = columns(modes), len(theta)
+    jacobian = np.zeros((3 * len(here), 2 * MODES + 3 * unknowns))
+    slopes = []
+    for n in range(2 * MODES):
+        step = np.zeros(2 * MODES)
+        step[n] = 1e-6
+        slopes.append((columns(modes + step) - columns(modes - step)) / 2e-6 @ theta)
+    for i in range(3):
+        rows = slice(i * len(here), (i + 1) * len(here))
+        jacobian[rows, : 2 * MODES] = np.stack([slope[:, i] for slope in slopes], axis=1) * weight[:, [i]]
+        jacobian[rows, 2 * MODES + i * unknowns : 2 * MODES + (i + 1) * unknowns] = here * weight[:, [i]]
+    scale = np.linalg.norm(jacobian, axis=0)
+    inverse = np.linalg.pinv(jacobian / scale)
+    return np.asarray(inverse @ inverse.T / np.outer(scale, scale))
