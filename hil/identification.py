@@ -73,15 +73,13 @@ def modes_hz(setup: Setup, strokes_m: Array) -> Array:
 def exciting(
     setup: Setup, strokes_m: Array, kind: Literal["multisine", "stepped"], amplitude_m: float, periods: int
 ) -> Excitation:
-    """All tones at once in periods of 1 s, or, in periods of 0.1 s, one after another, more of them about the modes."""
-    seconds = 1.0 if kind == "multisine" else 0.1
+    """All tones at once in periods of 1 s, or, in periods of 0.1 s, one after another; many of them about the modes."""
+    seconds, count, lowest, near = (1.0, 120, 5, 60) if kind == "multisine" else (0.1, 14, 1, 24)
     period_ticks = round(seconds / setup.bus.period_s)
-    bins = tones(period_ticks, 120, 5) if kind == "multisine" else tones(period_ticks, 14, 1)
-    if kind == "stepped":
-        hz = modes_hz(setup, strokes_m)
-        near = np.linspace(0.85 * hz.min(), 1.15 * hz.max(), 24) * seconds
-        bins = np.unique(np.r_[bins, np.round(near).astype(np.int64)])
-        bins = bins[bins < period_ticks // 2]
+    hz = modes_hz(setup, strokes_m)
+    about = np.round(np.linspace(0.85 * hz.min(), 1.15 * hz.max(), near) * seconds).astype(np.int64)
+    bins = np.unique(np.r_[tones(period_ticks, count, lowest), about])
+    bins = bins[bins < period_ticks // 2]
     return excitation(
         kind, bins, period_ticks=period_ticks, periods=periods, amplitude_m=amplitude_m, first_tick=0, seed=setup.seed
     )
