@@ -22,6 +22,7 @@ from pkxyz_ctrl.controller_config import ControllerConfig
 from pkxyz_ctrl.period import period_of
 from pkxyz_ctrl.row import CONTROLLER_FIELDS, ROW, columns
 from pkxyz_ctrl.safety.modes import Mode
+from pkxyz_ctrl.safety.monitors import SenseStatus
 
 Rows = NDArray[np.void]
 
@@ -29,11 +30,13 @@ _INPUTS = {  # of the cycle, by the row's name for them
     "request": "event", "sense_status": "sense_status", "node_events": "node_events", "overrun": "overrun",
     "sense_count": "sense_count", "outside_trips": "trips",
 }  # fmt: skip
+_FOUND_OUT = int(SenseStatus.IMPLAUSIBLE)
+"""Bits of the sense status that the tick itself adds."""
 _FIELDS = tuple(str(entry[0]) for entry in CONTROLLER_FIELDS)
 _FLOW = (
-    "t_us", "tick", "sense_f", "measurement_m", "innovation_m", "estimate_m", "estimate_m_per_s", "disturbance_n",
-    "reference_tick", "reference_m", "demand_n", "force_n", "slack_n", "active_set_steps", "saturated", "drive_count",
-    "voltage_v",
+    "t_us", "tick", "sense_f", "measurement_m", "sense_status", "innovation_m", "estimate_m", "estimate_m_per_s",
+    "disturbance_n", "reference_tick", "reference_m", "demand_n", "force_n", "slack_n", "active_set_steps", "saturated",
+    "drive_count", "voltage_v",
 )  # fmt: skip
 _COMPARED = (*_FLOW, *(name for name in _FIELDS if name not in _FLOW and name not in _INPUTS))
 """Fields in the order in which a tick computes them, so that a cause is named before its consequences."""
@@ -116,6 +119,7 @@ class _Player:
         inputs = np.zeros(len(recorded), cycling.INPUT)
         for row_name, name in _INPUTS.items():
             inputs[name] = recorded[row_name]
+        inputs["sense_status"] &= ~_FOUND_OUT
         seen, row = memory["input"], memory["row"]
         begin = 0
         while begin < len(recorded):

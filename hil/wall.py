@@ -7,7 +7,6 @@ from typing import Any
 
 import numpy as np
 
-from hil.blocks import PREVIEW_ROWS
 from hil.ending import Ended, Ending
 from hil.learning_run import Learning
 from hil.metrics import Metrics
@@ -15,6 +14,7 @@ from hil.recording import Recording
 from hil.run_folder import RunFolder, metadata_of, summarise
 from hil.scenario import Scenario
 from hil.setup import Setup
+from hil.streamed_reference import StreamedReference
 from hil.wall_learning import LiveReference
 from hil.wall_recorder import WallRecorder
 from pkxyz_ctrl import cycle as cycling
@@ -100,14 +100,9 @@ class WallRig:
         self._ending = ending
         can_config = require_real_bus(setup.bus)
         law = setup.law
-        self._reference = setup.trajectory.sample(
-            0, setup.trajectory.duration_us // setup.bus.period_us + PREVIEW_ROWS + 1, setup.bus.period_us
-        )
         learner = setup.new_learner()
         self.live = None if learner is None else LiveReference(setup.trajectory, setup.bus.period_us, learner)
-        if self.live is not None:
-            self._reference = self.live.rows
-        _warm_up(law, self._reference)
+        _warm_up(law, np.zeros((1, 9)) if self.live is None else self.live.rows)
         self._bus = open_bus(can_config, setup.bus.name)
         self.clock = WallClock()
         self.can_port = CanPort(self._bus, self.clock, can_config.sense_deadline_us // 2)
@@ -132,16 +127,24 @@ class WallRig:
         """Start the amplifier and run all ticks. Raises ``StartUpError`` and ``Ended``."""
         self._started = True
         start(self.clock, _Interruptible(self.port, self._ending), self.controller)
-        reference, row, take = self._reference, self.controller.row, self._recorder.row
+        row, take = self.controller.row, self._recorder.row
         live, memory = self.live, self.controller.memory
+        streamed = StreamedReference(self.setup.trajectory, self.setup.bus.period_us, memory)
+
+        def record(tick: int) -> None:
+            take(row)
+            streamed.prepare()
 
         def record_and_learn(tick: int) -> None:
             take(row)
             if live is not None:
                 live.after(memory)
 
-        record = record_and_learn if live is not None else lambda tick: take(row)
-        run(self.ticks, self.port, self.controller, lambda tick: reference, self.setup.ticks, record)
+        if live is None:
+            run(self.ticks, self.port, self.controller, streamed, self.setup.ticks, record)
+        else:
+            rows = live.rows
+            run(self.ticks, self.port, self.controller, lambda tick: rows, self.setup.ticks, record_and_learn)
 
     def close(self) -> None:
         """0 V, pre-operational, and off the bus."""

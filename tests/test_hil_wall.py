@@ -253,6 +253,55 @@ def test_a_stopped_controller_goes_on_and_sigterm_ends_it_at_0_v(bench, changes)
     assert log[-1].arbitration_id in (0x000, 0x70A)
 
 
+def test_ctrl_c_ends_at_0_v(bench, changes):
+    changes("pre-operational", False)
+    words = ("on_slow.toml", "--bus", "slow.toml", "--out", "interrupted", "--seconds", "60", "--json")
+    with controller(bench, *words) as run:
+        with UnixBus(f"{bench}/bus") as observer:
+            until_driven(observer)
+        run.send_signal(signal.SIGINT)
+        out, err = run.communicate(timeout=60)
+    assert run.returncode == 128 + signal.SIGINT, err
+    assert json.loads(out)["interrupted"]
+    assert changes("pre-operational", False)[-2]["driven"]
+    assert_ended_by_the_controller(bench / "interrupted" / "frames.log")
+
+
+def assert_ended_by_the_controller(log):
+    """Its last voltages are 0 V, and the node did not have to find out that it is gone."""
+    frames = list(can.LogReader(log))
+    drives = [message.data[:6] for message in frames if message.arbitration_id == 0x30A]
+    assert any(drives[-2])
+    assert not any(drives[-1])
+    assert not any(message.arbitration_id == EMCY for message in frames)
+
+
+def test_a_full_disk_ends_at_0_v_with_one_line_and_what_was_written_opens(bench, changes):
+    """A crash under way: the recorder's process fails, so does the loop, and the controller still takes the combs down.
+
+    Every file of the run may hold 1.2 MB, which the journal exceeds after some thousand ticks.
+    """
+    changes("pre-operational", False)
+    words = ("on_slow.toml", "--bus", "slow.toml", "--out", "full", "--seconds", "60")
+    limit = "import resource; resource.setrlimit(resource.RLIMIT_FSIZE, (1_200_000, 1_200_000))"
+    script = f"import sys; {limit}; from hil.cli import main; sys.argv[0] = 'pkxyz'; main()"
+    run = subprocess.run(
+        [sys.executable, "-c", script, "run", *words], cwd=bench, text=True, check=False, capture_output=True,
+        env={**os.environ, "PYTHONPATH": str(ROOT)}, timeout=120,
+    )  # fmt: skip
+    assert run.returncode == 1
+    complaints = [line for line in run.stderr.splitlines() if line.startswith("pkxyz: ")]
+    assert len(complaints) == 1, run.stderr
+    assert "file too large" in complaints[0]
+    assert "Traceback" not in run.stderr
+    lines = changes("pre-operational", False)
+    assert lines[-2]["driven"]
+    assert lines[-1]["t_s"] - lines[-2]["t_s"] < 30
+    full = Recording.open(bench / "full" / "recording.parquet")
+    assert full.ticks >= 2048
+    assert (np.diff(full["tick"]) == 1).all()
+
+
 def test_bad_input_is_refused_with_one_line(bench, monkeypatch):
     monkeypatch.chdir(bench)
     for command, words, expected in (

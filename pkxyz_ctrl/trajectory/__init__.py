@@ -119,13 +119,14 @@ class Trajectory:
         """
         t_us = np.maximum(_instants_us(first_tick, count, period_us), 0)
         out = np.empty((count, 9))
+        if count == 0:
+            return out
         # the motion of each start up to now is on; rows are in order of time, so each motion has a slice of them
-        bounds = np.searchsorted(t_us, self._start_us[1:], side="left")
-        begins = np.concatenate([[0], bounds])
-        ends = np.concatenate([bounds, [count]])
-        for n in np.flatnonzero(ends > begins):
-            rows = slice(begins[n], ends[n])
-            out[rows] = self._motions[n].sample((t_us[rows] - self._start_us[n]) * 1e-6)
+        first, last = (int(n) - 1 for n in np.searchsorted(self._start_us, t_us[[0, -1]], side="right"))
+        bounds = np.searchsorted(t_us, self._start_us[first + 1 : last + 1], side="left")
+        for n, begin, end in zip(range(first, last + 1), [0, *bounds], [*bounds, count], strict=True):
+            if end > begin:
+                out[begin:end] = self._motions[n].sample((t_us[begin:end] - self._start_us[n]) * 1e-6)
         return out
 
     def segment_index(self, first_tick: int, count: int, period_us: int) -> NDArray[np.int16]:

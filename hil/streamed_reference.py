@@ -1,0 +1,58 @@
+"""The reference of a loop at rate: sampled ahead, a few rows after each tick, however long the trajectory is."""
+
+import numpy as np
+from numpy.typing import NDArray
+
+from hil.blocks import PREVIEW_ROWS
+from pkxyz_ctrl.trajectory import Trajectory
+
+BLOCK_ROWS = 1024
+PIECE_ROWS = 32
+"""Sampled at once, some 50 us: a 32nd of a block, so a block is ready long before the one in use has ended."""
+
+
+class StreamedReference:
+    """``runtime.Reference`` of two blocks: the loop reads one while ``prepare``, called after each tick, fills the
+    other.
+
+    A reference that begins anew, as after a fault that was cleared, is sampled in that tick.
+    """
+
+    def __init__(self, trajectory: Trajectory, period_us: int, memory: NDArray[np.void]) -> None:
+        """``memory``: the controller's, (1,) of ``cycle.MEMORY``; says where the trajectory is, and is told where the
+        rows begin.
+        """
+        self._trajectory = trajectory
+        self._period_us = period_us
+        self._memory = memory
+        self._rows, self._next = (np.empty((BLOCK_ROWS + PREVIEW_ROWS, 9)) for _ in range(2))
+        self._base = self._filled = 0
+        self._begin(0)
+
+    def __call__(self, tick: int) -> NDArray[np.float64]:
+        """Rows (n, 9) for this tick."""
+        at = int(self._memory["reference_tick"][0])
+        ahead = at - self._base
+        if ahead == BLOCK_ROWS and self._filled == len(self._next):
+            self._rows, self._next = self._next, self._rows
+            self._take(at)
+        elif not 0 <= ahead < BLOCK_ROWS:
+            self._begin(at)
+        return self._rows
+
+    def prepare(self) -> None:
+        """Sample the next few rows, if there are any left to be sampled."""
+        begin, end = self._filled, min(self._filled + PIECE_ROWS, len(self._next))
+        if begin < end:
+            first = self._base + BLOCK_ROWS + begin
+            self._next[begin:end] = self._trajectory.sample(first, end - begin, self._period_us)
+            self._filled = end
+
+    def _begin(self, at: int) -> None:
+        self._rows[:] = self._trajectory.sample(at, len(self._rows), self._period_us)
+        self._take(at)
+
+    def _take(self, at: int) -> None:
+        """The rows in use begin at trajectory tick ``at``; of those after them there is none yet."""
+        self._base, self._filled = at, 0
+        self._memory["input"]["reference_base"] = at
