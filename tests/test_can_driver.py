@@ -1,5 +1,7 @@
 """The amplifier driver as a scripted dialogue: literal bytes in, literal bytes out, no node behind it."""
 
+import itertools
+
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
@@ -344,16 +346,17 @@ def test_frames_of_another_kind_are_not_ours(flag, can_id):
 
 
 def test_our_heartbeat_keeps_its_grid_however_late_it_is_sent():
+    """Its grid would be the node's, whose first heartbeat came at 0; it stays 1 ms before that."""
     driver = started()
-    assert driver.heartbeat_due(19_999) is None
-    assert driver.heartbeat_due(20_000) == frame(OUR_HEARTBEAT)
-    assert driver.heartbeat_due(20_400) == frame(OUR_HEARTBEAT)  # until it was sent
-    driver.heartbeat_sent(20_400)
-    assert driver.heartbeat_due(39_999) is None
-    assert driver.heartbeat_due(40_000) is not None
+    assert driver.heartbeat_due(18_999) is None
+    assert driver.heartbeat_due(19_000) == frame(OUR_HEARTBEAT)
+    assert driver.heartbeat_due(19_400) == frame(OUR_HEARTBEAT)  # until it was sent
+    driver.heartbeat_sent(19_400)
+    assert driver.heartbeat_due(38_999) is None
+    assert driver.heartbeat_due(39_000) is not None
     driver.heartbeat_sent(105_000)  # whole periods are skipped
-    assert driver.heartbeat_due(119_999) is None
-    assert driver.heartbeat_due(120_000) is not None
+    assert driver.heartbeat_due(118_999) is None
+    assert driver.heartbeat_due(119_000) is not None
 
 
 def test_stop_is_zero_volts_then_pre_operational():
@@ -491,3 +494,28 @@ def test_no_frame_whatsoever_upsets_the_driver(traffic, from_operational):
 def test_configuration_errors_name_the_key(settings_of, complaint):
     with pytest.raises(ValidationError, match=complaint):
         DriverConfig(**settings_of)
+
+
+@pytest.mark.parametrize(
+    ("ours_ms", "nodes_ms", "slip_us"), [(20, 20, -200), (20, 20, 0), (20, 20, 70), (7, 20, -33), (50, 20, 3)]
+)
+def test_heartbeats_of_both_sides_never_meet(ours_ms: int, nodes_ms: int, slip_us: int) -> None:
+    """A tick has room for one. The node's come a little earlier or later than its period says; ours keep their time."""
+    driver = started(
+        controller_heartbeat_period_ms=ours_ms, controller_heartbeat_timeout_ms=200,
+        node_heartbeat_period_ms=nodes_ms, node_heartbeat_timeout_ms=200,
+    )  # fmt: skip
+    node_us = [1000 * nodes_ms]
+    our_us = [0]
+    for t_us in range(0, 3_000_000, 200):
+        if t_us >= node_us[-1]:
+            driver.receive(heartbeat(OPERATIONAL), t_us)
+            node_us.append(node_us[-1] + 1000 * nodes_ms + slip_us)
+        if driver.heartbeat_due(t_us) is not None:
+            driver.heartbeat_sent(t_us)
+            our_us.append(t_us)
+    apart_us = [min(abs(t_us - other_us) for other_us in node_us) for t_us in our_us[2:]]
+    assert min(apart_us) >= 400
+    gaps_us = [b - a for a, b in itertools.pairwise(our_us[1:])]
+    assert max(gaps_us) <= 1000 * ours_ms + 200
+    assert len(our_us) < 1.2 * 3000 / ours_ms

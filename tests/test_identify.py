@@ -92,7 +92,6 @@ def test_homing_finds_the_capacitance_at_rest():
 
 
 def test_lanes_give_the_same_bits():
-    """For as long as no SYNC is late, which the first one is after 1.7 s, where two heartbeats meet in a tick."""
     added = excitation(
         "multisine", tones(250, 20, 2), period_ticks=250, periods=3, amplitude_m=5e-9, first_tick=0, seed=1
     )

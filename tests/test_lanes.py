@@ -43,6 +43,15 @@ def test_lockstep_equals_fast_bit_for_bit(plant, bus_name):
     assert modes == {Mode.HOMING: homing - 1, Mode.IDLE: 1, Mode.ENABLED: 1, Mode.TRACKING: ticks - homing - 1}
 
 
+def test_the_lanes_agree_for_as_long_as_one_likes():
+    """Both sides' heartbeats drift past one another; a tick with both of them would be too full for its SYNC."""
+    long = dataclasses.replace(setup("mild"), duration_s=6.0)
+    fast, _ = rows_of(long, "fast")
+    slow, over_bus = rows_of(long, "lockstep")
+    assert over_bus.missed_ticks == 0
+    assert first_difference(slow, fast) is None
+
+
 def test_a_slow_adapter_is_the_same_in_both_lanes():
     """Two periods from sample to action: frames that leave a period late, and a compiled loop that waits as long."""
     slow_bus = bus("fd_5k").model_copy(update={"delay_periods": 2})
