@@ -9,11 +9,12 @@ import typer
 from rich.console import Console
 from rich.table import Table
 
+from hil.progress import progress_bar
+
 if TYPE_CHECKING:
     from hil.compare import Compared
 
 _screen = Console(highlight=False)
-_notes = Console(stderr=True, highlight=False)
 
 
 class Lane(StrEnum):
@@ -37,19 +38,13 @@ def compare(
     as_json: Annotated[bool, typer.Option("--json", help="Print JSON, and nothing else.")] = False,
 ) -> None:
     """Run all laws on one scenario and plant. Exit code 0 if each ran without a fault, 1 if not, 2 for bad input."""
-    from rich.progress import Progress
-
     from hil.compare import DEFAULT
     from hil.compare import compare as run_all
     from hil.compare_figure import draw
 
     names = tuple(name.strip() for name in controllers.split(",") if name.strip()) or DEFAULT
-    with Progress(console=_notes, transient=True, disable=as_json or not _notes.is_terminal) as progress:
-        task = progress.add_task("laws", total=len(names))
-        runs = run_all(
-            scenario, names, plant=plant, seed=seed, lane=lane.value,
-            on_progress=lambda done, total: progress.update(task, completed=done, total=total),
-        )  # fmt: skip
+    with progress_bar("laws", quiet=as_json) as tell:
+        runs = run_all(scenario, names, plant=plant, seed=seed, lane=lane.value, on_progress=tell)
     title = f"{scenario}{f' on {plant}' if plant else ''}"
     draw(runs, title, out)
     if as_json:

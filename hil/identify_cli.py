@@ -11,15 +11,13 @@ import typer
 from rich.console import Console
 from rich.table import Table
 
+from hil.progress import progress_bar
 from pkxyz_ctrl.config import ConfigError, load
 
 if TYPE_CHECKING:
-    from collections.abc import Callable
-
     from hil.identification import Identification
 
 _screen = Console(highlight=False)
-_notes = Console(stderr=True, highlight=False)
 
 AMPLITUDE_NM = {"multisine": 5.0, "stepped": 25.0}
 """Of each tone, by default: one alone may be larger than a hundred at once."""
@@ -92,7 +90,7 @@ def identify(
     strokes = np.full(3, 12.5e-6) if at_um is None else np.array(at_um) * 1e-6
     outside = None if reference is None else outside_scale(Stage.load(stage), *read_points(reference))
     amplitude = AMPLITUDE_NM[tones.value] if amplitude_nm is None else amplitude_nm
-    with _one_line_errors(), _progress("exciting the loop", quiet=as_json) as tell:
+    with _one_line_errors(), progress_bar("exciting the loop", quiet=as_json) as tell:
         found = identified(
             bare_setup(stage, plant, config, on_bus, seed), strokes, lane.value, kind=tones.value,
             amplitude_m=amplitude * 1e-9, periods=periods, on_progress=tell,
@@ -118,16 +116,6 @@ def _one_line_errors() -> "Iterator[None]":
         yield
     except (FitError, DesignError, StageDomainError, MeasurementError) as error:
         raise ConfigError(str(error)) from None
-
-
-@contextmanager
-def _progress(words: str, *, quiet: bool) -> "Iterator[Callable[[int, int], None]]":
-    from rich.progress import BarColumn, Progress, TextColumn, TimeRemainingColumn
-
-    columns = (TextColumn("{task.description}"), BarColumn(), TimeRemainingColumn())
-    with Progress(*columns, console=_notes, transient=True, disable=quiet or not _notes.is_terminal) as progress:
-        task = progress.add_task(words, total=None)
-        yield lambda done, total: progress.update(task, completed=done, total=total)
 
 
 def _write(out: Path | None, found: "Identification", data: dict[str, Any]) -> Path:

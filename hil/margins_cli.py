@@ -12,6 +12,7 @@ import typer
 from rich.console import Console
 from rich.table import Table
 
+from hil.progress import progress_bar
 from pkxyz_ctrl.config import ConfigError, load
 
 if TYPE_CHECKING:
@@ -22,7 +23,6 @@ if TYPE_CHECKING:
     from pkxyz_ctrl.design.margins import Margins, Sensitivities
 
 _screen = Console(highlight=False)
-_notes = Console(stderr=True, highlight=False)
 
 
 class Lane(StrEnum):
@@ -88,12 +88,12 @@ def margins(
         }  # fmt: skip
         changed = None
         if perturbed:
-            with _progress("changed plants", quiet=as_json) as tell:
+            with progress_bar("changed plants", quiet=as_json) as tell:
                 changed = over_changed_plants(loop, wide.cases(), tell)
             data["perturbed"] = _changed_data(changed, wide.name)
         response = compared = None
         if measured:
-            with _progress("exciting the loop", quiet=as_json) as tell:
+            with progress_bar("exciting the loop", quiet=as_json) as tell:
                 response = _measure(
                     stage, plant, config, on_bus, strokes, lane, tones, amplitude_nm, periods, seed, tell
                 )
@@ -125,16 +125,6 @@ def _one_line_errors() -> "Iterator[None]":
         yield
     except (LawError, DesignError, StageDomainError, MeasurementError) as error:
         raise ConfigError(str(error)) from None
-
-
-@contextmanager
-def _progress(words: str, *, quiet: bool) -> "Iterator[Callable[[int, int], None]]":
-    from rich.progress import BarColumn, Progress, TextColumn, TimeRemainingColumn
-
-    columns = (TextColumn("{task.description}"), BarColumn(), TimeRemainingColumn())
-    with Progress(*columns, console=_notes, transient=True, disable=quiet or not _notes.is_terminal) as progress:
-        task = progress.add_task(words, total=None)
-        yield lambda done, total: progress.update(task, completed=done, total=total)
 
 
 def _measure(

@@ -9,10 +9,10 @@ import typer
 from rich.console import Console
 from rich.table import Table
 
+from hil.progress import progress_bar
 from pkxyz_ctrl.config import ConfigError
 
 _screen = Console(highlight=False)
-_notes = Console(stderr=True, highlight=False)
 
 
 def montecarlo(
@@ -55,16 +55,9 @@ def montecarlo(
         raise ConfigError(f"--out: {out}: {(error.strerror or str(error)).lower()}; give another folder") from None
     results = Results(out / "results.jsonl", study)
     seeds, interrupted = range(seed, seed + plants), False
-    from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn
-
-    columns = (TextColumn("{task.description}"), BarColumn(), MofNCompleteColumn(), TimeRemainingColumn())
-    with Progress(*columns, console=_notes, transient=True, disable=as_json or not _notes.is_terminal) as progress:
-        task = progress.add_task("plants", total=plants)
+    with progress_bar("plants", quiet=as_json) as tell:
         try:
-            run_study(
-                study, seeds, results, workers or cores(), dask,
-                lambda done, total: progress.update(task, completed=done, total=total),
-            )  # fmt: skip
+            run_study(study, seeds, results, workers or cores(), dask, tell)
         except KeyboardInterrupt:
             interrupted = True
     found = [results.found[n] for n in seeds if n in results.found]

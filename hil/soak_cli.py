@@ -9,10 +9,10 @@ from typing import Annotated
 import typer
 from rich.console import Console
 
+from hil.progress import progress_bar
 from pkxyz_ctrl.config import ConfigError
 
 _screen = Console(highlight=False)
-_notes = Console(stderr=True, highlight=False)
 
 
 def soak(
@@ -27,21 +27,14 @@ def soak(
 
     Exit code 0 if not, 1 if so, 2 for bad input. Some minutes for half an hour.
     """
-    from rich.progress import BarColumn, Progress, TextColumn, TimeRemainingColumn
-
     from hil import soak as soaking
 
     if keep and out is None:
         raise ConfigError("--keep: needs --out, the folder to keep the recordings in")
     folder = _folder(out)
-    columns = (TextColumn("soak"), BarColumn(), TextColumn("{task.percentage:3.0f} %"), TimeRemainingColumn())
     try:
-        with Progress(*columns, console=_notes, transient=True, disable=as_json or not _notes.is_terminal) as progress:
-            task = progress.add_task("", total=None)
-            soaked = soaking.soak(
-                60.0 * minutes, seed, law, folder, keep=keep,
-                on_progress=lambda done, total: progress.update(task, completed=done, total=total),
-            )  # fmt: skip
+        with progress_bar("soak", quiet=as_json) as tell:
+            soaked = soaking.soak(60.0 * minutes, seed, law, folder, keep=keep, on_progress=tell)
         if out is not None:
             text = json.dumps(soaking.as_json(soaked), indent=1) + "\n"
             (out / "soak.json").write_text(text, encoding="utf-8")

@@ -8,10 +8,10 @@ import typer
 from rich.console import Console
 from rich.table import Table
 
+from hil.progress import progress_bar
 from pkxyz_ctrl.config import ConfigError
 
 _screen = Console(highlight=False)
-_notes = Console(stderr=True, highlight=False)
 
 
 def tune(
@@ -47,12 +47,8 @@ def tune(
     interrupted = False
     if trials:
         try:
-            with _progress(quiet=as_json) as progress:
-                task = progress.add_task(problem.search.name, total=trials)
-                run_search(
-                    study, problem, trials, workers or cores(), dask,
-                    lambda done, total: progress.update(task, completed=done, total=total),
-                )  # fmt: skip
+            with progress_bar(problem.search.name, quiet=as_json) as tell:
+                run_search(study, problem, trials, workers or cores(), dask, tell)
         except KeyboardInterrupt:
             interrupted = True
     found = best(study, problem)
@@ -70,13 +66,6 @@ def tune(
     else:
         _show(data, problem.search.objective)
     raise typer.Exit(130 if interrupted else 0 if found is not None else 1)
-
-
-def _progress(*, quiet: bool):  # type: ignore[no-untyped-def]
-    from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn
-
-    columns = (TextColumn("{task.description}"), BarColumn(), MofNCompleteColumn(), TimeRemainingColumn())
-    return Progress(*columns, console=_notes, transient=True, disable=quiet or not _notes.is_terminal)
 
 
 def _show(data: dict, objective: str) -> None:  # type: ignore[type-arg]
