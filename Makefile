@@ -1,5 +1,6 @@
 # make sil    close the loop over the simulated bus: runs/raster-lockstep-1/ holds recording, summary and picture
 # make test   run every test, the linter and the type checker
+# make test-socketcan  controller and plant in two processes over the kernel's CAN sockets, in a guest that has them
 # make bench  measure what the docs promise and print it
 # make mutate change one thing at a time in gate, modes, monitors, comb law and codec: does a test notice? SECONDS=1200
 # make fuzz   hostile frames and broken documents: FRAMES=1000000 DOCUMENTS=10000
@@ -7,7 +8,7 @@
 PYTHON ?= python3
 BIN := .venv/bin
 
-.PHONY: sil test bench docs wheel clean mutate fuzz
+.PHONY: sil test test-socketcan bench docs wheel clean mutate fuzz
 
 sil: .venv/.ready
 	$(BIN)/pkxyz sil
@@ -17,6 +18,9 @@ test: .venv/.ready
 	$(BIN)/ruff format --check .
 	$(BIN)/mypy
 	$(BIN)/python -m pytest -n auto --dist loadfile
+
+test-socketcan: .venv/.ready
+	$(BIN)/python tests/socketcan/run.py
 
 bench: .venv/.ready
 	$(BIN)/pkxyz bench

@@ -1,0 +1,326 @@
+"""Controller and plant in two processes over the kernel's CAN sockets; run in a guest by ``run.py``.
+
+The kernel's interface is a virtual one, the rest is what an engineer would run: the shipped bus files, python-can's
+``socketcan``, ``pkxyz plant`` and ``pkxyz run``. An observer of our own looks on with a bare socket. The guest's single
+processor goes from one to the other when it likes, so ticks are slow and monitors of lateness are off; nothing is said
+about when, except by the node's own clock. Imports take longest there, so processes are forked after them.
+"""
+
+import ctypes
+import json
+import multiprocessing
+import os
+import re
+import signal
+import socket
+import struct
+import sys
+import tempfile
+import time
+from contextlib import contextmanager
+from pathlib import Path
+
+import can
+import can.interfaces.socketcan
+import canopen  # noqa: F401
+import numpy as np
+import pyarrow.parquet  # noqa: F401
+import pytest
+
+from hil.cli import main
+from hil.recording import Recording
+from hil.replay import replay
+from hil.scenario import load_scenario
+from hil.wall_figure import draw_wall  # noqa: F401
+from hil.wall_plant import TRUTH
+from pkxyz_ctrl.config import CONFIG_DIR
+from pkxyz_ctrl.safety.modes import Mode
+
+PERIOD_US = 10_000
+TIMEOUT_US = 200_000
+CAPABILITIES_VERSION, SYS_NICE = 0x2008_0522, 23  # linux/capability.h
+CANFD_BRS = 0x01  # linux/can.h
+SYNC, DRIVE, SENSE, EMCY, OURS = 0x080, 0x30A, 0x28A, 0x08A, 0x77F
+SCENARIO = """
+name = "slow_scan"
+duration_s = 3.2
+seed = 3
+stage = "reconstructed"
+plant = "nominal"
+controller = "patient.toml"
+bus = "bus.toml"
+[[reference]]
+kind = "hold"
+duration_s = 0.02
+measured = false
+[[reference]]
+kind = "move"
+to_m = [0.0, 0.0, 19.2495e-6]
+velocity_max_m_per_s = 0.05e-3
+acceleration_max_m_per_s2 = 1.0e-3
+jerk_max_m_per_s3 = 0.05
+[[reference]]
+kind = "waypoints"
+points_m = [
+    [2.0e-6, 0.0, 19.2495e-6],
+    [-2.0e-6, 0.3e-6, 19.2495e-6],
+    [2.0e-6, 0.6e-6, 19.2495e-6],
+    [0.0, 0.0, 19.2495e-6],
+]
+deviation_m = 50.0e-9
+velocity_max_m_per_s = 0.02e-3
+acceleration_max_m_per_s2 = 1.0e-3
+jerk_max_m_per_s3 = 0.05
+"""
+
+
+@pytest.fixture(scope="module", params=["socketcan_fd", "socketcan_classic"])
+def bench(request):
+    """A folder with the scenario, the shipped bus at a slow rate and the shipped law, patient with lateness."""
+    folder = Path(tempfile.mkdtemp(prefix=request.param))
+    law = (CONFIG_DIR / "controllers" / "lqg.toml").read_text(encoding="utf-8")
+    for name in ("stale", "sequence", "innovation", "saturation", "overrun"):
+        law = replaced(rf"^{name}_count = \d+", f"{name}_count = -1", law)
+    (folder / "patient.toml").write_text(replaced(r"^slew_max_v_per_s = \S+", "slew_max_v_per_s = 15.0e3", law))
+    bus = (CONFIG_DIR / "buses" / f"{request.param}.toml").read_text(encoding="utf-8")
+    for key, value in (("period", PERIOD_US), ("sense_deadline", 8000), ("heartbeat_deadline", 9900)):
+        bus = replaced(rf"^{key}_us = \d+", f"{key}_us = {value}", bus)
+    timeouts = f"controller_heartbeat_timeout_ms = {TIMEOUT_US // 1000}\nnode_heartbeat_timeout_ms = 900\n"
+    (folder / "bus.toml").write_text(bus + timeouts)
+    (folder / "slow_scan.toml").write_text(SCENARIO)
+    return folder
+
+
+def is_fd(bench):
+    return "_fd" in bench.name
+
+
+def replaced(pattern, by, text):
+    text, found = re.subn(pattern, by, text, flags=re.MULTILINE)
+    assert found == 1, pattern
+    return text
+
+
+def without_real_time():
+    """Give up CAP_SYS_NICE: on one processor, two loops under SCHED_FIFO would leave nothing to the observer."""
+    libc = ctypes.CDLL(None, use_errno=True)
+    header = ctypes.create_string_buffer(struct.pack("Ii", CAPABILITIES_VERSION, 0))
+    sets = ctypes.create_string_buffer(24)  # effective, permitted, inheritable; low and high words
+    assert libc.capget(header, sets) == 0
+    effective, permitted, *rest = struct.unpack("6I", sets.raw)
+    kept = ~(1 << SYS_NICE)
+    assert libc.capset(header, struct.pack("6I", effective & kept, permitted & kept, *rest)) == 0
+
+
+class Command:
+    """``pkxyz`` in a process of its own, in a folder, its streams in files there."""
+
+    def __init__(self, folder, *words):
+        self.out, self.err = (folder / f"{words[0]}.{name}" for name in ("out", "err"))
+        self.out.write_text("")
+        self.process = multiprocessing.get_context("fork").Process(target=self._run, args=(folder, words))
+        self.process.start()
+        self.pid = self.process.pid
+
+    def _run(self, folder, words):
+        os.chdir(folder)
+        for number, path, name in ((1, self.out, "stdout"), (2, self.err, "stderr")):
+            stream = path.open("w")
+            os.dup2(stream.fileno(), number)
+            setattr(sys, name, stream)
+        without_real_time()
+        sys.argv = ["pkxyz", *map(str, words)]
+        main()
+
+    def signal(self, number):
+        os.kill(self.pid, number)
+
+    def wait(self):
+        """Its exit code, and what it wrote to both streams."""
+        self.process.join(200)
+        return self.process.exitcode, self.out.read_text(), self.err.read_text()
+
+    def __enter__(self):
+        return self
+
+    def __exit__(self, *_):
+        self.process.kill()
+        self.process.join()
+
+
+@pytest.fixture(scope="module")
+def plant(bench):
+    """Serves node and plant; has ``seen``, which waits for a state and returns all changes so far."""
+    load_scenario(bench / "slow_scan.toml").setup().law  # noqa: B018  imports the rest, once
+    command = Command(bench, "plant", "slow_scan.toml", "--truth", "truth.bin", "--bus", "bus.toml", "--json")
+
+    def seen(state, driven):
+        end_s = time.monotonic() + 120
+        while True:
+            lines = [json.loads(line) for line in command.out.read_text(encoding="utf-8").splitlines()]
+            if lines and (lines[-1]["state"], lines[-1]["driven"]) == (state, driven):
+                return lines
+            assert command.process.is_alive(), command.wait()
+            assert time.monotonic() < end_s, f"the node is not {state}, driven {driven}: {lines}"
+            time.sleep(0.05)
+
+    command.seen = seen
+    with command:
+        yield command
+        command.signal(signal.SIGCONT)
+        command.signal(signal.SIGTERM)
+        code, _, err = command.wait()
+        assert code == 0, err
+
+
+@contextmanager
+def observer(bench):
+    """A socket of the kernel's, without python-can: (identifier, data, is_fd, flags) of each frame."""
+    with socket.socket(socket.PF_CAN, socket.SOCK_RAW, socket.CAN_RAW) as looking:
+        if is_fd(bench):
+            looking.setsockopt(socket.SOL_CAN_RAW, socket.CAN_RAW_FD_FRAMES, 1)
+        looking.setsockopt(socket.SOL_SOCKET, socket.SO_RCVBUF, 1 << 20)
+        looking.bind(("can0",))
+        looking.settimeout(90)
+        yield looking
+
+
+def next_frame(looking):
+    raw = looking.recv(72)
+    can_id, length, flags = struct.unpack_from("<IBB", raw)
+    return can_id & 0x1FFF_FFFF, raw[8 : 8 + length], len(raw) == 72, flags
+
+
+def until_driven(looking, run, frames=20):
+    """Frames seen until so many drive frames of a controller carried a voltage."""
+    seen = []
+    while frames:
+        try:
+            seen.append(next_frame(looking))
+        except TimeoutError:
+            raise AssertionError((run.process.exitcode, run.out.read_text(), run.err.read_text())) from None
+        frames -= seen[-1][0] == DRIVE and any(seen[-1][1][:6])
+    return seen
+
+
+def test_start_up_and_scan(bench, plant):
+    """The stage follows; on the wire stands what the bus file says; the recording replays bit for bit."""
+    plant.seen("pre-operational", False)
+    with Command(bench, "run", "slow_scan.toml", "--bus", "bus.toml", "--out", "scan", "--json") as run:
+        with observer(bench) as looking:
+            seen = until_driven(looking, run)
+        code, out, err = run.wait()
+    assert code == 0, err
+    summary = json.loads(out)
+    assert summary["faults"] == []
+    assert summary["refused_frames"] == 0
+    plant.seen("pre-operational", False)
+    by_id = {can_id: (data, fd, flags) for can_id, data, fd, flags in seen}
+    assert {0x000, SYNC, DRIVE, SENSE, 0x60A, 0x58A, 0x70A, OURS} <= set(by_id)
+    assert {fd for _, fd, _ in by_id.values()} == {is_fd(bench)}
+    assert len(by_id[DRIVE][0]) == len(by_id[SENSE][0]) == 8
+    if is_fd(bench):
+        assert all(flags & CANFD_BRS for _, _, flags in by_id.values())
+    recording = Recording.open(bench / "scan" / "recording.parquet")
+    assert recording.ticks == round(3.2e6 / PERIOD_US)
+    good = recording["sense_status"] == 0
+    assert good.mean() > 0.5
+    tracking = (recording["mode"] == Mode.TRACKING) & good
+    error_m = (recording.vector("measurement_m") - recording.vector("reference_m"))[tracking]
+    assert np.abs(np.median(error_m, axis=0)).max() < 100e-9
+    truth = np.fromfile(bench / "truth.bin", TRUTH)["position_m"]
+    assert truth[:, 2].max() == pytest.approx(19.25e-6, abs=1.0e-6)
+    assert np.ptp(truth[:, 0]) == pytest.approx(4.0e-6, abs=1.0e-6)
+    assert np.abs(truth[-1]).max() < 30e-6
+    result = replay(bench / "scan" / "recording.parquet")
+    assert result.differences == []
+    assert result.ticks == recording.ticks
+    frames = list(can.LogReader(bench / "scan" / "frames.log"))
+    assert sum(frame.arbitration_id == SYNC for frame in frames) == recording.ticks
+
+
+def test_killed_controller_leaves_0_v_within_the_heartbeat_time(bench, plant):
+    plant.seen("pre-operational", False)
+    with (
+        Command(bench, "run", "slow_scan.toml", "--bus", "bus.toml", "--out", "killed", "--seconds", "60") as run,
+        observer(bench) as looking,
+    ):
+        until_driven(looking, run)
+        run.signal(signal.SIGKILL)
+        while (frame := next_frame(looking))[0] != EMCY:
+            pass
+        assert frame[1][:2] == b"\x30\x81"  # 0x8130, life guard or heartbeat error (CiA 301, table 26)
+    lines = plant.seen("pre-operational", False)
+    assert lines[-2]["driven"]
+    last_us = int(np.fromfile(bench / "truth.bin", TRUTH)["t_us"][-1])
+    waited_us = 1e6 * lines[-1]["t_s"] - last_us
+    assert waited_us <= TIMEOUT_US + 10 * PERIOD_US  # the guest's one processor may be with somebody else
+    assert waited_us > TIMEOUT_US - 100_000
+
+
+def test_a_node_that_falls_silent_is_a_fault(bench, plant):
+    """The plant's process is stopped: our monitors find out, say why, and only 0 V goes out from then on."""
+    plant.seen("pre-operational", False)
+    with Command(
+        bench, "run", "slow_scan.toml", "--bus", "bus.toml", "--out", "silent", "--seconds", "6", "--json"
+    ) as run:
+        with observer(bench) as looking:
+            until_driven(looking, run)
+            plant.signal(signal.SIGSTOP)
+            while next_frame(looking)[0] != DRIVE:
+                pass
+        code, out, err = run.wait()
+        plant.signal(signal.SIGCONT)
+    assert code in (0, 1), err
+    (fault,) = json.loads(out)["faults"]
+    assert "HEARTBEAT_LOST" in fault
+    silent = Recording.open(bench / "silent" / "recording.parquet")
+    at = int(np.argmax(silent["mode"] == Mode.FAULT))
+    assert at > 0
+    assert (silent["mode"][at:] == Mode.FAULT).all()
+    assert not silent.vector("drive_count")[at:].any()
+    plant.seen("pre-operational", False)
+
+
+def test_someone_else_who_sends_damaged_sense_frames_is_a_fault(bench, plant):
+    """Frames with the node's identifier and a wrong CRC, from a third socket."""
+    plant.seen("pre-operational", False)
+    with Command(
+        bench, "run", "slow_scan.toml", "--bus", "bus.toml", "--out", "damaged", "--seconds", "4", "--json"
+    ) as run:
+        with observer(bench) as looking:
+            until_driven(looking, run)
+            for n in range(20):
+                while next_frame(looking)[0] != SYNC:
+                    pass
+                data = bytes((1, 2, 3, 4, 5, 6, n, 0))
+                if is_fd(bench):
+                    looking.send(struct.pack("<IBBBB64s", SENSE, 8, CANFD_BRS, 0, 0, data))
+                else:
+                    looking.send(struct.pack("<IBBBB8s", SENSE, 8, 0, 0, 0, data))
+        code, out, err = run.wait()
+    assert code in (0, 1), err
+    faults = json.loads(out)["faults"]
+    assert len(faults) == 1
+    assert "SENSE_CRC" in faults[0]
+    damaged = Recording.open(bench / "damaged" / "recording.parquet")
+    at = int(np.argmax(damaged["mode"] == Mode.FAULT))
+    assert (damaged["sense_status"][: at + 1] & 4 > 0).sum() >= 5
+    assert not damaged.vector("drive_count")[at:].any()
+    plant.seen("pre-operational", False)
+
+
+def test_sigterm_ends_at_0_v_by_the_controller(bench, plant):
+    plant.seen("pre-operational", False)
+    with Command(bench, "run", "slow_scan.toml", "--bus", "bus.toml", "--out", "ended", "--seconds", "60") as run:
+        with observer(bench) as looking:
+            until_driven(looking, run)
+        run.signal(signal.SIGTERM)
+        code, _, err = run.wait()
+    assert code == 128 + signal.SIGTERM, err
+    assert plant.seen("pre-operational", False)[-2]["driven"]
+    log = list(can.LogReader(bench / "ended" / "frames.log"))
+    drives = [message for message in log if message.arbitration_id == DRIVE]
+    assert any(drives[-2].data[:6])
+    assert not any(drives[-1].data[:6])
+    assert not any(message.arbitration_id == EMCY for message in log)

@@ -1,0 +1,147 @@
+"""Boots user-mode-linux with CAN in its kernel and runs ``on_vcan.py`` there: ``make test-socketcan``.
+
+The host's files are the guest's root, read-only, so it runs this very checkout and its environment, and it has the
+host's cache with the kernels that were compiled there. It has one processor, and its clock is not the world's: what is
+tested is what happens, not when. Arguments are handed on to pytest.
+
+Exit code 0 if all tests pass, or if the two packages cannot be had, which is then said loudly; 1 if not.
+"""
+
+import os
+import shlex
+import shutil
+import signal
+import subprocess
+import sys
+import tempfile
+import time
+from pathlib import Path
+
+import matplotlib.font_manager  # noqa: F401  makes its list of fonts in the cache, which takes a guest a minute
+
+import pkxyz_ctrl  # noqa: F401  so does the folder of compiled kernels come to be
+
+ROOT = Path(__file__).parent.parent.parent
+SCRATCH = ROOT / ".uml"
+PACKAGES = {"user-mode-linux": "usr/bin/linux.uml", "busybox-static": "bin/busybox"}
+MODULES = ("drivers/net/can/dev/can-dev", "drivers/net/can/vcan", "net/can/can", "net/can/can-raw")
+LONGEST_S = 590
+MEMORY = "2G"  # of which a guest takes what it uses
+
+INIT = """#!{busybox} sh
+b={busybox}
+$b mount -t proc proc /proc
+$b mount -t sysfs sys /sys
+$b mount -t devtmpfs dev /dev 2>/dev/null
+$b mkdir -p /dev/shm
+for folder in /run /dev/shm; do $b mount -t tmpfs scratch $folder; done
+$b mkdir -p {scratch}
+$b mount -t hostfs none {scratch} -o {scratch}
+$b mount -t hostfs none {cache} -o {cache}
+for module in {modules}; do $b insmod $module || echo "no $module"; done
+$b ip link add dev can0 type vcan && $b ip link set can0 mtu 72 && $b ip link set can0 up
+$b ip link set lo up
+export HOME=/run TMPDIR=/run PATH={path} XDG_CACHE_HOME={cache} PYTHONDONTWRITEBYTECODE=1
+cd {root}
+exec > {scratch}/report 2>&1
+{python} -m pytest -q -n 0 -p no:cacheprovider -x --durations=0 tests/socketcan/on_vcan.py {chosen}
+echo $? > {scratch}/status
+$b poweroff -f
+"""
+
+
+def main(chosen: list[str]) -> int:
+    """Fetch, boot, wait; returns the exit code. ``chosen``: arguments for pytest."""
+    missing = _fetch()
+    if missing:
+        print(f"\n*** SKIPPED: test-socketcan, nothing was tested over a real CAN socket: {missing}\n", file=sys.stderr)
+        return 0
+    begin_s = time.monotonic()
+    with tempfile.TemporaryDirectory(prefix="uml-") as short:  # sockets of a guest have short paths
+        guest = _boot(Path(short), chosen)
+        try:
+            guest.wait(LONGEST_S)
+            ended = "halted"
+        except subprocess.TimeoutExpired:
+            ended = f"did not end within {LONGEST_S} s"
+        finally:
+            if guest.poll() is None:
+                os.killpg(guest.pid, signal.SIGKILL)
+                guest.wait()
+    passed = _verdict(ended)
+    print(f"{time.monotonic() - begin_s:.0f} s in all, the guest booted and halted")
+    return 0 if passed else 1
+
+
+def _fetch() -> str:
+    """Have the packages unpacked in the scratch folder; empty if they are there, else why not."""
+    if not (shutil.which("apt-get") and shutil.which("dpkg-deb")):
+        return "packages are fetched with apt-get and unpacked with dpkg-deb, which are not here"
+    SCRATCH.mkdir(exist_ok=True)
+    for package, file in PACKAGES.items():
+        if (SCRATCH / "root" / file).is_file():
+            continue
+        with tempfile.TemporaryDirectory(dir=SCRATCH) as folder:
+            done = _apt("download", package, cwd=folder)
+            if done.returncode != 0:
+                _apt("update", cwd=folder)
+                done = _apt("download", package, cwd=folder)
+            if done.returncode != 0:
+                return f"no package {package}: {' '.join(done.stderr.split())[-200:]}"
+            (archive,) = Path(folder).glob("*.deb")
+            subprocess.run(["dpkg-deb", "-x", archive, SCRATCH / "root"], check=True)
+    return ""
+
+
+def _apt(*words: str, cwd: str) -> subprocess.CompletedProcess[str]:
+    return subprocess.run(["apt-get", "-q", *words], cwd=cwd, check=False, capture_output=True, text=True)
+
+
+def _boot(short: Path, chosen: list[str]) -> subprocess.Popen[bytes]:
+    """Start the guest; ``short`` is a folder for its sockets."""
+    scratch = SCRATCH / "guest"
+    scratch.mkdir(exist_ok=True)
+    for name in ("status", "report"):
+        (scratch / name).unlink(missing_ok=True)
+    (kernel,) = (SCRATCH / "root/usr/lib/uml/modules").glob("*/kernel")
+    init = scratch / "init"
+    values = {
+        "busybox": SCRATCH / "root" / PACKAGES["busybox-static"],
+        "modules": " ".join(shlex.quote(f"{kernel / module}.ko") for module in MODULES),
+        "scratch": scratch,
+        "cache": os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache",
+        "path": os.environ["PATH"],
+        "python": sys.executable,
+        "root": ROOT,
+        "chosen": shlex.join(chosen),
+    }
+    ready = ("modules", "chosen")
+    quoted = {key: value if key in ready else shlex.quote(str(value)) for key, value in values.items()}
+    init.write_text(INIT.format(**quoted), encoding="utf-8")
+    init.chmod(0o755)
+    words = [
+        SCRATCH / "root" / PACKAGES["user-mode-linux"], f"mem={MEMORY}", "root=/dev/root", "rootfstype=hostfs",
+        "rootflags=/", "ro", f"init={init}", "con=null", "con0=null,fd:2", "con1=null", "ssl=null", "quiet",
+        "umid=vcan", f"uml_dir={short}/",
+    ]  # fmt: skip
+    env = {**os.environ, "HOME": str(short), "TMPDIR": str(short)}
+    with (scratch / "console").open("wb") as console:
+        return subprocess.Popen(
+            words, env=env, stdin=subprocess.DEVNULL, stdout=console, stderr=console, start_new_session=True
+        )
+
+
+def _verdict(ended: str) -> bool:
+    """Whether the tests passed; says what they said."""
+    scratch = SCRATCH / "guest"
+    status, report, console = (scratch / name for name in ("status", "report", "console"))
+    if report.is_file():
+        print(report.read_text(encoding="utf-8", errors="replace"))
+    if not status.is_file():
+        print(f"the guest {ended} without a verdict\n{console.read_text(encoding='utf-8', errors='replace')[-3000:]}")
+        return False
+    return status.read_text(encoding="utf-8").strip() == "0"
+
+
+if __name__ == "__main__":
+    sys.exit(main(sys.argv[1:]))
