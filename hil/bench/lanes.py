@@ -19,7 +19,7 @@ from hil.run_folder import metadata_of
 from hil.scenario import Scenario, load_scenario, resolve
 from hil.setup import Setup
 
-REPEATS = 5
+REPEATS = 15
 
 
 def lockstep() -> list[Figure]:
