@@ -37,7 +37,7 @@ from pkxyz_ctrl.config import CONFIG_DIR
 from pkxyz_ctrl.safety.modes import Mode
 
 PERIOD_US = 10_000
-TIMEOUT_US = 200_000
+TIMEOUT_US = 800_000  # the guest stands still for longer than 0.2 s now and then
 CAPABILITIES_VERSION, SYS_NICE = 0x2008_0522, 23  # linux/capability.h
 CANFD_BRS = 0x01  # linux/can.h
 SYNC, DRIVE, SENSE, EMCY, OURS = 0x080, 0x30A, 0x28A, 0x08A, 0x77F
