@@ -4,7 +4,6 @@ import itertools
 import json
 import sys
 import tomllib
-from enum import StrEnum
 from pathlib import Path
 from typing import Annotated, Any, NoReturn
 
@@ -27,6 +26,7 @@ from hil import (
     soak_cli,
     tune_cli,
 )
+from hil.choices import Lane
 from pkxyz_ctrl.config import CONFIG_DIR, ConfigError, names
 
 app = typer.Typer(
@@ -41,13 +41,6 @@ _notes = Console(stderr=True, highlight=False)
 
 KINDS = ("scenarios", "stages", "plants", "controllers", "buses", "tolerances", "searches")
 """Folders of configs/, as ``pkxyz configs`` lists them."""
-
-
-class Lane(StrEnum):
-    """How a scenario is run: over the simulated bus, or composed in one compiled loop."""
-
-    LOCKSTEP = "lockstep"
-    FAST = "fast"
 
 
 def main() -> NoReturn:

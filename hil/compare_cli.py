@@ -1,7 +1,6 @@
 """``pkxyz compare``: several laws on one scenario and plant, one table and one picture."""
 
 import json
-from enum import StrEnum
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
@@ -9,19 +8,13 @@ import typer
 from rich.console import Console
 from rich.table import Table
 
+from hil.choices import Lane
 from hil.progress import progress_bar
 
 if TYPE_CHECKING:
     from hil.compare import Compared
 
 _screen = Console(highlight=False)
-
-
-class Lane(StrEnum):
-    """In which lane the laws run; both have the same bits."""
-
-    FAST = "fast"
-    LOCKSTEP = "lockstep"
 
 
 def compare(

@@ -1,9 +1,6 @@
 """``pkxyz identify``: what the stage really is, measured in its running loop."""
 
 import json
-from collections.abc import Iterator
-from contextlib import contextmanager
-from enum import StrEnum
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
@@ -11,6 +8,8 @@ import typer
 from rich.console import Console
 from rich.table import Table
 
+from hil.choices import Lane, Tones
+from hil.one_line_errors import one_line_errors
 from hil.progress import progress_bar
 from pkxyz_ctrl.config import ConfigError, load
 
@@ -21,20 +20,6 @@ _screen = Console(highlight=False)
 
 AMPLITUDE_NM = {"multisine": 5.0, "stepped": 25.0}
 """Of each tone, by default: one alone may be larger than a hundred at once."""
-
-
-class Lane(StrEnum):
-    """Where the loop runs."""
-
-    FAST = "fast"
-    LOCKSTEP = "lockstep"
-
-
-class Tones(StrEnum):
-    """What is added to the measurement."""
-
-    MULTISINE = "multisine"
-    STEPPED = "stepped"
 
 
 def identify(
@@ -90,7 +75,7 @@ def identify(
     strokes = np.full(3, 12.5e-6) if at_um is None else np.array(at_um) * 1e-6
     outside = None if reference is None else outside_scale(Stage.load(stage), *read_points(reference))
     amplitude = AMPLITUDE_NM[tones.value] if amplitude_nm is None else amplitude_nm
-    with _one_line_errors(), progress_bar("exciting the loop", quiet=as_json) as tell:
+    with one_line_errors(), progress_bar("exciting the loop", quiet=as_json) as tell:
         found = identified(
             bare_setup(stage, plant, config, on_bus, seed), strokes, lane.value, kind=tones.value,
             amplitude_m=amplitude * 1e-9, periods=periods, on_progress=tell,
@@ -103,19 +88,6 @@ def identify(
     else:
         _show(found, data, folder)
     raise typer.Exit(0 if found.modes.noise_alone else 1)
-
-
-@contextmanager
-def _one_line_errors() -> "Iterator[None]":
-    from hil.measured_loop import MeasurementError
-    from pkxyz_ctrl.design.design_error import DesignError
-    from pkxyz_ctrl.design.modal_fit import FitError
-    from pkxyz_ctrl.stage import StageDomainError
-
-    try:
-        yield
-    except (FitError, DesignError, StageDomainError, MeasurementError) as error:
-        raise ConfigError(str(error)) from None
 
 
 def _write(out: Path | None, found: "Identification", data: dict[str, Any]) -> Path:

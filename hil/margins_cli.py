@@ -2,9 +2,6 @@
 
 import json
 import math
-from collections.abc import Iterator
-from contextlib import contextmanager
-from enum import StrEnum
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
@@ -12,6 +9,8 @@ import typer
 from rich.console import Console
 from rich.table import Table
 
+from hil.choices import Lane, Tones
+from hil.one_line_errors import one_line_errors
 from hil.progress import progress_bar
 from pkxyz_ctrl.config import ConfigError, load
 
@@ -23,20 +22,6 @@ if TYPE_CHECKING:
     from pkxyz_ctrl.design.margins import Margins, Sensitivities
 
 _screen = Console(highlight=False)
-
-
-class Lane(StrEnum):
-    """In which lane the loop runs while it is measured."""
-
-    FAST = "fast"
-    LOCKSTEP = "lockstep"
-
-
-class Tones(StrEnum):
-    """What is added to the measurement."""
-
-    MULTISINE = "multisine"
-    STEPPED = "stepped"
 
 
 def margins(
@@ -79,7 +64,7 @@ def margins(
     config = load("controllers", controller, ControllerConfig)
     wide = load("tolerances", tolerances, Tolerances)
     strokes = np.full(3, 12.5e-6) if at_um is None else np.array(at_um) * 1e-6
-    with _one_line_errors():
+    with one_line_errors():
         loop = Loop(device, on_bus, design_law(device, config, on_bus, autostart=True))
         computed = loop.margins(strokes)
         data: dict[str, Any] = {
@@ -112,19 +97,6 @@ def margins(
     stable = computed.stable and (changed is None or math.isfinite(changed.worst[1]))
     agrees = compared is None or compared.holds or plant != "nominal"
     raise typer.Exit(0 if stable and agrees else 1)
-
-
-@contextmanager
-def _one_line_errors() -> "Iterator[None]":
-    from hil.measured_loop import MeasurementError
-    from pkxyz_ctrl.design.design_error import DesignError
-    from pkxyz_ctrl.design.discrete_law import LawError
-    from pkxyz_ctrl.stage import StageDomainError
-
-    try:
-        yield
-    except (LawError, DesignError, StageDomainError, MeasurementError) as error:
-        raise ConfigError(str(error)) from None
 
 
 def _measure(

@@ -20,11 +20,7 @@ from pkxyz_ctrl.safety.trips import Trip, explain
 
 Array = NDArray[np.float64]
 Send = Callable[[Frame], object]
-_WIDTHS = (
-    9,
-    12,
-    15,
-)  # of a reference: the trajectory, an excitation, what was asked for where the trajectory is shifted
+_WIDTHS = (9, 12, 15)  # of a reference: trajectory; and excitation; and what was asked for, where that is shifted
 
 _IDLE = int(Mode.IDLE)
 

@@ -1,5 +1,6 @@
 """The recorder's other process, and that a loop at rate neither grows nor loses a row."""
 
+import dataclasses
 import os
 import subprocess
 import sys
@@ -10,6 +11,7 @@ import can
 import numpy as np
 import pytest
 
+from hil import latency
 from hil.ending import Ending
 from hil.frame_log import FrameLog
 from hil.latency import measure, read_cyclictest
@@ -153,7 +155,20 @@ def test_after_warm_up_nothing_grows(tmp_path, folder):
     assert Recording.open(folder.recording).ticks == 3000
 
 
-def test_latency_counts_every_tick_and_the_controller_has_really_controlled():
+_OF_PUNCTUALITY = ("overrun", "sequence", "innovation", "residual", "unexplained_force")
+
+
+def test_latency_counts_every_tick_and_the_controller_has_really_controlled(monkeypatch):
+    """Monitors that a stalled machine sets off are off: how punctual it is, is measured here and not tested."""
+    real = latency._setup
+
+    def patient(period_us, seconds):
+        setup = real(period_us, seconds)
+        counts = {f"{name}_count": -1 for name in _OF_PUNCTUALITY}
+        monitors = setup.controller.monitors.model_copy(update=counts)
+        return dataclasses.replace(setup, controller=setup.controller.model_copy(update={"monitors": monitors}))
+
+    monkeypatch.setattr(latency, "_setup", patient)
     measured = measure(2000, 0.6, "/bin/true")
     assert measured.ticks == 300
     assert sum(measured.cycle_us) == 300
@@ -162,8 +177,7 @@ def test_latency_counts_every_tick_and_the_controller_has_really_controlled():
     figures = measured.figures()
     assert 1 <= figures["cycle_us"]["p50"] < 2000
     assert figures["lateness_us"]["p50"] <= figures["lateness_us"]["p99_9"] <= figures["lateness_us"]["max"]
-    # ten ticks missed in short order are a fault by configuration, and a busy machine may miss them
-    assert measured.mode == Mode.TRACKING or measured.missed_ticks >= 10
+    assert measured.mode == Mode.TRACKING
     for period_us, seconds in ((50, 1.0), (200, 0.0), (200, 61.0)):
         with pytest.raises(ConfigError, match="is not in"):
             measure(period_us, seconds)
