@@ -44,14 +44,18 @@ def search(bus_name: str) -> dict[int, AxisLaw]:
         starts = {0: axis_law(hinf(loop_plant(stage, bus, middle)).law, 0, extra_poles=[0.3])}
         starts[2] = axis_law(lqg, 2, extra_poles=[0.3])
         steps_hz, noise_m, changed = (150.0, 180.0, 190.0, 195.0, 201.0), 1.45e-9, 2.9
+        effort, ring_s = 10.0, 5e-3  # what hinf and lqg_wide need near half the sampling rate; half the stage's own
     else:
         starts = {axis: axis_law(lqg, axis, extra_poles=[0.3, 0.5]) for axis in (0, 2)}
-        steps_hz, noise_m, changed = (400.0, 500.0, 600.0, 660.0), 2.5e-9, 3.0
+        steps_hz, noise_m, changed, effort, ring_s = (400.0, 500.0, 600.0, 660.0), 2.5e-9, 3.0, np.inf, np.inf
     found = {}
     for axis, law in starts.items():
         these = plants(stage, bus, axis, changed=robust)
         for bandwidth_hz in steps_hz:
-            bounds = Bounds(bandwidth_hz, noise_m, float(sense[axis]), float(force[axis]), peak_s_changed=changed)
+            bounds = Bounds(
+                bandwidth_hz, noise_m, float(sense[axis]), float(force[axis]), peak_s_changed=changed, effort=effort,
+                ring_s=ring_s,
+            )  # fmt: skip
             law, worst = minimax(these, law, bounds)
             print(f"{bus_name}, axis {axis}, {bandwidth_hz:g} Hz: {worst:.3f} of the bounds", flush=True)
         found[axis] = law

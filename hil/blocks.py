@@ -90,7 +90,7 @@ class Blocks:
 
     def reference(self, memory: NDArray[np.void]) -> NDArray[np.float64]:
         """``Handout.rows`` of the next block."""
-        return self._handout.rows(memory, BLOCK_TICKS)
+        return self._handout.rows(memory, min(BLOCK_TICKS, self.ticks - self.done))
 
     def hand_on(self, count: int) -> None:
         """The first ``count`` rows are complete."""

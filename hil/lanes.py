@@ -3,6 +3,7 @@
 import time
 from collections.abc import Callable
 from dataclasses import dataclass
+from functools import cache
 from pathlib import Path
 
 import numpy as np
@@ -95,14 +96,19 @@ def _sample_us(setup: Setup, first: int, count: int) -> NDArray[np.int64]:
     """Plant time of the samples: the end of each tick's SYNC, whose length depends on its counter, since the first
     one.
     """
-    start = np.arange(first, first + count, dtype=np.int64) * setup.bus.period_us
+    tick = np.arange(first, first + count, dtype=np.int64)
     can = setup.bus.can
     if can is None:
-        return start
-    nominal, data = can.nominal_bitrate_bit_per_s, can.data_bitrate_bit_per_s or can.nominal_bitrate_bit_per_s
-    end_us = np.empty(240, np.int64)
-    for n in range(240):
-        sync = Frame(0x080, bytes((n + 1,)), can.driver.fd, can.driver.fd)
-        end_ns = frame_duration_ns(sync, nominal, data) - INTERFRAME_BITS * 1_000_000_000 // nominal
-        end_us[n] = -(-end_ns // 1000)
-    return start + end_us[np.arange(first, first + count) % 240] - end_us[0]
+        return tick * setup.bus.period_us
+    nominal = can.nominal_bitrate_bit_per_s
+    end_us = _sync_end_us(nominal, can.data_bitrate_bit_per_s or nominal, can.driver.fd)
+    return tick * setup.bus.period_us + end_us[tick % len(end_us)] - end_us[0]
+
+
+@cache
+def _sync_end_us(nominal_bit_per_s: int, data_bit_per_s: int, fd: bool) -> NDArray[np.int64]:
+    """(240,) by counter less 1, since the SYNC's start."""
+    gap_ns = INTERFRAME_BITS * 1_000_000_000 // nominal_bit_per_s
+    frames = (Frame(0x080, bytes((n + 1,)), fd, fd) for n in range(240))
+    ends_ns = [frame_duration_ns(sync, nominal_bit_per_s, data_bit_per_s) - gap_ns for sync in frames]
+    return np.array([-(-end_ns // 1000) for end_ns in ends_ns], np.int64)

@@ -5,7 +5,6 @@ from the discrete Fourier transforms of whole periods, an axis after the other; 
 differ by noise alone, and their spread says how well S is known.
 """
 
-import math
 from collections.abc import Callable
 from dataclasses import dataclass, replace
 
@@ -62,9 +61,7 @@ def sampled_margins(frequency_hz: Array, s: Complex) -> Margins:
     over the logarithm of frequency.
     """
     spline = scipy.interpolate.CubicSpline(np.log(frequency_hz), s, axis=0)
-    eye = np.eye(3)
-    grid = LoopResponse(frequency_hz, np.asarray(np.linalg.inv(s) - eye), s, np.asarray(eye - s))
-    return margins_of_response(grid, lambda f: np.asarray(spline(math.log(f)), dtype=np.complex128))
+    return margins_of_response(frequency_hz, s, lambda f: np.asarray(spline(np.log(f)), dtype=np.complex128))
 
 
 def at_point(setup: Setup, strokes_m: Array, excitation: Excitation) -> Setup:

@@ -7,6 +7,7 @@ import hashlib
 import os
 import sys
 import tempfile
+from functools import cache
 from importlib.metadata import version
 from pathlib import Path
 
@@ -47,11 +48,18 @@ def _path_of(stage: StageConfig, controller: ControllerConfig, bus: BusConfig, a
     digest = hashlib.sha256()
     for model in (stage, controller, bus):
         digest.update(model.model_dump_json().encode() + b"\0")
-    root = Path(__file__).parent
-    for source in sorted(root.rglob("*.py")):
-        digest.update(source.read_bytes())
-    digest.update(repr((autostart, sys.version, [version(name) for name in _LIBRARIES], cycle.LAW)).encode())
+    digest.update(repr((autostart, _program())).encode())
     return Path(home) / "laws" / digest.hexdigest()[:32]
+
+
+@cache
+def _program() -> str:
+    """Digest of what designs: the sources as they were when this process looked first, and the libraries."""
+    digest = hashlib.sha256()
+    for source in sorted(Path(__file__).parent.rglob("*.py")):
+        digest.update(source.read_bytes())
+    digest.update(repr((sys.version, [version(name) for name in _LIBRARIES], cycle.LAW)).encode())
+    return digest.hexdigest()
 
 
 def _read(path: Path) -> NDArray[np.void] | None:

@@ -11,6 +11,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from loop_rig import MIDDLE, bus, controller, law, new_tick_memory, rows_of, setup, stage
 
+from pkxyz_ctrl.config import load
 from pkxyz_ctrl.core import tick
 from pkxyz_ctrl.design.discrete_law import DiscreteLaw, LawError
 from pkxyz_ctrl.design.hold_noise import hold_noise_m
@@ -20,14 +21,16 @@ from pkxyz_ctrl.design.lqg_equivalent import lqg_equivalent
 from pkxyz_ctrl.design.margins import (
     HALF_POWER,
     axis_margins,
-    closed_loop,
     frequency_grid_hz,
+    largest_singular_value,
     loop_response,
     margins,
     spectral_radius,
     structured_norm,
 )
 from pkxyz_ctrl.design.pi_notch import PiNotch, pi_notch
+from pkxyz_ctrl.design.sensitivity import Sensitivity, closed_loop
+from pkxyz_ctrl.design.tolerances import Tolerances
 
 OFF_CENTRE = np.array([7e-6, 15e-6, 11e-6])
 MASS = stage().config.dynamics.mass_kg
@@ -213,6 +216,22 @@ def test_mimo_figures_are_those_of_a_dense_sweep():
     size = np.linalg.norm(loop_response(p, k, frequency).s, 2, axis=(1, 2))
     assert found.peak_s == pytest.approx(size.max(), rel=1e-5)
     assert found.bandwidth_hz == pytest.approx(frequency[np.argmax(size >= HALF_POWER)], abs=0.21)
+
+
+@settings(max_examples=10, deadline=None)
+@given(st.integers(0, 2**32 - 1))
+def test_the_sensitivity_of_many_frequencies_is_the_inverse_of_one_and_the_loop(seed):
+    """By the Schur form against (I + L)^-1 from two linear systems; and its poles against the eigenvalues."""
+    tolerances = load("tolerances", "wide", Tolerances).draw(seed)
+    p = plant(strokes_m=tolerances.strokes_m, perturbation=tolerances.perturbation)
+    k = lqg_equivalent(stage(), law(), tolerances.strokes_m, tolerances.perturbation)
+    f = frequency_grid_hz(p, k, 100)[:-1]
+    found = Sensitivity(p, k)
+    assert np.abs(found(f) - loop_response(p, k, f).s).max() < 1e-9
+    assert found(np.empty(0)).shape == (0, 3, 3)
+    assert found.spectral_radius == pytest.approx(spectral_radius(p, k), rel=1e-9)
+    size = largest_singular_value(found(f))
+    assert size == pytest.approx(np.linalg.norm(found(f), 2, axis=(1, 2)), rel=1e-7)
 
 
 def test_an_unstable_loop_has_no_margins():

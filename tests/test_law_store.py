@@ -59,19 +59,22 @@ def test_every_input_counts(folder: Path, designs: list[object]) -> None:
     assert len(list(folder.iterdir())) == 5
 
 
-def test_an_edit_of_any_source_designs_anew(
+def test_a_program_of_other_sources_designs_anew(
     folder: Path, designs: list[object], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     sources = tmp_path / "sources"
     sources.mkdir()
     (sources / "a.py").write_text("GAIN = 1.0")
     monkeypatch.setattr(law_store, "__file__", str(sources / "law_store.py"))
+    law_store._program.cache_clear()  # a process looks at its sources once
     law_of(*PARTS, autostart=True)
     law_of(*PARTS, autostart=True)
     assert len(designs) == 1
     (sources / "a.py").write_text("GAIN = 2.0")
+    law_store._program.cache_clear()
     law_of(*PARTS, autostart=True)
     assert len(designs) == 2
+    law_store._program.cache_clear()
 
 
 @pytest.mark.parametrize("damage", ["one bit", "cut", "longer", "empty"])

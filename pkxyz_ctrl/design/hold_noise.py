@@ -7,8 +7,8 @@ from pkxyz_ctrl.bus_config import BusConfig
 from pkxyz_ctrl.design.discrete_law import DiscreteLaw, LawError
 from pkxyz_ctrl.design.estimator_gain import measurement_noise
 from pkxyz_ctrl.design.loop_plant import LoopPlant
-from pkxyz_ctrl.design.margins import closed_loop
 from pkxyz_ctrl.design.plant_model import LinearStage, linearise
+from pkxyz_ctrl.design.sensitivity import closed_loop
 from pkxyz_ctrl.stage import Stage
 
 Array = NDArray[np.float64]
