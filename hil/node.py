@@ -206,6 +206,7 @@ class AmplifierNode:
         if pending is not None:
             self._apply(pending)
         else:
+            self._drive.miss()
             self._count_silence(t_us)
         if self._sync_errors.present:
             self._sync_errors.good(t_us)

@@ -21,6 +21,9 @@ class DriveReceiver:
     than that of the last frame with a correct CRC, whether that one passed or not: after a lost frame one more is
     refused, and the sequence goes on. The first frame after `start` may carry any.
 
+    A frame that is the very next one, although a SYNC has found none to apply (`miss`), is late: it was meant for that
+    SYNC. It is refused, unless it is 0 V; the frames behind it are taken, since the controller hears of it at once.
+
     Once the node has released the combs by itself (`demand_zero`), only 0 V passes first: what was queued somewhere on
     the way while the bus was blocked comes late, and must not energise them again.
     """
@@ -37,6 +40,8 @@ class DriveReceiver:
         self.counter: int | None = None  # of the last frame with a correct CRC
         self.crc = 0
         self._is_zero_due = False
+        self._is_owed = False  # a SYNC has passed for which no frame came
+        self._was_refused = False  # a frame with a correct CRC, since the last SYNC
         self.configure()
 
     def configure(self) -> None:
@@ -53,6 +58,7 @@ class DriveReceiver:
         """Forget what came before: nothing pending, and any alive counter may come next."""
         self.pending = None
         self.counter = None
+        self._is_owed = self._was_refused = False
 
     def reset(self) -> None:
         """As after power-up."""
@@ -65,6 +71,11 @@ class DriveReceiver:
         self.pending = None
         self._is_zero_due = True
 
+    def miss(self) -> None:
+        """A SYNC found nothing pending."""
+        self._is_owed = self.counter is not None and not self._was_refused
+        self._was_refused = False
+
     def _receive_protected(self, data: bytes, t_us: int) -> None:
         try:
             a, b, c, counter, crc = _unpack_protected(data)
@@ -76,11 +87,13 @@ class DriveReceiver:
             return
         last, self.counter, self.crc = self.counter, counter, crc
         if last is not None and (last + 1) & 0xFF != counter:
-            self._errors.bad(ErrorCode.DRIVE_COUNTER, t_us, bytes((last, counter)))
+            self._refuse(ErrorCode.DRIVE_COUNTER, t_us, bytes((last, counter)))
             return
         limit = self._limit  # the words are unsigned here, so a negative count is above any limit
         if a > limit or b > limit or c > limit:
-            self._errors.bad(ErrorCode.DRIVE_VALUE, t_us, _channels_over((a, b, c), limit))
+            self._refuse(ErrorCode.DRIVE_VALUE, t_us, _channels_over((a, b, c), limit))
+            return
+        if self._is_owed and self._is_late((a, b, c), t_us):
             return
         if self._is_zero_due and not self._zeroed((a, b, c)):
             return
@@ -88,8 +101,17 @@ class DriveReceiver:
         if self._errors.present:
             self._errors.good(t_us)
 
+    def _refuse(self, code: int, t_us: int, info: bytes) -> None:
+        self._is_owed, self._was_refused = False, True
+        self._errors.bad(code, t_us, info)
+
+    def _is_late(self, counts: Counts, t_us: int) -> bool:
+        self._refuse(ErrorCode.DRIVE_LATE, t_us, bytes((self.counter or 0,)))
+        return any(counts)
+
     def _zeroed(self, counts: Counts) -> bool:
         self._is_zero_due = any(counts)
+        self._was_refused = self._is_zero_due
         return not self._is_zero_due
 
     def _receive_mapped(self, data: bytes, t_us: int) -> None:
@@ -107,14 +129,16 @@ class DriveReceiver:
         if layout.counter is not None:
             last, self.counter = self.counter, values[layout.counter]
             if last is not None and (last + 1) & 0xFF != self.counter:
-                self._errors.bad(ErrorCode.DRIVE_COUNTER, t_us, bytes((last, values[layout.counter])))
+                self._refuse(ErrorCode.DRIVE_COUNTER, t_us, bytes((last, values[layout.counter])))
                 return
         words = list(self.pending or self._outputs())
         for (index, subindex), value in zip(layout.fields, values, strict=True):
             if index == _OUTPUT:
                 words[subindex - 1] = value & 0xFFFF
         if max(words) > self._limit:
-            self._errors.bad(ErrorCode.DRIVE_VALUE, t_us, _channels_over(words, self._limit))
+            self._refuse(ErrorCode.DRIVE_VALUE, t_us, _channels_over(words, self._limit))
+            return
+        if layout.counter is not None and self._is_owed and self._is_late((words[0], words[1], words[2]), t_us):
             return
         if self._is_zero_due and not self._zeroed((words[0], words[1], words[2])):
             return

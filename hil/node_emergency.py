@@ -32,6 +32,7 @@ class ErrorCode(IntEnum):
     DRIVE_CRC = 0xFF10
     DRIVE_COUNTER = 0xFF11
     DRIVE_VALUE = 0xFF12
+    DRIVE_LATE = 0xFF13
 
 
 class EmergencyProducer:

@@ -6,6 +6,13 @@ from pydantic import Field, model_validator
 
 from pkxyz_ctrl.config import FrozenModel
 from pkxyz_ctrl.law_config import LAWS, SECTIONS, Hinf, Irc, Linear, Mpc, PiNotch
+from pkxyz_ctrl.safety.thresholds import (
+    FORCE_CHANGE_MAX_N,
+    FORCE_CHANGE_SHARE,
+    FORCE_TREND_S,
+    RESIDUAL_MAX_M,
+    UNEXPLAINED_FORCE_MAX_N,
+)
 
 Positive = Annotated[float, Field(gt=0)]
 
@@ -48,11 +55,15 @@ class MonitorConfig(FrozenModel):
     stroke_min_m: float
     stroke_max_m: float
     innovation_max_m: Positive
-    residual_max_m: Positive = 0.7e-6
+    residual_max_m: Positive = RESIDUAL_MAX_M
     """Most that a stroke may be from where it was expected; beyond it the measurement is not used."""
-    unexplained_force_max_n: Positive = 0.4e-3
-    """Most that the estimated disturbance may amount to at a comb. A device that is 10 % off shows 0.2 mN in
-    mid-workspace and 0.4 mN at the end of the stroke: to use all of it on such a one, give more."""
+    unexplained_force_max_n: Positive = UNEXPLAINED_FORCE_MAX_N
+    """Most that a comb's force may be off; where the defaults of this and the next three come from is said there."""
+    force_change_max_n: Positive = FORCE_CHANGE_MAX_N
+    force_change_share: Annotated[float, Field(ge=0)] = FORCE_CHANGE_SHARE
+    """Most that what a force is off may change: so much, and this share of the change that was commanded."""
+    force_trend_s: Positive = FORCE_TREND_S
+    """Changes are counted from a mean over so long."""
     stale_count: int
     sequence_count: int
     crc_count: int

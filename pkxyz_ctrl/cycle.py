@@ -15,6 +15,7 @@ from pkxyz_ctrl.core import pace, tick
 from pkxyz_ctrl.row import ROW
 from pkxyz_ctrl.safety.modes import (
     LOOP_CLOSED,
+    NODE_EXPECTED,
     Event,
     Mode,
     clear_event,
@@ -124,6 +125,8 @@ def observe(law_array: Records, memory_array: Records, reference: Array) -> None
     seen = memory["input"]
     usable = (seen["sense_status"] & _UNUSABLE) == 0
     memory["suspects"] = 0
+    if NODE_EXPECTED[memory["mode"]] == 0:  # an estimate that ran away with what broke would outlive the clear
+        tick.set_position(law["tick"], memory["tick"], np.zeros(3))
     if usable:
         tick.measure(law["tick"], memory["tick"], seen["sense_count"])
         if memory["mode"] == _HOMING:
@@ -221,12 +224,11 @@ def _handle(law: np.void, memory: np.void, event: int) -> None:
     memory["mode"] = target
     if LOOP_CLOSED[target] == 0:
         memory["pace"] = pace.STEADY
-    rest = np.zeros(3)
     if target == _HOMING:
         memory["homing_count"] = 0
         memory["homing_sum"][:] = 0
         memory["tick"]["sense_zero_f"][:] = 0.0
-        tick.set_position(law["tick"], memory["tick"], rest)
+        tick.set_position(law["tick"], memory["tick"], np.zeros(3))
     elif target == _ENABLED and mode == _IDLE:
         memory["setpoint"][:] = 0.0
         memory["reference_tick"] = 0
@@ -273,9 +275,7 @@ def _change_pace(law: np.void, memory: np.void) -> None:
 
 @njit(cache=True)
 def _suspects(law: np.void, memory: np.void) -> int:
-    """Combs whose strokes are not to be believed, one bit each; leaves what the innovation would have been. While the
-    loop is open there is no estimate to hold them against.
-    """
+    """Combs whose strokes are not to be believed, one bit each, and what the innovation would be; none in open loop."""
     if LOOP_CLOSED[memory["mode"]] == 0:
         return 0
     combs: int = implausible_combs(law["limits"], memory["tick"]["residual_m"])
@@ -354,7 +354,8 @@ def _monitor(law: np.void, memory: np.void, saturated: int) -> int:
     obs["solver_ok"] = 0 if law["tick"]["kind"] == tick.PREDICTIVE and state["plan_known"] == 0 else 1
     obs["finite"] = 1 if tick.is_finite(state) else 0
     obs["implausible_combs"] = memory["suspects"]
-    tick.unexplained_force(state, obs["unexplained_force_n"])
+    tick.unexplained_force(law["tick"], state, obs["unexplained_force_n"])
+    tick.commanded_force(law["tick"], state, obs["commanded_force_n"])
     for i in range(3):
         obs["sense_count"][i] = seen["sense_count"][i]
         obs["stroke_m"][i] = state["stroke_m"][i]

@@ -128,6 +128,7 @@ def test_a_missing_frame_is_bridged_by_the_prediction():
     row = c.tick(noisy(AT_REST, 9))
     assert c.mode is Mode.ENABLED
     assert row["innovation_m"].any()
+    c.memory["monitors"]["sequence_level"] = 0  # which counts them all
     for _ in range(4):  # the good one between them starts the count anew
         c.tick((0, 0, 0), status=SenseStatus.MISSING)
         assert c.mode is Mode.ENABLED
@@ -279,7 +280,8 @@ def index_of(row: NDArray[np.float64]) -> int:
 @pytest.mark.parametrize("base", [0, 5, -3])
 def test_reference_rows_by_index_and_clamped_at_both_ends(delay, base):
     # the stage of this script does not move at all, and nobody waits for it
-    blind = controller_with(monitors={"innovation_count": -1, "residual_max_m": 1.0, "safe_cycles": 0})
+    off = {"innovation_count": -1, "unexplained_force_count": -1, "residual_max_m": 1.0, "safe_cycles": 0}
+    blind = controller_with(monitors=off)
     designed = design_law(stage(), blind, bus("fd_5k", delay), autostart=False)
     c = Cycle(designed, ramp(), Mode.IDLE)
     c.memory["homed"] = 1

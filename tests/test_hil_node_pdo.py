@@ -11,7 +11,7 @@ from pkxyz_ctrl.can.codec import ProcessCodec
 
 COUNTS = st.tuples(*[st.integers(0, 32767)] * 3)
 ZERO = (0, 0, 0)
-CRC, COUNTER, VALUE, MISSING, SHORT, LONG = 0xFF10, 0xFF11, 0xFF12, 0x8250, 0x8210, 0x8220
+CRC, COUNTER, VALUE, LATE, MISSING, SHORT, LONG = 0xFF10, 0xFF11, 0xFF12, 0xFF13, 0x8250, 0x8210, 0x8220
 GOOD = protected(DRIVE, (1, 2, 3), 0)
 
 
@@ -171,6 +171,51 @@ def test_alive_counter(first: int) -> None:
         rig.give(DRIVE, protected(DRIVE, (3, 3, 3), (second + 1) % 256))
         rig.sync()
         assert rig.node.outputs == (3, 3, 3), "in step again"
+
+
+@pytest.mark.parametrize("syncs", [1, 2, 3])
+def test_a_frame_that_came_after_its_sync_is_refused_and_those_behind_it_are_taken(syncs: int) -> None:
+    rig = operational()
+    rig.cycle((1, 1, 1))
+    for _ in range(syncs):
+        rig.sync()  # the first applies (1, 1, 1), the others find nothing
+        rig.run(200)
+    rig.sync()
+    rig.drive((2, 2, 2))
+    rig.sync()
+    assert (rig.node.outputs, emergencies(rig)) == ((1, 1, 1), [LATE])
+    rig.drive((3, 3, 3))
+    rig.sync()
+    assert (rig.node.outputs, emergencies(rig)) == ((3, 3, 3), [LATE])
+
+
+def test_0_v_is_never_too_late() -> None:
+    rig = operational()
+    rig.cycle((1, 1, 1))
+    rig.cycle()
+    rig.cycle(ZERO)
+    rig.sync()
+    assert (rig.node.outputs, emergencies(rig)) == (ZERO, [LATE])
+
+
+@pytest.mark.parametrize("refused", ["counter", "value", "crc"])
+def test_a_frame_that_was_refused_in_its_time_makes_the_next_one_no_later(refused: str) -> None:
+    rig = operational()
+    rig.cycle((1, 1, 1))
+    wrong = {
+        "counter": protected(DRIVE, (2, 2, 2), 5),
+        "value": protected(DRIVE, (-1, 2, 2), 1),
+        "crc": bytes(8),
+    }[refused]
+    rig.sync()
+    rig.give(DRIVE, wrong)
+    rig.sync()  # finds nothing to apply
+    following = {"counter": 6, "value": 2, "crc": 2}[refused]
+    rig.give(DRIVE, protected(DRIVE, (3, 3, 3), following))
+    assert LATE not in emergencies(rig)
+    rig.sync()
+    taken = refused != "crc"  # whose counter nobody could read: the next one has jumped
+    assert rig.node.outputs == ((3, 3, 3) if taken else (1, 1, 1))
 
 
 def test_errors_end_after_a_quiet_while() -> None:

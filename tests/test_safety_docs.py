@@ -52,13 +52,18 @@ def test_gate_table_reads_back(figures: ModuleType) -> None:
     [
         ("| stale | 5 ticks |", {"stale_count": 5}),
         (
-            "| sequence, CRC, length | 10, 5, 5, leak 200 ticks |",
-            {"sequence_count": 10, "crc_count": 5, "length_count": 5, "frame_leak_ticks": 200},
+            "| sequence, CRC, length | 8, 5, 5, leak 200 ticks |",
+            {"sequence_count": 8, "crc_count": 5, "length_count": 5, "frame_leak_ticks": 200},
         ),
         ("| range | 3 ticks |", {"range_count": 3}),
         ("| stroke | -2 to 27 um |", {"stroke_min_m": -2e-6, "stroke_max_m": 27e-6}),
         ("| frozen | 50 equal counts |", {"frozen_count": 50}),
         ("| innovation | 500 nm, 5 ticks |", {"innovation_max_m": 500e-9, "innovation_count": 5}),
+        ("| unexplained force at a comb | 0.8 mN, 5 ticks |", {"unexplained_force_max_n": 0.8e-3}),
+        (
+            "| its change, about a mean over 30 ms | 40 uN + 40 % of what was commanded, 5 ticks |",
+            {"force_change_max_n": 40e-6, "force_change_share": 0.4, "unexplained_force_count": 5},
+        ),
         ("| saturation | 250 ticks |", {"saturation_count": 250}),
         ("| slew | 10 V a tick, at once |", {"voltage_step_max_v": 10.0, "slew_count": 1}),
         ("| overrun | 10 missed ticks, leak 500 |", {"overrun_count": 10, "overrun_leak_ticks": 500}),

@@ -99,15 +99,17 @@ STATES: list[tuple[str, Changes, Trip]] = [
         for comb in range(3)
         for value in (0.801e-3, -0.801e-3, math.nan, math.inf)
     ),
+    *(
+        ("unexplained_force_count", {"commanded_force_n": beyond(comb, math.nan)}, Trip(Trip.COMB_FORCE_1 << comb))
+        for comb in range(3)
+    ),
     ("saturation_count", {"saturated": 1}, Trip.SATURATION),
     ("solver_count", {"solver_ok": 0}, Trip.SOLVER),
 ]
 
 # What fills a bucket: its limit, the name of its leak, one event, the trip.
 EVENTS: list[tuple[str, str, Changes, Trip]] = [
-    ("sequence_count", "frame_leak_ticks", {"sense_status": SenseStatus.COUNTER}, Trip.SENSE_SEQUENCE),
     ("sequence_count", "frame_leak_ticks", {"sense_status": SenseStatus.MISSING}, Trip.SENSE_SEQUENCE),
-    ("sequence_count", "frame_leak_ticks", {"sense_status": SenseStatus.DUPLICATE}, Trip.SENSE_SEQUENCE),
     ("crc_count", "frame_leak_ticks", {"sense_status": SenseStatus.CRC}, Trip.SENSE_CRC),
     ("length_count", "frame_leak_ticks", {"sense_status": SenseStatus.LENGTH}, Trip.SENSE_LENGTH),
     ("overrun_count", "overrun_leak_ticks", {"overrun": 1}, Trip.OVERRUN),
@@ -121,7 +123,9 @@ EVENTS: list[tuple[str, str, Changes, Trip]] = [
 @pytest.mark.parametrize("count", [1, 2, 5, 50])
 @pytest.mark.parametrize(("count_name", "bad", "trip"), STATES)
 def test_state_trips_at_exactly_n_and_recovers(count_name: str, bad: Changes, trip: Trip, count: int) -> None:
-    bench = Bench(limits=only(count_name, count))
+    limits = only(count_name, count)
+    limits["force_change_max_n"] = 1.0  # for itself below
+    bench = Bench(limits=limits)
     for _ in range(2):  # the second time shows that one good tick forgives all
         assert [bench.tick(bad) for _ in range(count - 1)] == [Trip(0)] * (count - 1)
         assert bench.tick() == 0
@@ -161,6 +165,23 @@ def test_rate_decides_in_the_long_run(count_name: str, leak_name: str, bad: Chan
     assert any(refused.tick(bad if k % 10 == 0 else None) == trip for k in range(3000))
 
 
+@pytest.mark.parametrize("odd", [SenseStatus.COUNTER, SenseStatus.DUPLICATE, SenseStatus.COUNTER | SenseStatus.MISSING])
+def test_a_frame_that_cannot_be_counts_twice(odd: SenseStatus) -> None:
+    for count in (1, 2, 8):
+        bench = Bench(limits=only("sequence_count", count))
+        needed = (count + 1) // 2
+        assert [bench.tick({"sense_status": odd}) for _ in range(needed - 1)] == [Trip(0)] * (needed - 1)
+        # a duplicate makes the tick unusable, so the next one may be its echo
+        extra = 0 if odd is SenseStatus.COUNTER or odd & SenseStatus.MISSING else needed
+        assert any(bench.tick({"sense_status": odd}) == Trip.SENSE_SEQUENCE for _ in range(1 + extra))
+
+
+def test_a_lost_frame_counts_as_it_fails_to_come_and_as_the_next_counter_has_jumped() -> None:
+    missing, jumped = {"sense_status": SenseStatus.MISSING}, {"sense_status": SenseStatus.COUNTER}
+    bench = Bench(limits=only("sequence_count", 8))
+    assert [bench.tick(changes) for changes in [missing, jumped] * 4] == [Trip(0)] * 7 + [Trip.SENSE_SEQUENCE]
+
+
 def test_several_missed_ticks_count_as_several() -> None:
     assert Bench(limits=only("overrun_count", 10)).tick({"overrun": 9}) == 0
     assert Bench(limits=only("overrun_count", 10)).tick({"overrun": 10}) == Trip.OVERRUN
@@ -197,6 +218,7 @@ def test_boundaries_themselves_are_permitted() -> None:
     for name in COUNTS:
         limits[name] = 1
     limits["frozen_count"] = 50
+    limits["force_change_max_n"] = 0.8e-3
     edge = {
         "stroke_m": [limits["stroke_min_m"][0], limits["stroke_max_m"][0], 0.0],
         "sense_count": [-32767, 32766, 0],
@@ -205,6 +227,54 @@ def test_boundaries_themselves_are_permitted() -> None:
         "voltage_step_v": [10.0, -10.0, 0.0],
     }
     assert Bench(limits=limits).tick(edge) == 0
+
+
+class Trend:
+    """A mean that a step of 1/150 a tick makes, by numpy."""
+
+    def __init__(self) -> None:
+        self.mean = np.zeros(3)
+
+    def change(self, value: NDArray[np.float64]) -> NDArray[np.float64]:
+        self.mean = self.mean + 200e-6 / 0.03 * (value - self.mean)
+        return value - self.mean
+
+
+@settings(max_examples=40, deadline=None)
+@given(st.integers(0, 2**32 - 1), st.floats(0.2, 1.5))
+def test_a_change_of_force_trips_where_it_is_out_of_proportion_for_five_ticks(seed: int, share: float) -> None:
+    """Oracle: the rule written down for whole histories. A comb makes ``1 - share`` of the force that is commanded."""
+    dice = np.random.default_rng(seed)
+    commanded = np.repeat(dice.uniform(0.0, 0.5e-3, (12, 3)), 8, axis=0)
+    lacking = -share * commanded + dice.normal(0.0, 20e-6, commanded.shape)
+    bench, missing, asked = Bench(limits=only("unexplained_force_count", 5)), Trend(), Trend()
+    beyond_so_far: list[NDArray[np.bool_]] = []
+    for c, f in zip(commanded, lacking, strict=True):
+        beyond_so_far.append(np.abs(missing.change(f)) > 40e-6 + 0.4 * np.abs(asked.change(c)))
+        expected = np.all(beyond_so_far[-5:], axis=0) & (len(beyond_so_far) >= 5)
+        trips = bench.tick({"unexplained_force_n": f, "commanded_force_n": c})
+        assert trips == sum(int(Trip.COMB_FORCE_1) << i for i in range(3) if expected[i])
+
+
+def test_an_imperfect_device_is_in_proportion_and_a_stuck_comb_is_not() -> None:
+    for share, tripped in ((0.38, False), (-0.38, False), (1.0, True), (0.0, False)):
+        bench = Bench()
+        ramp = 4e-6 * np.arange(200)  # a move at 1 mN in 50 ms
+        found = [bench.tick({"unexplained_force_n": -share * n, "commanded_force_n": n}) for n in ramp]
+        assert any(found) is tripped, share
+
+
+@pytest.mark.parametrize("value", [math.nan, math.inf, -math.inf])
+@pytest.mark.parametrize("name", ["unexplained_force_n", "commanded_force_n"])
+def test_a_force_that_is_not_finite_counts_and_leaves_no_trace(name: str, value: float) -> None:
+    bench = Bench(limits=only("unexplained_force_count", 2))
+    counted = not (name == "commanded_force_n" and math.isinf(value))  # against an infinite change all is little
+    for _ in range(3):
+        assert bench.tick({name: value}) == 0
+        assert bench.memory["unexplained_force"][0].tolist() == [int(counted)] * 3
+        assert bench.tick() == 0
+        assert not bench.memory["unexplained_trend_n"].any()
+        assert not bench.memory["commanded_trend_n"].any()
 
 
 @pytest.mark.parametrize("event", list(NodeEvent))

@@ -219,13 +219,15 @@ def test_default_limits_of_the_monitors() -> None:
     limits = default_limits()[0]
     counts = {name: int(limits[name]) for name in limits.dtype.names if name.endswith(("_count", "_ticks"))}
     assert counts == {
-        "stale_count": 5, "sequence_count": 10, "crc_count": 5, "length_count": 5, "range_count": 3,
+        "stale_count": 5, "sequence_count": 8, "crc_count": 5, "length_count": 5, "range_count": 3,
         "frozen_count": 50, "innovation_count": 5, "saturation_count": 250, "slew_count": 1, "overrun_count": 10,
         "solver_count": 5, "frame_leak_ticks": 200, "overrun_leak_ticks": 500, "residual_count": 3,
         "unexplained_force_count": 5,
     }  # fmt: skip
     assert limits["safe_cycles"] == 10
     assert (limits["residual_max_m"], limits["unexplained_force_max_n"]) == (0.7e-6, 0.8e-3)
+    assert (limits["force_change_max_n"], limits["force_change_share"]) == (40e-6, 0.4)
+    assert limits["force_trend_share"] == 200e-6 / 0.03
     assert (limits["stroke_min_m"], limits["stroke_max_m"], limits["voltage_step_max_v"]) == (-2e-6, 27e-6, 10.0)
     assert (limits["sense_count_min"], limits["sense_count_max"]) == (-32768, 32767)
     assert list(limits["innovation_max_m"]) == [0.5e-6] * 3

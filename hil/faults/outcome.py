@@ -121,7 +121,8 @@ def _problems(
             problems.append(f"a fault {onset - decision} ticks before anything was wrong")
         elif not case.reasons & Trip(int(rows["trips"][decision])):
             problems.append(f"latched {' and '.join(outcome.reason)}, which is not the cause")
-        if decision - onset > case.within_ticks:
+        ends = round(case.lasts_s * 1e6) // setup.bus.period_us
+        if decision - onset > case.within_ticks and not (case.may_go_on and decision - onset >= ends):
             problems.append(f"noticed after {decision - onset} ticks instead of {case.within_ticks}")
         problems += _problems_after(rows, decision)
         if not outcome.recovered:

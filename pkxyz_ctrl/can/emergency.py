@@ -5,6 +5,7 @@ from typing import NamedTuple
 
 PROTECTION_CRC = 0xFF10  # ours: a drive PDO with a wrong CRC was not applied
 PROTECTION_COUNTER = 0xFF11  # ours: a drive PDO with a wrong alive counter was not applied
+PROTECTION_LATE = 0xFF13  # ours: a drive PDO that came after its SYNC was not applied
 
 _EXACT = {
     0x8110: "CAN overrun, objects lost",
@@ -19,6 +20,7 @@ _EXACT = {
     0x8250: "RPDO time-out",
     PROTECTION_CRC: "drive PDO with a wrong CRC",
     PROTECTION_COUNTER: "drive PDO with a wrong alive counter",
+    PROTECTION_LATE: "drive PDO after the SYNC that it was meant for",
 }
 _CLASS = {
     0x00: "error reset or no error",

@@ -253,16 +253,26 @@ def is_discharged(memory: np.void) -> bool:
 
 
 @njit(cache=True)
-def unexplained_force(memory: np.void, out_n: Array) -> None:
-    """Comb forces (3,) that would amount to the estimated disturbance: J^-T d, with the Jacobian of the last ``act``.
+def unexplained_force(law: np.void, memory: np.void, out_n: Array) -> None:
+    """Comb forces (3,) that would explain what was seen: J^-T (d + K_0 e), with the Jacobian of the last ``act``; d is
+    the estimated disturbance, which takes its time, and K_0 e what holds the stage where it is instead of where it
+    was expected.
 
     A comb that does not give the force of its voltage shows up in its own entry alone.
     """
     inverse, disturbance = memory["scratch"]["inverse"], memory["estimate"]["filtered"]
+    innovation, stiffness = memory["estimate"]["innovation_m"], law["estimator"]["stiffness_n_per_m"]
     for i in range(3):
         out_n[i] = 0.0
         for k in range(3):
-            out_n[i] += inverse[k, i] * disturbance[6 + k]
+            held = stiffness[k, 0] * innovation[0] + stiffness[k, 1] * innovation[1] + stiffness[k, 2] * innovation[2]
+            out_n[i] += inverse[k, i] * (disturbance[6 + k] + held)
+
+
+@njit(cache=True)
+def commanded_force(law: np.void, memory: np.void, out_n: Array) -> None:
+    """Comb forces (3,) by the voltages that act from this sample on, at the end of a tick."""
+    voltage.forces_of_counts(law["drive"], memory["count"][law["delay_periods"]], out_n)
 
 
 @njit(cache=True)

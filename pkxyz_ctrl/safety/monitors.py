@@ -21,6 +21,13 @@ from numba import njit
 from numpy.typing import NDArray
 
 from pkxyz_ctrl.safety.modes import LOOP_CLOSED, NODE_EXPECTED, Mode
+from pkxyz_ctrl.safety.thresholds import (
+    FORCE_CHANGE_MAX_N,
+    FORCE_CHANGE_SHARE,
+    FORCE_TREND_S,
+    RESIDUAL_MAX_M,
+    UNEXPLAINED_FORCE_MAX_N,
+)
 from pkxyz_ctrl.safety.trips import Trip
 
 
@@ -52,6 +59,9 @@ LIMITS: Final = np.dtype(
         ("innovation_max_m", "f8", (3,)),
         ("residual_max_m", "f8"),
         ("unexplained_force_max_n", "f8"),
+        ("force_change_max_n", "f8"),  # of the unexplained force about its trend ...
+        ("force_change_share", "f8"),  # ... and this much of the change of the commanded force
+        ("force_trend_share", "f8"),  # of its way that a trend goes in a tick
         ("voltage_step_max_v", "f8"),
         ("sense_count_min", "i4"),  # at or below is at the rail
         ("sense_count_max", "i4"),  # at or above is at the rail
@@ -83,6 +93,8 @@ MONITOR_MEMORY: Final = np.dtype(
         ("length_level", "i8"),
         ("overrun_level", "i8"),
         ("residual_level", "i8", (3,)),
+        ("unexplained_trend_n", "f8", (3,)),
+        ("commanded_trend_n", "f8", (3,)),
         ("stale", "i4"),
         ("range", "i4", (3,)),
         ("frozen", "i4", (3,)),
@@ -100,7 +112,8 @@ OBSERVATION: Final = np.dtype(
     [
         ("stroke_m", "f8", (3,)),  # measured strokes relative to rest
         ("innovation_m", "f8", (3,)),  # measured minus predicted position, x y z
-        ("unexplained_force_n", "f8", (3,)),  # at combs 1 2 3, what the estimated disturbance amounts to there
+        ("unexplained_force_n", "f8", (3,)),  # at combs 1 2 3, what their forces lack or have too much
+        ("commanded_force_n", "f8", (3,)),  # of combs 1 2 3, by the voltages that act
         ("voltage_step_v", "f8", (3,)),  # commanded now minus commanded one tick ago, combs 1 2 3
         ("implausible_combs", "i4"),  # of :func:`implausible_combs`, bit 0 for comb 1
         ("mode", "i4"),  # Mode in which this tick was computed
@@ -119,24 +132,27 @@ OBSERVATION: Final = np.dtype(
 def default_limits() -> NDArray[np.void]:
     """(1,) of LIMITS, for a 25 um stage at 5 kHz with 2 nm rms of sense noise.
 
-    The innovation is a few nm when all is well, up to 450 nm where a fast circle begins on the harsh plant, and the
-    shock of a snap is micrometres, hence 500 nm for an axis in five ticks and 700 nm for a stroke. A disturbance of
-    0.2 mN is what ten per cent of error in combs and springs amounts to in mid-workspace, a comb that fails there 1 mN;
-    both are twice that at the end of the stroke. Identical counts
-    for 50 ticks do not happen while noise spans several counts (0.2^50). 250 ticks at a bound are 50 ms, longer than
-    any move across the workspace takes.
+    The innovation is a few nm when all is well, up to 540 nm for a tick or two where a fast circle begins on the harsh
+    plant, and the shock of a snap is micrometres, hence 500 nm for an axis in five ticks. Those of strokes and forces
+    are explained where they stand, in ``thresholds``. Identical counts for 50 ticks do not happen while noise spans
+    several counts (0.2^50). 250 ticks at a bound are 50 ms, longer than any move across the workspace takes. A frame
+    that is lost or late counts as it fails to come and as the next one's counter has jumped, one that is repeated or
+    out of order twice: four of them in short order are a fault, since the bus does neither.
     """
     limits = np.zeros(1, LIMITS)
     limits["stroke_min_m"] = -2e-6
     limits["stroke_max_m"] = 27e-6
     limits["innovation_max_m"] = 0.5e-6
-    limits["residual_max_m"] = 0.7e-6
-    limits["unexplained_force_max_n"] = 0.8e-3
+    limits["residual_max_m"] = RESIDUAL_MAX_M
+    limits["unexplained_force_max_n"] = UNEXPLAINED_FORCE_MAX_N
+    limits["force_change_max_n"] = FORCE_CHANGE_MAX_N
+    limits["force_change_share"] = FORCE_CHANGE_SHARE
+    limits["force_trend_share"] = 200e-6 / FORCE_TREND_S
     limits["voltage_step_max_v"] = 10.0
     limits["sense_count_min"] = -32768
     limits["sense_count_max"] = 32767
     limits["stale_count"] = 5
-    limits["sequence_count"] = 10
+    limits["sequence_count"] = 8
     limits["crc_count"] = 5
     limits["length_count"] = 5
     limits["range_count"] = 3
@@ -155,7 +171,8 @@ def default_limits() -> NDArray[np.void]:
 
 
 _UNUSABLE = int(SenseStatus.MISSING | SenseStatus.CRC | SenseStatus.LENGTH | SenseStatus.DUPLICATE)
-_OUT_OF_SEQUENCE = int(SenseStatus.MISSING | SenseStatus.COUNTER | SenseStatus.DUPLICATE)
+_MISSING = int(SenseStatus.MISSING)
+_IMPOSSIBLE = int(SenseStatus.COUNTER | SenseStatus.DUPLICATE)
 _CRC = int(SenseStatus.CRC)
 _LENGTH = int(SenseStatus.LENGTH)
 
@@ -228,6 +245,8 @@ def _clear_loop(memory: np.void) -> None:
         memory["innovation"][i] = 0
         memory["residual_level"][i] = 0
         memory["unexplained_force"][i] = 0
+        memory["unexplained_trend_n"][i] = 0.0
+        memory["commanded_trend_n"][i] = 0.0
 
 
 @njit(cache=True)
@@ -250,8 +269,11 @@ def implausible_combs(limits: np.void, residual_m: NDArray[np.float64]) -> int:
 def _check_frames(limits: np.void, memory: np.void, obs: np.void) -> int:
     status = obs["sense_status"]
     leak = limits["frame_leak_ticks"]
+    events = 1 if status & (_MISSING | _IMPOSSIBLE) else 0
+    if status & _IMPOSSIBLE and (status & _MISSING or memory["stale"] == 0):
+        events = 2  # not the echo of a loss: a frame that nobody can have sent now
     memory["stale"] = _consecutive(memory["stale"], (status & _UNUSABLE) != 0)
-    memory["sequence_level"] = _bucket(memory["sequence_level"], 1 if status & _OUT_OF_SEQUENCE else 0, leak)
+    memory["sequence_level"] = _bucket(memory["sequence_level"], events, leak)
     memory["crc_level"] = _bucket(memory["crc_level"], 1 if status & _CRC else 0, leak)
     memory["length_level"] = _bucket(memory["length_level"], 1 if status & _LENGTH else 0, leak)
     trips: int = _reached(memory["stale"], limits["stale_count"], _SENSE_STALE)
@@ -306,15 +328,35 @@ def _check_residuals(limits: np.void, memory: np.void, obs: np.void) -> int:
 
 
 @njit(cache=True)
+def _check_forces(limits: np.void, memory: np.void, obs: np.void) -> int:
+    """Whose force is not that of its voltage: by too much altogether, or by too much of what has changed of late.
+
+    An imperfect device is off in proportion, and so is its change; a comb that does not obey, or whose stroke is not
+    seen, is off by all of the change.
+    """
+    trips: int = 0
+    share = limits["force_trend_share"]
+    for i in range(3):
+        force_n, commanded_n = obs["unexplained_force_n"][i], obs["commanded_force_n"][i]
+        if abs(force_n) + abs(commanded_n) < np.inf:  # what is not finite leaves no trace
+            memory["unexplained_trend_n"][i] += share * (force_n - memory["unexplained_trend_n"][i])
+            memory["commanded_trend_n"][i] += share * (commanded_n - memory["commanded_trend_n"][i])
+        change_n = abs(force_n - memory["unexplained_trend_n"][i])
+        asked_n = abs(commanded_n - memory["commanded_trend_n"][i])
+        # Written as "not within", so that NaN counts as beyond.
+        astray = not abs(force_n) <= limits["unexplained_force_max_n"]
+        astray = astray or not change_n <= limits["force_change_max_n"] + limits["force_change_share"] * asked_n
+        memory["unexplained_force"][i] = _consecutive(memory["unexplained_force"][i], astray)
+        trips |= _reached(memory["unexplained_force"][i], limits["unexplained_force_count"], _COMB_FORCE_1 << i)
+    return trips
+
+
+@njit(cache=True)
 def _check_loop(limits: np.void, memory: np.void, obs: np.void) -> int:
     """What has a meaning only while the loop is closed."""
     trips: int = 0
     too_fast = False
     for i in range(3):
-        # Written as "not within", so that NaN counts as beyond.
-        astray = not abs(obs["unexplained_force_n"][i]) <= limits["unexplained_force_max_n"]
-        memory["unexplained_force"][i] = _consecutive(memory["unexplained_force"][i], astray)
-        trips |= _reached(memory["unexplained_force"][i], limits["unexplained_force_count"], _COMB_FORCE_1 << i)
         beyond = not abs(obs["innovation_m"][i]) <= limits["innovation_max_m"][i]
         memory["innovation"][i] = _consecutive(memory["innovation"][i], beyond)
         trips |= _reached(memory["innovation"][i], limits["innovation_count"], _INNOVATION_X << i)
@@ -325,7 +367,7 @@ def _check_loop(limits: np.void, memory: np.void, obs: np.void) -> int:
     trips |= _reached(memory["saturation"], limits["saturation_count"], _SATURATION)
     trips |= _reached(memory["slew"], limits["slew_count"], _SLEW)
     trips |= _reached(memory["solver"], limits["solver_count"], _SOLVER)
-    return trips | _check_residuals(limits, memory, obs)
+    return trips | _check_forces(limits, memory, obs) | _check_residuals(limits, memory, obs)
 
 
 @njit(cache=True)

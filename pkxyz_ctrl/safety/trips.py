@@ -152,15 +152,15 @@ EXPLANATIONS: Final[dict[Trip, tuple[str, str]]] = {
     ),
     Trip.COMB_FORCE_1: (
         "drive comb 1 pulls with a force that is not that of its voltage",
-        "check amplifier channel 1 (stuck, dead, limited, slow), then look for something that pushes the stage",
+        "check amplifier channel 1 (stuck, dead, limited, slow), then sense comb 1 (slow), then look for a push",
     ),
     Trip.COMB_FORCE_2: (
         "drive comb 2 pulls with a force that is not that of its voltage",
-        "check amplifier channel 2 (stuck, dead, limited, slow), then look for something that pushes the stage",
+        "check amplifier channel 2 (stuck, dead, limited, slow), then sense comb 2 (slow), then look for a push",
     ),
     Trip.COMB_FORCE_3: (
         "drive comb 3 pulls with a force that is not that of its voltage",
-        "check amplifier channel 3 (stuck, dead, limited, slow), then look for something that pushes the stage",
+        "check amplifier channel 3 (stuck, dead, limited, slow), then sense comb 3 (slow), then look for a push",
     ),
 }
 

@@ -1,0 +1,31 @@
+"""Numbers that tell a fault from a device that is merely imperfect: one place, each with what it follows from.
+
+Measured on the plant with the laws of configs/controllers: moves between the corners of the workspace at 0.5 and
+2 mm/s, circles of 4 um at 100 Hz and 2 um at 200 Hz, the shipped scans; on the plant ``harsh`` (10 % in combs and
+springs), and where stiffness is 20 % off, mass 10 % and each comb 10 %, with quality factors of 5 to 200 (the
+tolerances ``wide``). ``tests/test_false_alarms.py`` repeats it.
+"""
+
+from typing import Final
+
+RESIDUAL_MAX_M: Final = 0.7e-6
+"""Most that a stroke may be from where it was expected; beyond it the measurement is not used. Up to 0.54 um where a
+fast circle begins on ``harsh``; 2 nm of noise are nothing beside it."""
+
+UNEXPLAINED_FORCE_MAX_N: Final = 0.8e-3
+"""Most that a comb's force may be off altogether. Where springs are 20 % too stiff and combs 10 % too weak, they take a
+third more than the model says: at the end of the stroke all of the 2.55 mN that 200 V give, of which a quarter,
+0.64 mN, is not explained (measured: 0.65). ``harsh`` shows 0.26. A comb that is dead in mid-workspace lacks 1.1 mN."""
+
+FORCE_TREND_S: Final = 0.03
+"""What changes more slowly than this is the business of ``UNEXPLAINED_FORCE_MAX_N``. Longer, and what is left of the
+way into a scan hides what happens in it."""
+
+FORCE_CHANGE_SHARE: Final = 0.4
+"""Of a change of the commanded force, what an imperfect device may make too much or too little of: where springs are
+20 % too soft and combs 10 % too strong, 1.1 / 0.8 - 1 = 38 %."""
+
+FORCE_CHANGE_MAX_N: Final = 40e-6
+"""What a change of unexplained force may be besides: twice the most that was seen five ticks in a row, 10 uN on
+``harsh`` and 20 uN in ``wide``. It is the weight of the moving mass: a knock of 1 g on the table that lasts five ticks
+is noticed, too."""
