@@ -60,7 +60,11 @@ class Lockstep:
 
     def spend(self, compute_us: int) -> None:
         """Let ``compute_us`` pass: computing costs what one says that it costs."""
-        self.run_until(self.now_us + compute_us)
+        t_us = self.now_us + compute_us
+        if self._heap and self._heap[0][0] <= t_us:
+            self.run_until(t_us)
+        else:
+            self.now_us = t_us
 
     def run_while_empty(self, queue: Sized, t_us: int) -> None:
         """Run events one by one until ``queue`` holds something or it is ``t_us``; an earlier ``t_us`` is now."""

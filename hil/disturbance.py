@@ -23,10 +23,11 @@ FaultTap = Callable[[Frame, str, int], Outcome | None]
 
 
 class Disturbance:
-    """Judges each frame as it ends. ``armed`` is False while nothing is set, and then nobody asks."""
+    """Judges each frame as it ends. ``armed`` is False while nothing is set; ``on_armed`` hears that something was."""
 
-    def __init__(self, seed: int) -> None:
+    def __init__(self, seed: int, on_armed: Callable[[], object]) -> None:
         self.armed = False
+        self._on_armed = on_armed
         self._random = random.Random(seed)
         self._tap: FaultTap | None = None
         self._bit_error_rate = 0.0
@@ -64,3 +65,5 @@ class Disturbance:
 
     def _rearm(self) -> None:
         self.armed = bool(self._doomed or self._bit_error_rate or self._tap)
+        if self.armed:
+            self._on_armed()

@@ -6,9 +6,8 @@ from enum import IntEnum
 from heapq import heappush
 from typing import TYPE_CHECKING
 
-from hil.frame_time import FrameFormatError, duration_ns_kernel, frame_duration_ns, frame_flags
+from hil.frame_time import FrameFormatError, frame_duration_ns
 from pkxyz_ctrl.can.frame import Frame
-from pkxyz_ctrl.direct_call import direct
 
 if TYPE_CHECKING:
     from hil.wire import Wire
@@ -20,12 +19,12 @@ class ErrorState(IntEnum):
     BUS_OFF = 2  # transmit counter at 256 or more
 
 
-_duration_ns = direct(duration_ns_kernel, 0, b"", 0, 0, 0)
 _REMEMBERED = 1024  # identifiers, and durations of each
 
+Listener = Callable[[Frame, int], object]
 Entry = tuple[int, int, Frame, int]  # arbitration key, order of queueing, frame, duration_ns
-Kind = tuple[tuple[object, ...], int, int, dict[bytes, int]]  # marks, arbitration key, flags, recurring durations
-_UNSEEN: Kind = ((), 0, 0, {})
+Kind = tuple[int, int, dict[bytes, int]]  # flags, arbitration key, durations of frames that recur
+_UNSEEN: Kind = (-1, 0, {})
 
 
 class Endpoint:
@@ -34,9 +33,12 @@ class Endpoint:
     __slots__ = (
         "_earliest_ns",
         "_kinds",
-        "_others",
+        "_listeners",
+        "_on_frame",
+        "_queues",
         "_received",
         "_recovery_runs",
+        "_take",
         "_to_send",
         "_wire",
         "auto_recover",
@@ -44,10 +46,10 @@ class Endpoint:
         "error_frames",
         "listen_only",
         "name",
-        "on_frame",
         "on_full",
         "on_sent",
         "overruns",
+        "pending",
         "queue_limit",
         "receive_errors",
         "send_drops",
@@ -58,17 +60,18 @@ class Endpoint:
         self,
         wire: "Wire",
         name: str,
-        on_frame: Callable[[Frame, int], object] | None,
+        on_frame: Listener | None,
         queue_limit: int,
         on_full: Callable[[], object] | None,
-        on_sent: Callable[[Frame, int], object] | None,
+        on_sent: Listener | None,
         listen_only: bool,
         error_frames: bool,
         auto_recover: bool,
     ) -> None:
         self._wire: Wire | None = wire
         self.name = name
-        self.on_frame = on_frame
+        self._on_frame = on_frame
+        self._take: Listener = on_frame or self._keep  # what becomes of a frame of another
         self.on_sent = on_sent
         self.queue_limit = queue_limit
         self.on_full = on_full
@@ -81,11 +84,26 @@ class Endpoint:
         self.overruns = 0  # frames lost because the receive queue was full
         self.send_drops = 0  # frames refused or discarded unsent
         self._to_send: list[Entry] = []
+        self.pending = self._to_send.__len__
+        """Number of frames queued and not yet sent, the one on the wire included."""
         self._kinds: dict[int, Kind] = {}  # by identifier: the latest that was sent
-        self._others: tuple[Endpoint, ...] = ()  # on the same wire
+        self._listeners: tuple[Endpoint, ...] = ()  # the others that are called, and those whose queues are filled
+        self._queues: tuple[tuple[deque[tuple[Frame, int]], int, Endpoint], ...] = ()
         self._received: deque[tuple[Frame, int]] = deque()
         self._earliest_ns = 0
         self._recovery_runs = 0
+
+    @property
+    def on_frame(self) -> Listener | None:
+        """Called with each frame of the others and the time in us at which it ended; None: they are queued."""
+        return self._on_frame
+
+    @on_frame.setter
+    def on_frame(self, on_frame: Listener | None) -> None:
+        self._on_frame = on_frame
+        self._take = on_frame or self._keep
+        if self._wire is not None:
+            self._wire._introduce()
 
     @property
     def state(self) -> ErrorState:
@@ -104,17 +122,21 @@ class Endpoint:
         wire = self._wire
         if wire is not None and wire._is_calm:
             # The short way, for speed: a frame of a kind that was sent before, with nothing else on its way.
-            can_id, data = frame[0], frame[1]
-            marks, key, flags, recurring_ns = self._kinds.get(can_id, _UNSEEN)
-            if marks == frame[2:]:
-                duration_ns = recurring_ns.get(data) or _duration_ns(
-                    can_id, data, flags, wire.nominal_bitrate, wire._fast_bitrate
-                )
+            can_id, data, flags = frame
+            known_flags, key, known_ns = self._kinds.get(can_id, _UNSEEN)
+            if flags == known_flags:
+                duration_ns = (known_ns and known_ns.get(data)) or wire._duration_ns(can_id, data, flags)
                 if duration_ns > 0:
-                    wire._order = order = wire._order + 1
-                    entry = key, order, frame, duration_ns
+                    wire._is_calm = False
+                    wire._sender = self
+                    wire._entry = entry = key, 0, frame, duration_ns
                     self._to_send.append(entry)
-                    wire._begin(self, entry, wire.clock.now_us * 1000)
+                    start_ns = wire.clock.now_us * 1000
+                    if start_ns < wire._free_ns:
+                        start_ns = wire._free_ns
+                    wire._start_ns = start_ns
+                    wire._end_us = end_us = (start_ns + duration_ns + wire._to_end_ns) // 1000
+                    wire._call_at(end_us, wire._completion)
                     return True
         return self._queue(frame)
 
@@ -123,7 +145,7 @@ class Endpoint:
         if wire is None or self.listen_only:
             raise RuntimeError(f"endpoint {self.name!r} is {'listen-only' if wire else 'detached'}")
         is_passive = self._is_passive()
-        duration_ns = frame_duration_ns(frame, wire.nominal_bitrate, wire._fast_bitrate, is_passive)
+        duration_ns = frame_duration_ns(frame, *wire._bitrates, is_passive)
         if frame.is_fd and wire.data_bitrate is None:
             raise FrameFormatError("a CAN FD frame on a classic wire (no data bit rate)")
         if self.bus_off or len(self._to_send) >= self.queue_limit:
@@ -135,24 +157,31 @@ class Endpoint:
         wire._has_queue = True
         wire._order = order = wire._order + 1
         heappush(self._to_send, (key, order, frame, duration_ns))
-        if not wire._delivering and (wire._end_us < 0 or wire.clock.now_us * 1000 <= wire._start_ns):
+        if not wire._has_started():
             wire._arbitrate()
         return True
 
     def _remember(self, frame: Frame, key: int, duration_ns: int) -> None:
-        can_id, data, *_ = frame
+        can_id, data, flags = frame
         if can_id not in self._kinds and len(self._kinds) >= _REMEMBERED:
             return
         kind = self._kinds.get(can_id, _UNSEEN)
-        if kind[0] != frame[2:]:
-            kind = self._kinds[can_id] = frame[2:], key, frame_flags(frame), {}
-        if len(data) < 3 and len(kind[3]) < _REMEMBERED:  # SYNC and heartbeats recur; process data hardly ever does
-            kind[3][data] = duration_ns
+        if kind[0] != flags:
+            kind = self._kinds[can_id] = flags, key, {}
+        if len(data) < 3 and len(kind[2]) < _REMEMBERED:  # SYNC and heartbeats recur; process data hardly ever does
+            kind[2][data] = duration_ns
+
+    def _keep(self, frame: Frame, t_us: int) -> None:
+        """Queue a frame that has come."""
+        if len(self._received) < self.queue_limit:
+            self._received.append((frame, t_us))
+        else:
+            self._overrun(frame, t_us)
 
     def _overrun(self, frame: Frame, t_us: int) -> None:
         """There is no room for a frame that has come."""
-        if self.bus_off:
-            return  # detached while the frame was delivered to the others
+        if self._wire is None:
+            return
         if self.on_full is not None:
             self.on_full()
         if len(self._received) < self.queue_limit:
@@ -177,17 +206,13 @@ class Endpoint:
         self._received.clear()
         return received
 
-    def pending(self) -> int:
-        """Number of frames queued and not yet sent, the one on the wire included."""
-        return len(self._to_send)
-
     def flush(self) -> None:
         """Discard all queued frames but the one on the wire."""
         wire = self._wire
-        kept = [e for e in self._to_send if wire is not None and e is wire._entry and wire._has_started()]
+        kept = [e for e in self._to_send if wire is not None and wire._has_started() and e is wire._entry]
         self.send_drops += len(self._to_send) - len(kept)
         self._to_send[:] = kept
-        if wire is not None and not kept and wire._sender is self:
+        if wire is not None and wire._end_us >= 0 and not wire._has_started() and wire._sender is self:
             wire._arbitrate()
 
     def recover(self) -> None:
@@ -199,6 +224,19 @@ class Endpoint:
         """Unplug. A frame on its way is cut off; received frames stay readable."""
         if self._wire is not None:
             self._wire._detach(self)
+
+    def _unplug(self) -> None:
+        self._wire = None
+        self._on_frame = self.on_sent = None
+        self._take = _ignore  # in the middle of a delivery, too
+        self._received = self._received.copy()
+        self.bus_off = True
+        self.send_drops += len(self._to_send)
+        self._to_send.clear()
+
+
+def _ignore(frame: Frame, t_us: int) -> None:
+    """What a controller does with a frame that has no wire."""
 
 
 def arbitration_key(frame: Frame) -> int:

@@ -6,13 +6,13 @@ from typing import Self
 
 from hil.endpoint import Endpoint
 from hil.wire import ERROR_BUS, Wire
-from pkxyz_ctrl.can.frame import Frame
+from pkxyz_ctrl.can.frame import BIT_RATE_SWITCH, ERROR, EXTENDED, FD, REMOTE, Frame
 
 BLOCK_FRAMES = 512  # formatted and written together: few enough to stay in the cache, 35 ms of a busy wire
 ERROR_FLAG = 0x2000_0000  # CAN_ERR_FLAG of linux/can.h
 
 _THREE_DIGITS = tuple(f"{n:03d}" for n in range(1000))
-_UNSEEN: tuple[tuple[object, ...], str] = ((), "")
+_UNSEEN = (-1, "")
 
 
 class FrameLog:
@@ -28,7 +28,7 @@ class FrameLog:
         self.channel = channel
         self.frames = 0
         self._rows: list[tuple[Frame, int]] = []
-        self._middles: dict[int, tuple[tuple[object, ...], str]] = {}  # of an identifier: marks, text before the data
+        self._middles: dict[int, tuple[int, str]] = {}  # of an identifier: flags, text before the data
         self._endpoint: Endpoint | None = None
         self._file = self.path.open("w", encoding="ascii", newline="\n")
 
@@ -76,26 +76,25 @@ class FrameLog:
         # Formatting a number takes as long as the rest of a line: the milliseconds are kept, the rest is looked up.
         lines: list[str] = []
         write, middles = lines.append, self._middles
-        last_ms, begin = -1, ""
-        for frame, t_us in rows:
-            t_ms = t_us // 1000
-            if t_ms != last_ms:
-                last_ms, begin = t_ms, f"({t_ms // 1000}.{t_ms % 1000:03d}"
-            marks, middle = middles.get(frame[0], _UNSEEN)
-            if marks != frame[2:]:
-                marks, middle = middles[frame[0]] = frame[2:], f") {self.channel} {_identifier(frame)}"
-            data = frame[1]
-            payload = data.hex().upper() if not frame[4] else f"{len(data)}" if data else ""
-            write(f"{begin}{_THREE_DIGITS[t_us - 1000 * t_ms]}{middle}{payload}\n")
+        begin_us, end_us, begin = 0, 0, ""
+        for (can_id, data, flags), t_us in rows:
+            if not begin_us <= t_us < end_us:
+                t_ms = t_us // 1000
+                begin_us, end_us, begin = 1000 * t_ms, 1000 * t_ms + 1000, f"({t_ms // 1000}.{t_ms % 1000:03d}"
+            known_flags, middle = middles.get(can_id, _UNSEEN)
+            if flags != known_flags:
+                middle = f") {self.channel} {_identifier(can_id, flags)}"
+                middles[can_id] = flags, middle
+            payload = data.hex().upper() if not flags & REMOTE else f"{len(data)}" if data else ""
+            write(f"{begin}{_THREE_DIGITS[t_us - begin_us]}{middle}{payload}\n")
         return lines
 
 
-def _identifier(frame: Frame) -> str:
+def _identifier(can_id: int, flags: int) -> str:
     """The identifier, the mark of the kind of frame and, for FD, its flags."""
-    can_id = frame.can_id
-    if frame.is_error:
+    if flags & ERROR:
         can_id |= ERROR_FLAG | ERROR_BUS  # without this class python-can's reader takes it for a data frame
-    identifier = f"{can_id:08X}" if frame.is_extended or frame.is_error else f"{can_id:03X}"
-    if frame.is_fd:
-        return f"{identifier}##{1 if frame.bitrate_switch else 0}"
-    return f"{identifier}#R" if frame.is_remote else f"{identifier}#"
+    identifier = f"{can_id:08X}" if flags & (EXTENDED | ERROR) else f"{can_id:03X}"
+    if flags & FD:
+        return f"{identifier}##{1 if flags & BIT_RATE_SWITCH else 0}"
+    return f"{identifier}#R" if flags & REMOTE else f"{identifier}#"

@@ -13,11 +13,11 @@ takes over, so their CRC does not change their length.
 import numpy as np
 from numba import njit
 
-from pkxyz_ctrl.can.frame import Frame
+from pkxyz_ctrl.can.frame import BIT_RATE_SWITCH, ERROR, EXTENDED, FD, REMOTE, Frame
 
 FD_LENGTHS = (0, 1, 2, 3, 4, 5, 6, 7, 8, 12, 16, 20, 24, 32, 48, 64)
 
-IS_FD, BIT_RATE_SWITCH, IS_REMOTE, IS_EXTENDED, ERROR_PASSIVE = 1, 2, 4, 8, 16
+ERROR_PASSIVE = 32  # beside the flags of a frame: its sender's state, which an FD frame tells in its ESI bit
 
 CRC15_POLYNOMIAL = 0x4599  # x^15+x^14+x^10+x^8+x^7+x^4+x^3+1, without its leading term
 ACK_TO_END_BITS = 9  # ACK slot, ACK delimiter, 7 x end of frame
@@ -77,14 +77,14 @@ def _id_bits(can_id: int, extended: bool) -> int:
 def _bit_counts(can_id: int, data: bytes, flags: int) -> int:
     """Bits at nominal rate | bits at data rate << 16; -1 if there is no such frame."""
     length = len(data)
-    extended = (flags & IS_EXTENDED) != 0
+    extended = (flags & EXTENDED) != 0
     if can_id < 0 or can_id >= (1 << 29 if extended else 1 << 11):
         return -1
     header, n_header = _id_bits(can_id, extended), 32 if extended else 12
-    if flags & IS_FD == 0:
+    if flags & FD == 0:
         if length > 8 or flags & BIT_RATE_SWITCH:
             return -1
-        remote = 1 if flags & IS_REMOTE else 0
+        remote = 1 if flags & REMOTE else 0
         header, n_header = header << 7 | remote << 6 | length, n_header + 7  # RTR, IDE or r1, r0, DLC
         state, crc = _stuff(1, header, n_header), _crc15(0, header, n_header)
         if remote:
@@ -96,7 +96,7 @@ def _bit_counts(can_id: int, data: bytes, flags: int) -> int:
         stuffed = (state >> 8) + (1 if (state >> 1) & 0x7F == 5 else 0)
         return int(n_header + 8 * length + 15 + stuffed + 1 + ACK_TO_END_BITS + INTERFRAME_BITS)
     code = _fd_code(length)
-    if code < 0 or flags & IS_REMOTE:
+    if code < 0 or flags & REMOTE:
         return -1
     switch = 1 if flags & BIT_RATE_SWITCH else 0
     # RRS, IDE, FDF, res, BRS; an extended frame has had its IDE
@@ -112,7 +112,7 @@ def _bit_counts(can_id: int, data: bytes, flags: int) -> int:
 
 
 @njit(cache=True)
-def duration_ns_kernel(can_id: int, data: bytes, flags: int, nominal_bitrate: int, data_bitrate: int) -> int:
+def duration_ns_kernel(nominal_bitrate: int, data_bitrate: int, can_id: int, data: bytes, flags: int) -> int:
     """``frame_duration_ns`` for the hot path: -1 if there is no such frame."""
     counts = _bit_counts(can_id, data, flags)
     if counts < 0:
@@ -125,14 +125,10 @@ def duration_ns_kernel(can_id: int, data: bytes, flags: int, nominal_bitrate: in
 
 def frame_flags(frame: Frame, error_passive: bool = False) -> int:
     """The flags of ``duration_ns_kernel``. Raises FrameFormatError for an error frame."""
-    _, _, is_fd, bitrate_switch, is_remote, is_extended, is_error = frame
-    if is_error:
+    flags = frame.flags
+    if flags & ERROR:
         raise FrameFormatError("an error frame has no length of its own")
-    flags = (IS_FD if is_fd else 0) | (BIT_RATE_SWITCH if bitrate_switch else 0)
-    if is_remote or is_extended or error_passive:
-        flags |= (IS_REMOTE if is_remote else 0) | (IS_EXTENDED if is_extended else 0)
-        flags |= ERROR_PASSIVE if error_passive else 0
-    return flags
+    return flags | ERROR_PASSIVE if error_passive else flags
 
 
 def frame_duration_ns(frame: Frame, nominal_bitrate: int, data_bitrate: int, error_passive: bool = False) -> int:
@@ -142,7 +138,7 @@ def frame_duration_ns(frame: Frame, nominal_bitrate: int, data_bitrate: int, err
     which an FD frame carries in its ESI bit. Raises FrameFormatError.
     """
     duration_ns: int = duration_ns_kernel(
-        frame[0], frame[1], frame_flags(frame, error_passive), nominal_bitrate, data_bitrate
+        nominal_bitrate, data_bitrate, frame.can_id, frame.data, frame_flags(frame, error_passive)
     )
     if duration_ns < 0:
         raise FrameFormatError(_what_is_wrong(frame))
@@ -151,7 +147,7 @@ def frame_duration_ns(frame: Frame, nominal_bitrate: int, data_bitrate: int, err
 
 def frame_bit_counts(frame: Frame, error_passive: bool = False) -> tuple[int, int]:
     """Bits at the nominal and at the data bit rate, interframe space included. Raises FrameFormatError."""
-    counts: int = _bit_counts(frame[0], frame[1], frame_flags(frame, error_passive))
+    counts: int = _bit_counts(frame.can_id, frame.data, frame_flags(frame, error_passive))
     if counts < 0:
         raise FrameFormatError(_what_is_wrong(frame))
     return counts & 0xFFFF, counts >> 16

@@ -17,7 +17,7 @@ from hil.node_pdo import PdoParameters
 from hil.node_sense import Plant, SenseTransmitter
 from hil.object_dictionary import ObjectDictionary
 from hil.sdo_server import SdoServer
-from pkxyz_ctrl.can.frame import Frame
+from pkxyz_ctrl.can.frame import FD_FAST, UNUSUAL, Frame
 
 BOOT_US = 2_000  # from reset to boot-up message; a small microcontroller takes a few ms
 _COMMUNICATION_PROFILE = (0x1000, 0x1FFF)
@@ -64,7 +64,7 @@ class AmplifierNode:
         self._clock = clock
         self._send = send
         self._plant = plant
-        self._fd = fd
+        self._flags = FD_FAST if fd else 0
         self._protection = protection
         self._boot_us = boot_us
         self._boot_alarm = Alarm(clock, self._boot)
@@ -107,9 +107,10 @@ class AmplifierNode:
 
     def on_frame(self, frame: Frame, t_us: int) -> None:
         """A frame of somebody else has ended on the wire at ``t_us`` (now)."""
-        receiver = self._receivers.get(frame[0])
-        if receiver is not None and not (frame[4] or frame[5] or frame[6]):  # remote, extended, error
-            receiver(frame[1], t_us)
+        can_id, data, flags = frame
+        receiver = self._receivers.get(can_id)
+        if receiver is not None and not flags & UNUSUAL:
+            receiver(data, t_us)
 
     def amplifier_fault(self, code: int) -> None:
         """The amplifier reports a fault (an EMCY ``code``, say 0x2310): outputs at their error values until cleared."""
@@ -337,5 +338,4 @@ class AmplifierNode:
         self._transmit(0x700 + self.node_id, bytes((self.state,)))
 
     def _transmit(self, cob_id: int, data: bytes) -> None:
-        fd = self._fd
-        self._send(_new_tuple(Frame, (cob_id, data, fd, fd, False, False, False)))
+        self._send(_new_tuple(Frame, (cob_id, data, self._flags)))

@@ -53,6 +53,7 @@ class SenseTransmitter:
         self._turnaround_us = turnaround_us
         self._event = Alarm(clock, self._on_event)
         self._running = False
+        self._each = False  # SYNC is one to sample at
         self._sync_us = 0
         self._cycle_us = 0  # between the last two SYNCs
         self._due_us: int | None = None  # of the frame in the turn-around
@@ -65,11 +66,9 @@ class SenseTransmitter:
         """Take over COB-ID, mapping, transmission type and timers from the dictionary."""
         od, parameters = self._od, self._parameters
         self._cob_id = parameters.cob_id
-        self._cob_bytes = self._cob_id.to_bytes(2, "little")
         self._layout = parameters.layout()
-        self._is_default = self._layout.fields == parameters.protected_fields
-        if self._is_default:
-            self._w3 = last_byte_table(self._cob_id)
+        is_default = self._layout.fields == parameters.protected_fields
+        self._w3 = last_byte_table(self._cob_id) if is_default else None
         kind = parameters.transmission_type
         self._on_change = kind == 0
         self._every = max(1, kind) if parameters.in_use and kind <= 240 else 0
@@ -89,6 +88,7 @@ class SenseTransmitter:
         self._to_go = self._every
         self._sent: tuple[int, int, int] | None = None
         self._waits_for = self._start_data
+        self._each = self._every == 1 and self._start_data is None
         if self._event_us:
             self._event.set(self._clock.now_us + self._event_us)
 
@@ -102,21 +102,25 @@ class SenseTransmitter:
         """Sample if it is time to; the plant is at ``t_us``. ``data`` of the SYNC: its counter, or nothing."""
         self._cycle_us = t_us - self._sync_us
         self._sync_us = t_us
+        if not (self._each or self._is_time(data)):
+            return
+        self.counts = counts = self._plant.sample()
+        if self._on_change and counts == self._sent:
+            return
+        self._due_us = due_us = t_us + self._turnaround_us
+        self._clock.call_at(due_us, self._on_turnaround)
+
+    def _is_time(self, data: bytes) -> bool:
         self._to_go -= 1
         if self._waits_for is not None:
             if data != self._waits_for:
-                return
+                return False
             self._waits_for = None
             self._to_go = 0
         if self._to_go > 0 or not self._every:
-            return
+            return False
         self._to_go = self._every
-        self.counts = self._plant.sample()
-        if self._on_change and self.counts == self._sent:
-            return
-        due_us = t_us + self._turnaround_us
-        self._due_us = due_us
-        self._clock.call_at(due_us, self._on_turnaround)
+        return True
 
     def _on_turnaround(self) -> None:
         now_us = self._clock.now_us
@@ -134,9 +138,10 @@ class SenseTransmitter:
 
     def _transmit(self) -> None:
         self.counter = counter = (self.counter + 1) & 0xFF
-        if self._is_default:
+        w3 = self._w3
+        if w3 is not None:
             a, b, c = self._sent = self.counts
-            self.crc = crc = self._w0[a] ^ self._w1[b] ^ self._w2[c] ^ self._w3[counter]
+            self.crc = crc = self._w0[a] ^ self._w1[b] ^ self._w2[c] ^ w3[counter]
             self._send(self._cob_id, _pack_protected(a, b, c, counter, crc))
         else:
             self._send(self._cob_id, self._encode_mapped())
@@ -147,7 +152,7 @@ class SenseTransmitter:
         self.publish()
         data = layout.codec.pack(*(od[field] for field in layout.fields))
         if layout.crc is not None:
-            self.crc = od[_PROTECTION, 2] = crc8h2f(self._cob_bytes + data[:-1])
+            self.crc = od[_PROTECTION, 2] = crc8h2f(self._cob_id.to_bytes(2, "little") + data[:-1])
             data = data[:-1] + bytes((self.crc,))
         return data
 

@@ -59,28 +59,26 @@ class PlantOnBus:
         self._params, self._state = plant.params, plant.state
         self.exchange = np.zeros(1, EXCHANGE)
         self._counts: Sequence[int] = (0, 0, 0)
-        self._is_driven = False  # the counts wait to be applied
+        self._is_driven = False  # the counts wait to be applied, and the time to pass
         self._origin_us: int | None = None
         self._plant_us = plant.t_us
         self._now_us = 0
-        self._waiting = False
         self._exchange = direct(_exchange, plant.params, plant.state, self.exchange, 0, False, 0, 0, 0)
         # Loaded now, not in the first tick:
         self._exchange(plant.params, plant.state.copy(), self.exchange.copy(), 0, False, 0, 0, 0)
 
     def advance_to(self, t_us: int) -> None:
         """It is ``t_us`` on the bus."""
-        if self._waiting:
+        if self._is_driven:
             self.settle()
         self._now_us = t_us
 
     def drive(self, counts: Sequence[int]) -> None:
         """The converters take new counts (3,) now."""
-        if self._waiting:
+        if self._is_driven:
             self.settle()
         self._counts = counts
         self._is_driven = True
-        self._waiting = True
 
     def sample(self) -> tuple[int, int, int]:
         """Sample the sense combs now."""
@@ -92,7 +90,7 @@ class PlantOnBus:
             self._params, self._state, self.exchange, target_us - self._plant_us, self._is_driven, a, b, c
         )
         self._plant_us = target_us
-        self._is_driven = self._waiting = False
+        self._is_driven = False
         return counts
 
     def settle(self) -> None:
@@ -104,4 +102,3 @@ class PlantOnBus:
         if self._is_driven:
             self.plant.drive(self._counts)
             self._is_driven = False
-        self._waiting = False

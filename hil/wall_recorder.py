@@ -50,9 +50,8 @@ class WallRecorder:
 
     def frame(self, frame: Frame, t_us: int) -> None:
         """Note a frame that was sent or received at ``t_us``."""
-        can_id, data, is_fd, bitrate_switch, is_remote, is_extended, is_error = frame
-        flags = is_fd << 1 | bitrate_switch << 2 | is_remote << 3 | is_extended << 4 | is_error << 5
-        self._waiting.append(_HEAD.pack(_FRAME | flags, len(data), t_us, can_id) + data)
+        can_id, data, flags = frame
+        self._waiting.append(_HEAD.pack(_FRAME | flags << 1, len(data), t_us, can_id) + data)
 
     def row(self, row: memoryview) -> None:
         """Note the row of a tick and send all that waits. Raises ``RecordingError`` if the writer has given up."""
@@ -144,9 +143,7 @@ def _write_down(reading: int, recording: RecordingWriter, log: FrameLog) -> None
                 row_bytes[:] = pending[at + 1 : end]
                 recording.write(row)
             else:
-                flags, _, t_us, can_id = _HEAD.unpack_from(pending, at)
-                is_fd, switch, remote, extended, error = (bool(flags >> bit & 1) for bit in range(1, 6))
-                data = pending[at + _HEAD.size : end]
-                log.record(Frame(can_id, data, is_fd, switch, remote, extended, error), t_us)
+                kind, _, t_us, can_id = _HEAD.unpack_from(pending, at)
+                log.record(Frame._make((can_id, pending[at + _HEAD.size : end], kind >> 1)), t_us)
             at = end
         pending = pending[at:]

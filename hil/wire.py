@@ -14,9 +14,10 @@ from weakref import WeakValueDictionary
 
 from hil.clock import Lockstep
 from hil.disturbance import Disturbance
-from hil.endpoint import Endpoint, Entry, dominance
-from hil.frame_time import INTERFRAME_BITS
+from hil.endpoint import Endpoint, Entry, Listener, dominance
+from hil.frame_time import INTERFRAME_BITS, duration_ns_kernel
 from pkxyz_ctrl.can.frame import Frame
+from pkxyz_ctrl.direct_call import direct
 
 ERROR_DELIMITER_BITS = 8  # the error flags themselves, 6 + 1 bits, lie where the frame's EOF would have been
 SUSPEND_BITS = 8  # an error-passive sender waits so long after its own frame
@@ -25,6 +26,8 @@ RECESSIVE_RUN_BITS = 11  # also what ends every frame and error frame: delimiter
 
 # classes of an error frame, as in linux/can/error.h
 ERROR_ACK, ERROR_PROTOCOL, ERROR_BUS_OFF, ERROR_BUS, ERROR_RESTARTED = 0x020, 0x008, 0x040, 0x080, 0x100
+
+_duration_ns = direct(duration_ns_kernel, 0, 0, 0, b"", 0)
 
 _channels: "WeakValueDictionary[str, Wire]" = WeakValueDictionary()
 
@@ -52,11 +55,11 @@ class Wire:
         self.clock = clock
         self.nominal_bitrate = nominal_bitrate
         self.data_bitrate = data_bitrate
-        self.disturbance = Disturbance(seed)
-        self._fast_bitrate = data_bitrate or nominal_bitrate
-        self._interframe_ns = self._bits_ns(INTERFRAME_BITS)
+        self.disturbance = Disturbance(seed, self._look_closely)
+        self._bitrates = nominal_bitrate, data_bitrate or nominal_bitrate
+        self._duration_ns = partial(_duration_ns, *self._bitrates)
+        self._to_end_ns = 999 - self._bits_ns(INTERFRAME_BITS)  # to where the EOF ends, rounded up to a microsecond
         self._endpoints: tuple[Endpoint, ...] = ()
-        self._queues: tuple[list[Entry], ...] = ()  # what each of them has to send
         self._nodes = 0  # endpoints that acknowledge
         self._order = 0
         self._frames = 0
@@ -64,29 +67,29 @@ class Wire:
         self._busy_ns = 0
         self._first = WireStatistics(clock.now_us, 0, 0, 0)
         # the transmission under way or, until its start is past, the one that would win the arbitration
-        self._sender: Endpoint | None = None
-        self._entry: Entry | None = None
+        self._sender: Endpoint
+        self._entry: Entry
         self._rivals: list[tuple[Endpoint, Entry]] = []  # others that send the same identifier at the same time
         self._start_ns = 0
-        self._end_us = -1  # end of EOF; -1: idle
+        self._end_us = -1  # end of EOF; -1: idle, and what follows from the last frame is done
         self._free_ns = 0  # end of the latest interframe space
-        self._delivering = False
         self._recovering: list[Endpoint] = []
         self._is_ordinary = False  # at least two nodes, and no error counted anywhere: a frame takes the short way
         self._has_queue = False  # somebody may have a frame to send besides the one on its way
         self._is_calm = False  # ordinary, idle and nothing queued: a frame that is sent has no rival
         self._runs = 0  # of 11 recessive bits, counted while an endpoint recovers
+        self._call_at, self._completion = clock.call_at, self._complete
 
     # -- endpoints ---------------------------------------------------------------------------------------------------
 
     def attach(
         self,
         name: str,
-        on_frame: Callable[[Frame, int], object] | None = None,
+        on_frame: Listener | None = None,
         queue_limit: int = 1024,
         *,
         on_full: Callable[[], object] | None = None,
-        on_sent: Callable[[Frame, int], object] | None = None,
+        on_sent: Listener | None = None,
         listen_only: bool = False,
         error_frames: bool = False,
         auto_recover: bool = True,
@@ -104,26 +107,25 @@ class Wire:
             self, name, on_frame, queue_limit, on_full, on_sent, listen_only, error_frames, auto_recover
         )
         self._nodes += not listen_only
-        self._set_endpoints((*self._endpoints, endpoint))
+        self._endpoints = (*self._endpoints, endpoint)
+        self._introduce()
         return endpoint
 
-    def _set_endpoints(self, endpoints: tuple[Endpoint, ...]) -> None:
-        self._endpoints = endpoints
-        self._queues = tuple(e._to_send for e in endpoints)
-        for endpoint in endpoints:
-            endpoint._others = tuple(e for e in endpoints if e is not endpoint)
+    def _introduce(self) -> None:
+        """Tell every endpoint who is to get its frames."""
+        for endpoint in self._endpoints:
+            others = [e for e in self._endpoints if e is not endpoint]
+            endpoint._listeners = tuple(e for e in others if e.on_frame is not None)
+            endpoint._queues = tuple((e._received, e.queue_limit, e) for e in others if e.on_frame is None)
 
     def _detach(self, endpoint: Endpoint) -> None:
-        self._set_endpoints(endpoint._others)
         self._is_ordinary = self._is_calm = False
         self._nodes -= not (endpoint.listen_only or endpoint.bus_off)
         if endpoint in self._recovering:
             self._recovering.remove(endpoint)
-        endpoint._wire = None
-        endpoint.bus_off = True  # if this happens during a delivery, it gets no more of it
-        endpoint.on_frame = endpoint.on_sent = None
-        endpoint.send_drops += len(endpoint._to_send)
-        endpoint._to_send.clear()
+        self._endpoints = tuple(e for e in self._endpoints if e is not endpoint)
+        self._introduce()
+        endpoint._unplug()
         if self._end_us >= 0 and not self._has_started():
             self._arbitrate()
 
@@ -138,7 +140,7 @@ class Wire:
     def statistics(self) -> WireStatistics:
         now_ns = self.clock.now_us * 1000
         busy_ns = self._busy_ns - max(0, self._free_ns - now_ns)
-        if self._end_us >= 0:
+        if self._end_us > self.clock.now_us:
             busy_ns += max(0, now_ns - self._start_ns)
         return WireStatistics(self.clock.now_us, busy_ns, self._frames, self._error_frames)
 
@@ -167,19 +169,16 @@ class Wire:
         if tie or (suspended and entry is None) or self._rivals:
             ready_ns, sender, entry = self._arbitrate_slowly(ready_ns)
         if sender is None or entry is None:
-            self._sender, self._entry, self._end_us = None, None, -1
-        elif entry is not self._entry or ready_ns != self._start_ns or self._end_us < 0:
+            self._end_us = -1
+        elif self._end_us < 0 or entry is not self._entry or ready_ns != self._start_ns:
             self._begin(sender, entry, ready_ns)
 
     def _begin(self, sender: Endpoint, entry: Entry, start_ns: int) -> None:
-        """Put ``entry`` on the wire at ``start_ns``, or when it is free, unless a better one is queued until then."""
+        """Put ``entry`` on the wire at ``start_ns`` unless a better one is queued until then."""
         self._is_calm = False
-        self._sender, self._entry = sender, entry
-        if start_ns < self._free_ns:
-            start_ns = self._free_ns
-        self._start_ns = start_ns
-        self._end_us = end_us = -((self._interframe_ns - entry[3] - start_ns) // 1000)  # rounded up
-        self.clock.call_at(end_us, self._complete)
+        self._sender, self._entry, self._start_ns = sender, entry, start_ns
+        self._end_us = end_us = (start_ns + entry[3] + self._to_end_ns) // 1000
+        self._call_at(end_us, self._completion)
 
     def _arbitrate_slowly(self, ready_ns: int) -> tuple[int, Endpoint | None, Entry | None]:
         """The cases that are rare: senders that must wait after their own frame, and equal identifiers."""
@@ -194,56 +193,77 @@ class Wire:
     def _complete(self) -> None:
         """The frame on the wire has reached the end of its EOF."""
         t_us = self.clock.now_us
-        sender, entry = self._sender, self._entry
-        if t_us != self._end_us or sender is None or entry is None:
+        if t_us != self._end_us:
             return  # the event of a frame that lost the arbitration later on
-        before_ns = self._free_ns
-        self._end_us = -1
-        self._sender = self._entry = None
-        self._free_ns = self._start_ns + entry[3]
-        self._busy_ns += entry[3]
-        self._delivering = True
+        if not self._is_ordinary:
+            self._complete_out_of_the_ordinary(t_us)
+            return
+        # _confirm and _deliver in one go, for speed: it happens three times a tick
+        sender = self._sender
+        _, _, frame, duration_ns = entry = self._entry
+        self._free_ns = self._start_ns + duration_ns
+        self._busy_ns += duration_ns
+        self._frames += 1
+        if self._has_queue:
+            self._unqueue(sender, entry)
+        else:
+            sender._to_send.clear()
         try:
-            if self._is_ordinary and not self.disturbance.armed:
-                # _confirm and _deliver in one go, for speed: it happens three times a tick
-                if len(sender._to_send) == 1:
-                    sender._to_send.pop()
+            if sender.on_sent is not None:
+                sender.on_sent(frame, t_us)
+            for endpoint in sender._listeners:
+                endpoint._take(frame, t_us)
+            received = frame, t_us
+            for queue, limit, endpoint in sender._queues:
+                if len(queue) < limit:
+                    queue.append(received)
                 else:
-                    self._unqueue(sender, entry)
-                self._frames += 1
-                frame = entry[2]
-                if sender.on_sent is not None:
-                    sender.on_sent(frame, t_us)
-                for endpoint in sender._others:
-                    if endpoint.on_frame is not None:
-                        endpoint.on_frame(frame, t_us)
-                    elif len(endpoint._received) < endpoint.queue_limit and not endpoint.bus_off:
-                        endpoint._received.append((frame, t_us))
-                    else:
-                        endpoint._overrun(frame, t_us)
-            else:
-                self._complete_out_of_the_ordinary(sender, entry, t_us, before_ns)
+                    endpoint._overrun(frame, t_us)
         finally:
-            self._delivering = False
-            if self._has_queue and any(self._queues):
-                self._arbitrate()
+            self._end_us = -1
+            if self._has_queue:
+                self._go_on()
             else:
-                self._has_queue = False
                 self._is_calm = self._is_ordinary
 
-    def _complete_out_of_the_ordinary(self, sender: Endpoint, entry: Entry, t_us: int, before_ns: int) -> None:
-        """``before_ns``: since when the wire was free before this frame."""
-        self._has_queue = True  # what was destroyed is sent again
+    def _go_on(self) -> None:
+        """The wire is free: whoever has something to send may."""
+        if any(e._to_send for e in self._endpoints):
+            self._arbitrate()
+        else:
+            self._has_queue = False
+            self._is_calm = self._is_ordinary
+
+    def _look_closely(self) -> None:
+        """The next frame takes the long way, and whether the one behind it has to is seen there."""
+        self._is_ordinary = False
+
+    def _complete_out_of_the_ordinary(self, t_us: int) -> None:
+        sender, entry = self._sender, self._entry
         if self._recovering:
-            self._runs += 1 + (self._start_ns - before_ns) // self._bits_ns(RECESSIVE_RUN_BITS)
+            self._runs += 1 + (self._start_ns - self._free_ns) // self._bits_ns(RECESSIVE_RUN_BITS)
+        self._free_ns = self._start_ns + entry[3]
+        self._busy_ns += entry[3]
+        self._has_queue = True  # what was destroyed is sent again
+        try:
+            self._judge(sender, entry, t_us)
+        finally:
+            self._end_us = -1
+            self._go_on()
+
+    def _judge(self, sender: Endpoint, entry: Entry, t_us: int) -> None:
         if self.disturbance.armed or self._nodes < 2 or self._rivals or sender._wire is None:
             self._complete_under_faults(sender, entry, t_us)
         else:
             self._confirm(sender, entry, t_us)
             self._deliver(entry[2], t_us, sender)
-        self._is_ordinary = self._nodes >= 2 and not any(
-            e.transmit_errors or e.receive_errors or e.bus_off or e._earliest_ns > self._free_ns
-            for e in self._endpoints
+        self._is_ordinary = (
+            self._nodes >= 2
+            and not self.disturbance.armed
+            and not any(
+                e.transmit_errors or e.receive_errors or e.bus_off or e._earliest_ns > self._free_ns
+                for e in self._endpoints
+            )
         )
 
     @staticmethod
@@ -272,12 +292,7 @@ class Wire:
             if endpoint.receive_errors:
                 # a passive receiver returns to 119..127 (ISO 11898-1, 12.1.4.2 h): the upper end
                 endpoint.receive_errors = min(endpoint.receive_errors, 128) - 1
-            if endpoint.on_frame is not None:
-                endpoint.on_frame(frame, t_us)
-            elif len(endpoint._received) < endpoint.queue_limit:
-                endpoint._received.append((frame, t_us))
-            else:
-                endpoint._overrun(frame, t_us)
+            endpoint._take(frame, t_us)
 
     # -- faults ------------------------------------------------------------------------------------------------------
 
@@ -378,12 +393,7 @@ class Wire:
         frame = Frame(kind, bytes((0, 0, 0, 0, 0, 0, *counters)), is_error=True)
         for listener in self._endpoints:
             if listener.error_frames:
-                if listener.on_frame is not None:
-                    listener.on_frame(frame, self.clock.now_us)
-                elif len(listener._received) < listener.queue_limit:
-                    listener._received.append((frame, self.clock.now_us))
-                else:
-                    listener._overrun(frame, self.clock.now_us)
+                listener._take(frame, self.clock.now_us)
 
     # -- small change ------------------------------------------------------------------------------------------------
 

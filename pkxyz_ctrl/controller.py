@@ -65,7 +65,7 @@ class Controller:
         self._restart_due = False
         self._restarting = False
         self._blocked = 0
-        self._take_sense = self.driver.take_sense
+        self._sense = self.driver.sense
         self._reference: Array = np.zeros((1, 9))  # the latest that was handed in
         self._drive_counts = (0, 0, 0)
         self._cycle = period_on(law, self._reference)
@@ -121,10 +121,9 @@ class Controller:
 
     def receive(self, frame: Frame, t_us: int) -> bool:
         """Take a frame from the bus; True once this tick's sense values are there."""
-        driver = self.driver
-        for reply in driver.receive(frame, t_us):
+        for reply in self.driver.receive(frame, t_us):
             self.send(reply, t_us)
-        return driver.sense_fresh
+        return self._sense.fresh
 
     def compute(self, reference: Array, overrun: int) -> None:
         """Run the cycle on what has come since the SYNC. ``reference`` (n, 9) float64, row after row in memory;
@@ -132,7 +131,7 @@ class Controller:
         """
         if self._clearing:
             self._event = int(Event.CLEAR) if self.mode == Mode.FAULT else self._event
-        c1, c2, c3, status = self._take_sense()
+        c1, c2, c3, status = self._sense.take()
         if status & 1:
             self.missing_sense += 1
         if self._blocked:

@@ -65,9 +65,13 @@ def run(
     missed, t_us = 0, clock.now_us + period_us
     for tick in range(ticks):
         wait_until(t_us)
-        overrun = (clock.now_us - t_us) // period_us
-        late = overrun + (1 if unsent() else 0)
-        t_us += overrun * period_us
+        overrun = 0
+        if clock.now_us - t_us >= period_us:
+            overrun = (clock.now_us - t_us) // period_us
+            t_us += overrun * period_us
+            missed += overrun
+        if unsent():
+            missed += 1
         begin(t_us)
         while (frame := receive_frame(t_us + answer_us)) is not None and not receive(frame, clock.now_us):
             pass
@@ -75,6 +79,5 @@ def run(
         spend(compute_us)
         finish(clock.now_us, t_us + heartbeat_us)
         record(tick)
-        missed += late
         t_us += period_us
     return missed

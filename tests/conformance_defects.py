@@ -5,7 +5,7 @@ from typing import Any
 from hil.node import AmplifierNode, NmtState
 from hil.object_dictionary import Abort, SdoAbortError
 from pkxyz_ctrl.can.codec import ProcessCodec
-from pkxyz_ctrl.can.frame import Frame
+from pkxyz_ctrl.can.frame import EXTENDED, Frame
 
 SENSE = ProcessCodec(0x28A, True)
 DRIVE = ProcessCodec(0x30A, True)
@@ -213,7 +213,7 @@ class ObeysExtended(AmplifierNode):
     """frames: 29-bit identifiers"""
 
     def on_frame(self, frame: Frame, t_us: int) -> None:
-        super().on_frame(frame._replace(is_extended=False), t_us)
+        super().on_frame(frame._replace(flags=frame.flags & ~EXTENDED), t_us)
 
 
 class SkipsSyncs(AmplifierNode):

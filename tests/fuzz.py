@@ -20,7 +20,7 @@ from pkxyz_ctrl.can.codec import ProcessCodec
 from pkxyz_ctrl.can.driver import AmplifierDriver, DriverState
 from pkxyz_ctrl.can.driver_config import DriverConfig
 from pkxyz_ctrl.can.emergency import decode_emergency
-from pkxyz_ctrl.can.frame import Frame
+from pkxyz_ctrl.can.frame import UNUSUAL, Frame
 from pkxyz_ctrl.can.sdo import parse_reply
 from pkxyz_ctrl.can.startup import configuration_steps, identity_steps
 from pkxyz_ctrl.safety.gate import GateConfig, TransmitGate
@@ -149,7 +149,7 @@ def fuzz_node(rng: random.Random, frames: int, node_type: type[AmplifierNode] = 
             frame = Frame(0, b"\1\n")
         if frame.can_id == 0x60A and int.from_bytes(frame.data[1:3], "little") in _CHANGE_THE_DRIVE:
             continue
-        if frame.can_id == 0x30A and len(frame.data) == 8 and not any(frame[4:]):
+        if frame.can_id == 0x30A and len(frame.data) == 8 and not frame.flags & UNUSUAL:
             a, b, c, _, right = DRIVE.decode(frame.data)
             if right and min(a, b, c) >= 0:
                 plant.allowed.add((a, b, c))
@@ -179,7 +179,7 @@ def fuzz_driver(rng: random.Random, frames: int) -> int:
             out += driver.poll(t_us)
         if driver.state is DriverState.OPERATIONAL and rng.random() < 0.5:
             out.append(driver.sync(t_us))
-            a, b, c, _ = driver.take_sense()
+            a, b, c, _ = driver.sense.take()
             if not all(-32768 <= count <= 32767 for count in (a, b, c)):
                 raise ViolationError(f"the driver believes {a}, {b}, {c}")
             out.append(driver.drive((0, 0, 0), t_us))
@@ -238,7 +238,7 @@ def fuzz_gate(rng: random.Random, frames: int, gate_type: type[TransmitGate] = T
                 if not limits or mode not in (Mode.ENABLED, Mode.TRACKING):
                     raise ViolationError(f"the gate lets {frame} pass after {held}, mode {mode}")
             held = counts
-        elif frame.can_id not in (0x000, 0x080, 0x60A, 0x77F) or any(frame[4:]):
+        elif frame.can_id not in (0x000, 0x080, 0x60A, 0x77F) or frame.flags & UNUSUAL:
             raise ViolationError(f"the gate lets {frame} pass")
     return passed
 

@@ -289,10 +289,10 @@ def test_start_is_possible_from_a_failure():
     driver.receive(heartbeat(BOOT_UP), 10)
     assert driver.state is DriverState.FAILED
     assert text(driver.start(20)) == [RESET]
-    assert driver.take_sense() == (0, 0, 0, SENSE_MISSING)
+    assert driver.sense.take() == (0, 0, 0, SENSE_MISSING)
     assert (driver.sync(21).data[0], driver.drive((0, 0, 0), 21).data[6], len(driver.emergencies)) == (1, 0, 0)
     driver.receive(sense[1], 22)
-    assert driver.take_sense() == (1, 2, 3, 0)
+    assert driver.sense.take() == (1, 2, 3, 0)
     assert (driver.failure, driver.node_events, driver.state) == ("", 0, DriverState.RESETTING)
     assert run_dialogue(driver, ObedientServer(), driver.receive(heartbeat(BOOT_UP), 30)) == [OUR_HEARTBEAT, START]
 
@@ -327,11 +327,11 @@ def test_one_tick():
     driver = started()
     assert driver.sync(200) == frame("080 01")
     assert driver.receive(Frame(0x28A, ProcessCodec(0x28A, True).encode((1, -2, 3), 9), True, True), 250) == ()
-    assert driver.sense_fresh
-    assert driver.take_sense() == (1, -2, 3, 0)
+    assert driver.sense.fresh
+    assert driver.sense.take() == (1, -2, 3, 0)
     driver.sync(400)
-    assert not driver.sense_fresh
-    assert driver.take_sense() == (1, -2, 3, SENSE_MISSING)
+    assert not driver.sense.fresh
+    assert driver.sense.take() == (1, -2, 3, SENSE_MISSING)
 
 
 @pytest.mark.parametrize("flag", ["is_remote", "is_extended", "is_error"])
@@ -340,8 +340,8 @@ def test_frames_of_another_kind_are_not_ours(flag, can_id):
     driver = started()
     driver.sync(0)
     data = ProcessCodec(0x28A, True).encode((1, 2, 3), 0) if can_id == 0x28A else bytes(1 if can_id == 0x70A else 8)
-    assert driver.receive(Frame(can_id, data)._replace(**{flag: True}), 0) == ()
-    assert driver.take_sense() == (0, 0, 0, SENSE_MISSING)
+    assert driver.receive(Frame(can_id, data, **{flag: True}), 0) == ()
+    assert driver.sense.take() == (0, 0, 0, SENSE_MISSING)
     assert (driver.node_events, len(driver.emergencies), driver.state) == (0, 0, DriverState.OPERATIONAL)
 
 
@@ -473,7 +473,7 @@ def test_no_frame_whatsoever_upsets_the_driver(traffic, from_operational):
         assert {each.can_id for each in sent} <= {0x000, 0x60A, 0x77F}
         assert len(sent) <= 4
         driver.sync(t_us)
-        *_, status = driver.take_sense()
+        *_, status = driver.sense.take()
         assert 0 <= status < 32
         assert (driver.state is DriverState.FAILED) == (driver.failure != "")
     if from_operational and driver.state is DriverState.OPERATIONAL:

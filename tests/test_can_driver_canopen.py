@@ -134,10 +134,10 @@ def test_drive_and_sense_through_canopens_pdo_maps():
             variable.raw = value
         sense[4].raw = crc8(b"\x8a\x02" + bytes(sense.data[:7]))
         bench.driver.receive(Frame(sense.cob_id, bytes(sense.data)), bench.t_us)
-        assert bench.driver.take_sense() == (-tick, tick, -32768, 0)
+        assert bench.driver.sense.take() == (-tick, tick, -32768, 0)
     bench.driver.sync(bench.t_us)
     bench.driver.receive(Frame(sense.cob_id, bytes(sense.data)), bench.t_us)  # the same again
-    assert bench.driver.take_sense() == (-299, 299, -32768, SENSE_MISSING | SENSE_COUNTER)
+    assert bench.driver.sense.take() == (-299, 299, -32768, SENSE_MISSING | SENSE_COUNTER)
 
 
 def test_canopens_emergency_producer_is_understood():

@@ -65,7 +65,7 @@ class Bench:
         t_us = self.clock.now_us
         self.master.send(self.driver.sync(t_us))
         self.clock.run_until(t_us + (130 if self.period_us == 200 else 350))
-        sense = self.driver.take_sense()
+        sense = self.driver.sense.take()
         self.master.send(self.driver.drive(counts, self.clock.now_us))
         heartbeat = self.driver.heartbeat_due(self.clock.now_us)
         if heartbeat is not None:

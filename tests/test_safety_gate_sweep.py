@@ -12,7 +12,7 @@ from itertools import combinations
 import pytest
 from gate_frames import CONFIG, DRIVE_ID, WRITES, drive, holding, nmt, sdo_read, sdo_write, sync
 
-from pkxyz_ctrl.can.frame import Frame
+from pkxyz_ctrl.can.frame import BIT_RATE_SWITCH, ERROR, EXTENDED, REMOTE, UNUSUAL, Frame
 from pkxyz_ctrl.safety.gate import GateConfig, TransmitGate
 from pkxyz_ctrl.safety.modes import Mode
 
@@ -131,8 +131,8 @@ class GateSweep(ABC):
             payload = PAYLOADS[name]
             spoilt = [Frame(can_id, payload + b"\x00", True, True), Frame(can_id, payload[:-1])]
             plain = Frame(can_id, payload)
-            spoilt += [plain._replace(is_remote=True), plain._replace(is_extended=True), plain._replace(is_error=True)]
-            spoilt += [plain._replace(bitrate_switch=True)]  # which only FD frames have
+            spoilt += [plain._replace(flags=flag) for flag in (REMOTE, EXTENDED, ERROR, UNUSUAL)]
+            spoilt += [plain._replace(flags=BIT_RATE_SWITCH)]  # which only FD frames have
             for frame in spoilt:
                 assert not self.passes(gate, frame), frame
 

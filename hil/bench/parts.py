@@ -74,7 +74,7 @@ def driver() -> list[Figure]:
     sense = [(frame, t_us) for frame, t_us in came if frame.can_id == sense_id][:TICKS]
 
     def run(amplifier: AmplifierDriver) -> None:
-        sync, receive, take, drive = amplifier.sync, amplifier.receive, amplifier.take_sense, amplifier.drive
+        sync, receive, take, drive = amplifier.sync, amplifier.receive, amplifier.sense.take, amplifier.drive
         heartbeat_due = amplifier.heartbeat_due
         for frame, t_us in sense:
             sync(t_us)

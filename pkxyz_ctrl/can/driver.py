@@ -1,7 +1,7 @@
 """The controller's side of the connection to the amplifier: frames in, frames out, time passed in.
 
 No clock, no socket, no thread. The start-up dialogue is driven by ``start``, ``receive`` and ``poll``; once
-``state`` is OPERATIONAL the loop calls ``sync``, ``receive``, ``take_sense``, ``drive`` and ``heartbeat_due``.
+``state`` is OPERATIONAL the loop calls ``sync``, ``receive``, ``sense.take``, ``drive`` and ``heartbeat_due``.
 """
 
 from collections import deque
@@ -12,7 +12,7 @@ from .cob_id import NmtCommand, NmtState
 from .codec import Counts, ProcessCodec
 from .driver_config import DriverConfig
 from .emergency import Emergency, decode_emergency
-from .frame import Frame
+from .frame import FD_FAST, UNUSUAL, Frame
 from .sdo import SdoDialogue
 from .sense_input import SenseInput
 from .startup import configuration_steps, identity_steps
@@ -49,7 +49,8 @@ class AmplifierDriver:
     ``state`` and ``failure`` (a sentence: what was expected, what came, what to do) tell how the connection fares.
     ``node_events`` (NODE_... bits) are latched: EMERGENCY until ``acknowledge``, the others until ``start``, because a
     node that was silent, left the operational state or restarted has to be configured again. ``emergencies`` holds
-    the last 64. All times are integer microseconds of the caller's one clock and never run backwards.
+    the last 64. ``sense`` holds this tick's sense values. All times are integer microseconds of the caller's one clock
+    and never run backwards.
     """
 
     def __init__(self, config: DriverConfig) -> None:
@@ -65,10 +66,10 @@ class AmplifierDriver:
         self._sdo_response_id = cob_id.SDO_RESPONSE_BASE + config.node_id
         self._emergency_id = cob_id.EMCY_BASE + config.node_id
         self._node_heartbeat_id = cob_id.HEARTBEAT_BASE + config.node_id
-        self._sense = SenseInput(ProcessCodec(self._sense_id, config.protection))
-        self._receive_sense = self._sense.receive
+        self.sense = SenseInput(ProcessCodec(self._sense_id, config.protection))
+        self._receive_sense = self.sense.receive
         self._encode_drive = ProcessCodec(self._drive_id, config.protection).encode
-        self._fd = config.fd
+        self._flags = FD_FAST if config.fd else 0
         self._sync_frames = tuple(
             self._frame(cob_id.SYNC, bytes((count,))) for count in range(1, cob_id.SYNC_COUNTER_OVERFLOW + 1)
         )
@@ -95,7 +96,7 @@ class AmplifierDriver:
         self.node_events = 0
         self.node_state = None
         self.emergencies.clear()
-        self._sense.reset()
+        self.sense.reset()
         self._sync_index = 0
         self._drive_counter = 0
         self._node_deadline_us = _NEVER_US
@@ -140,15 +141,15 @@ class AmplifierDriver:
         """The SYNC that begins a tick; its counter runs 1..240. What was received before is old from now on."""
         if t_us > self._node_deadline_us:
             self._node_lost(t_us)
-        self._sense.on_sync()
+        self.sense.on_sync()
         index = self._sync_index
         self._sync_index = index + 1 if index < cob_id.SYNC_COUNTER_OVERFLOW - 1 else 0
         return self._sync_frames[index]
 
     def receive(self, frame: Frame, t_us: int) -> Frames:
         """Takes any frame from the bus and returns what is to be sent at once (SDO requests during the start)."""
-        received_id, data, _, _, is_remote, is_extended, is_error = frame
-        if is_remote or is_extended or is_error:
+        received_id, data, flags = frame
+        if flags & UNUSUAL:
             return _NOTHING
         if received_id == self._sense_id:
             self._receive_sense(data)
@@ -161,18 +162,6 @@ class AmplifierDriver:
             self._on_emergency(data, t_us)
         return _NOTHING
 
-    def take_sense(self) -> tuple[int, int, int, int]:
-        """``(counts 1, counts 2, counts 3, status)``, once a tick; SENSE_... bits, 0 if all is well.
-
-        With SENSE_MISSING the counts are the last valid ones (0 before the first).
-        """
-        return self._sense.take()
-
-    @property
-    def sense_fresh(self) -> bool:
-        """Whether a valid sense PDO has come since the last SYNC."""
-        return self._sense.fresh
-
     def drive(self, counts: Counts, t_us: int) -> Frame:
         """The drive PDO, 0..32767 counts for 0..200 V. It is applied at the end of the next SYNC.
 
@@ -181,7 +170,7 @@ class AmplifierDriver:
         counter = self._drive_counter
         data = self._encode_drive(counts, counter)
         self._drive_counter = (counter + 1) & 0xFF
-        return _new_tuple(Frame, (self._drive_id, data, self._fd, self._fd, False, False, False))
+        return _new_tuple(Frame, (self._drive_id, data, self._flags))
 
     def revoke_drive(self) -> None:
         """The last drive PDO was not sent after all: its alive counter is the next one's."""
@@ -328,7 +317,7 @@ class AmplifierDriver:
         self._heartbeat_next_us = _NEVER_US
 
     def _frame(self, frame_id: int, data: bytes) -> Frame:
-        return Frame(frame_id, data, self._fd, self._fd)
+        return Frame._make((frame_id, data, self._flags))
 
     def _nmt(self, command: NmtCommand) -> Frame:
         return self._frame(cob_id.NMT, bytes((command, self.config.node_id)))

@@ -9,7 +9,7 @@ from dataclasses import dataclass
 from enum import IntFlag
 from typing import Final
 
-from pkxyz_ctrl.can.frame import Frame
+from pkxyz_ctrl.can.frame import FD, FD_FAST, UNUSUAL, Frame
 from pkxyz_ctrl.safety.modes import Mode
 from pkxyz_ctrl.safety.sdo_rules import is_read, write_refusal
 
@@ -158,7 +158,7 @@ class TransmitGate:
         self.blocked_frames = 0
         self._rows = {int(mode): int(kinds) for mode, kinds in PERMITTED.items()}
         self._mask = _EVERY_KIND
-        self._fd = config.fd
+        self._formats = (0, FD, FD_FAST) if config.fd else (0,)
         self._drive_id = 0x300 + config.node_id
         self._sdo_id = 0x600 + config.node_id
         self._heartbeat_id = 0x700 + config.controller_node_id
@@ -180,12 +180,10 @@ class TransmitGate:
 
     def check(self, frame: Frame, mode: int, t_us: int) -> str | None:
         """None: send it. Otherwise the reason why it must not be sent, and the gate is latched."""
-        can_id, data, is_fd, bitrate_switch, is_remote, is_extended, is_error = frame
+        can_id, data, flags = frame
         row = self._rows.get(mode, 0) & self._mask
-        if is_remote or is_extended or is_error:
-            reason: str | None = "not a plain data frame with an 11-bit identifier"
-        elif (is_fd and not self._fd) or (bitrate_switch and not is_fd):
-            reason = "frame format that this bus does not carry"
+        if flags not in self._formats:
+            reason: str | None = _refusal(flags)
         elif can_id == self._drive_id:
             reason = self._judge_drive(data, row, t_us)
         elif can_id == SYNC_ID:
@@ -296,6 +294,12 @@ class TransmitGate:
             return _not_now(FrameKind.SDO_WRITE)
         config = self.config
         return write_refusal(data, config.node_id, config.controller_node_id, config.heartbeat_timeout_max_ms)
+
+
+def _refusal(flags: int) -> str:
+    if flags & UNUSUAL:
+        return "not a plain data frame with an 11-bit identifier"
+    return "frame format that this bus does not carry"
 
 
 def _not_now(kind: FrameKind) -> str:
