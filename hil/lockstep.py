@@ -8,6 +8,7 @@ from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from functools import partial
 from pathlib import Path
+from typing import Final
 
 import numpy as np
 from numpy.typing import NDArray
@@ -30,6 +31,9 @@ from pkxyz_ctrl.config import CONFIG_DIR, ConfigError
 from pkxyz_ctrl.controller import Controller
 from pkxyz_ctrl.row import ROW
 from pkxyz_ctrl.runtime import Clock, Port, run, start
+
+_ROW_BYTES: Final = ROW.itemsize
+_TRUTH_AT: Final = ROW.itemsize - TRUTH_BYTES
 
 
 class WirePort:
@@ -142,26 +146,25 @@ def _seldom_collected() -> Iterator[None]:
 
 
 class _Recorder:
-    """Collects the controller's row and the truth beside it, a tick at a time, and puts them into a block."""
+    """Puts the controller's row of each tick into the block, and the truth behind it."""
 
     def __init__(self, rig: LockstepRig, blocks: Blocks) -> None:
         self._blocks = blocks
-        self._rows = blocks.rows.view(np.uint8)
-        self._row = rig.controller.row[: ROW.itemsize - TRUTH_BYTES]
+        self._rows = blocks.rows.view(np.uint8).data
+        self._row = rig.controller.row[:_TRUTH_AT]
         self._truth = rig.plant.exchange.view(np.uint8).data[:TRUTH_BYTES]
-        self._waiting: list[bytes] = []
+        self._at = 0
 
     def __call__(self, tick: int) -> None:
-        waiting = self._waiting
-        waiting.append(self._row.tobytes())
-        waiting.append(self._truth.tobytes())
+        rows, at = self._rows, self._at
+        truth_at = at + _TRUTH_AT
+        self._at = end = at + _ROW_BYTES
+        rows[at:truth_at] = self._row
+        rows[truth_at:end] = self._truth
 
     def finish(self) -> None:
         """Hand on the rows that wait."""
-        rows = np.frombuffer(b"".join(self._waiting), np.uint8)
-        count = len(self._waiting) // 2
-        self._waiting.clear()
-        self._rows[: len(rows)] = rows
+        self._at, count = 0, self._at // _ROW_BYTES
         self._blocks.hand_on(count)
 
 
@@ -185,6 +188,6 @@ class _Reference:
 
 def _exchange_in_blocks(rig: LockstepRig, blocks: Blocks) -> tuple[_Reference, _Recorder]:
     leads, ends = (dict(d.fields or {})["position_m"][1] for d in (EXCHANGE, ROW))
-    assert (leads, ends) == (0, ROW.itemsize - TRUTH_BYTES), "the truth leads the exchange and ends the row"
+    assert (leads, ends) == (0, _TRUTH_AT), "the truth leads the exchange and ends the row"
     recorder = _Recorder(rig, blocks)
     return _Reference(rig, blocks, recorder), recorder

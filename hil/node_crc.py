@@ -4,6 +4,8 @@ Polynomial 0x2F, initial value 0xFF, no reflection, final XOR 0xFF (AUTOSAR SWS 
 0xDF), over the COB-ID as two bytes, low byte first, and then the payload up to the CRC byte.
 """
 
+from functools import cache
+
 import numpy as np
 
 _POLYNOMIAL = 0x2F
@@ -39,6 +41,7 @@ def _word_tables() -> tuple[bytes, bytes, bytes]:
 WORDS = _word_tables()
 
 
+@cache
 def last_byte_table(cob_id: int) -> bytes:
     """Table w3 such that ``w0[a] ^ w1[b] ^ w2[c] ^ w3[n]`` with w0, w1, w2 = `WORDS` is the CRC of (a, b, c, n).
 
