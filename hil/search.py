@@ -6,9 +6,10 @@
 
 import copy
 import math
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
+from functools import cache
 from pathlib import Path
-from typing import Annotated, Any, Literal, Self
+from typing import TYPE_CHECKING, Annotated, Any, Literal, Self
 
 import numpy as np
 from pydantic import Field, model_validator
@@ -24,8 +25,11 @@ from pkxyz_ctrl.design.law import design_law
 from pkxyz_ctrl.design.law_about import law_about
 from pkxyz_ctrl.design.loop_plant import loop_plant
 from pkxyz_ctrl.design.margins import margins, peak_sensitivity
-from pkxyz_ctrl.design.tolerances import Tolerances
+from pkxyz_ctrl.design.tolerances import Case, Tolerances
 from pkxyz_ctrl.stage import Stage
+
+if TYPE_CHECKING:
+    from hil.setup import Setup
 
 Text = Annotated[str, Field(min_length=1)]
 Positive = Annotated[float, Field(gt=0)]
@@ -53,7 +57,7 @@ class Number(FrozenModel):
 
 
 class Goals(FrozenModel):
-    """Constraints: of the nominal plant at mid-workspace as a MIMO system, and of the changed plants there."""
+    """Constraints: of the nominal plant at mid-workspace as a MIMO system, and of the changed plants."""
 
     peak_s_max: Positive
     disk_margin_min: Positive
@@ -72,6 +76,8 @@ class SearchConfig(FrozenModel):
     tolerances: Text
     scenario: Text
     plants: Annotated[tuple[Text, ...], Field(min_length=1)]
+    points: Literal["middle", "all"] = "middle"
+    """where the changed plants are looked at: at mid-workspace, or, where all goals are kept there, at every point"""
     objective: Literal["rms_error_nm", "bandwidth_hz"]
     """rms_error_nm: least error, worst axis, mean over the plants, by runs; bandwidth_hz: widest, without a run"""
     goals: Goals
@@ -191,35 +197,57 @@ def _computed(search: SearchConfig, stage: Stage, bus: BusConfig, controller: Co
     if not found.stable:
         raise LawError("unstable as drawn")
     noise_nm = 1e9 * float(hold_noise_m(stage, bus, plant, about, noise_shaping=controller.limits.noise_shaping).max())
-    peaks = [
-        peak_sensitivity(loop_plant(stage, bus, middle, p), law_about(stage, law, middle, p))
-        for p in tolerances.perturbations().values()
-    ]
+
+    def largest_peak(cases: list[Case]) -> float:
+        return max(
+            peak_sensitivity(
+                loop_plant(stage, bus, case.strokes_m, case.perturbation),
+                law_about(stage, law, case.strokes_m, case.perturbation),
+            )
+            for case in cases
+        )
+
+    cases = tolerances.cases()
+    here = [case for case in cases if np.array_equal(case.strokes_m, middle)]
     figures = {
         "peak_s": found.mimo.peak_s, "disk_margin": found.mimo.disk_margin, "bandwidth_hz": found.mimo.bandwidth_hz,
-        "hold_noise_nm": noise_nm, "peak_s_changed": max(peaks),
+        "hold_noise_nm": noise_nm, "peak_s_changed": largest_peak(here),
     }  # fmt: skip
+    beyond = _beyond(goals, figures)
+    if search.points == "all" and max(beyond.values()) <= 0.0:
+        rest = [case for case in cases if not np.array_equal(case.strokes_m, middle)]
+        figures["peak_s_changed"] = max(figures["peak_s_changed"], largest_peak(rest))
+        beyond = _beyond(goals, figures)
+    return Worth(beyond, figures, None)
+
+
+def _beyond(goals: Goals, figures: dict[str, float]) -> dict[str, float]:
+    """How far each goal is missed, as a share of it; 0 or less where it is kept."""
     beyond = {
         "peak_s_max": figures["peak_s"] / goals.peak_s_max - 1.0,
         "disk_margin_min": 1.0 - figures["disk_margin"] / goals.disk_margin_min,
         "bandwidth_min_hz": 1.0 - figures["bandwidth_hz"] / goals.bandwidth_min_hz,
-        "hold_noise_max_nm": noise_nm / goals.hold_noise_max_nm - 1.0,
+        "hold_noise_max_nm": figures["hold_noise_nm"] / goals.hold_noise_max_nm - 1.0,
         "peak_s_changed_max": figures["peak_s_changed"] / goals.peak_s_changed_max - 1.0,
     }
-    return Worth({name: min(value, UNUSABLE) for name, value in beyond.items()}, figures, None)
+    return {name: min(value, UNUSABLE) for name, value in beyond.items()}
 
 
 def _run(search: SearchConfig, controller: ControllerConfig, plant: str) -> float:
     """RMS error in nm of the worst axis while scanning; NaN after a fault."""
-    from dataclasses import replace
-
     from hil import lanes
     from hil.metrics import Metrics
-    from hil.scenario import load_scenario
 
-    scenario = load_scenario(search.scenario, stage=search.stage, plant=plant, bus=search.bus)
-    setup = replace(scenario.setup(), controller=controller)
+    setup = replace(_setup(search.scenario, search.stage, plant, search.bus), controller=controller)
     metrics = Metrics(setup.trajectory, setup.bus.period_us)
     result = lanes.run(setup, "fast", on_block=metrics.update)
     error = metrics.figures()["rms_error_nm"]
     return math.nan if result.faults or error is None else max(error.values())
+
+
+@cache
+def _setup(scenario: str, stage: str, plant: str, bus: str) -> "Setup":
+    """Read and checked once in a process; trials differ by their controller."""
+    from hil.scenario import load_scenario
+
+    return load_scenario(scenario, stage=stage, plant=plant, bus=bus).setup()

@@ -6,7 +6,7 @@ from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import Any
 
-from hil.bench import control, lanes, learning, limits, parts, plant, quality, startup, tick
+from hil.bench import control, lanes, learning, limits, parts, plant, quality, startup, study, tick
 from hil.bench.figure import Figure
 from hil.versions import versions
 from pkxyz_ctrl.config import ConfigError
@@ -18,6 +18,7 @@ MEASUREMENTS: dict[str, Measurement] = {
     "plant": plant.plant,
     "lockstep": lanes.lockstep,
     "fast": lanes.fast,
+    "study": study.study,
     "sil": startup.sil,
     "nominal": quality.nominal,
     "mild": quality.mild,

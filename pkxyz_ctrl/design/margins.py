@@ -141,7 +141,9 @@ def peak_sensitivity(plant: LoopPlant, law: DiscreteLaw) -> float:
     if not sensitivity.spectral_radius < 1.0:
         return math.inf
     grid = _grid_hz([sensitivity.poles], plant.period_s, 200, 6)
-    return peak(grid, largest_singular_value(sensitivity(grid)), lambda f: largest_singular_value(sensitivity(f)))
+    return peak(
+        grid, largest_singular_value(sensitivity(grid)), lambda f: largest_singular_value(sensitivity(f)), rounds=2
+    )
 
 
 def axis_margins(grid_hz: Array, s: Complex, sensitivity: Callable[[Array], Complex]) -> AxisMargins:
