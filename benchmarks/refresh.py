@@ -1,15 +1,16 @@
-"""Takes every measurement anew, keeps it in benchmarks/results.json and redraws docs/performance.md from it.
+"""Takes every measurement anew, or those named, keeps it in benchmarks/results.json and redraws docs/performance.md.
 
-    python benchmarks/refresh.py
+    python benchmarks/refresh.py [NAME ...]
 
 On a machine with nothing else to do: the load that it had is kept beside the figures.
 """
 
 import json
 import runpy
+import sys
 from pathlib import Path
 
-from hil.bench.suite import describe_machine, results
+from hil.bench.suite import MEASUREMENTS, describe_machine, results
 from hil.bench_cli import measure_all
 
 RESULTS = Path(__file__).with_name("results.json")
@@ -17,6 +18,12 @@ PERFORMANCE = Path(__file__).parents[1] / "docs" / "figures" / "performance.py"
 
 if __name__ == "__main__":
     machine = describe_machine()  # its load before we add to it
-    measured = results(machine, measure_all([], quiet=False))
+    measured = results(machine, measure_all(sys.argv[1:], quiet=False))
+    if sys.argv[1:]:  # the others stay, with the machine as it was for them
+        kept = json.loads(RESULTS.read_text(encoding="utf-8"))
+        rest = [f for f in kept["figures"] if f["name"].partition(".")[0] not in sys.argv[1:]]
+        order = list(MEASUREMENTS)
+        figures = sorted(rest + measured["figures"], key=lambda f: order.index(f["name"].partition(".")[0]))
+        measured = kept | {"figures": figures}
     RESULTS.write_text(json.dumps(measured, indent=1, allow_nan=False) + "\n", encoding="utf-8")
     runpy.run_path(str(PERFORMANCE), run_name="__main__")

@@ -158,7 +158,7 @@ def axis_margins(grid_hz: Array, s: Complex, sensitivity: Callable[[Array], Comp
     real = loop_at(crossings(grid_hz, loop.imag, lambda f: loop_at(f).imag)).real
     at_end = loop[-1].real if abs(loop[-1].imag) < 1e-6 * abs(loop[-1]) else 0.0  # z = -1
     factors = [-1.0 / float(value) for value in np.append(real, at_end) if value < 0.0]
-    unity = crossings(grid_hz, np.log(np.abs(loop)), lambda f: np.log(np.abs(loop_at(f))))
+    unity = crossings(grid_hz, _log_size(loop), lambda f: _log_size(loop_at(f)))
     lags = (np.angle(loop_at(unity)) + math.pi).tolist()  # 0..2 pi, to -1
     return AxisMargins(
         peak_s=peak(grid_hz, np.abs(s), lambda f: np.abs(sensitivity(f))),
@@ -172,6 +172,11 @@ def axis_margins(grid_hz: Array, s: Complex, sensitivity: Callable[[Array], Comp
             (lag / (2.0 * math.pi * f) for f, lag in zip(unity.tolist(), lags, strict=True) if f > 0), default=math.inf
         ),
     )
+
+
+def _log_size(values: Complex) -> Array:
+    """Logarithm of magnitudes; a loop may be 0 at half the sampling rate."""
+    return np.asarray(np.log(np.maximum(np.abs(values), 1e-300)))
 
 
 def structured_norm(matrices: Complex) -> Array:
