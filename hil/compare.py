@@ -48,6 +48,7 @@ def compare(
     scenario: str,
     controllers: tuple[str, ...] = DEFAULT,
     *,
+    stage: str | None = None,
     plant: str | None = None,
     seed: int | None = None,
     lane: str = "fast",
@@ -55,17 +56,17 @@ def compare(
 ) -> list[Compared]:
     """Run a scenario with each controller. A law that can't be run there says why, and the others go on.
 
-    Raises ``ConfigError`` for a scenario, a plant or a controller's file that can't be used.
+    Raises ``ConfigError`` for a scenario, a stage, a plant or a controller's file that can't be used.
     """
     found = []
     for n, name in enumerate(controllers):
-        found.append(_run(scenario, name, plant, seed, lane))
+        found.append(_run(scenario, name, stage, plant, seed, lane))
         on_progress(n + 1, len(controllers))
     return found
 
 
-def _run(scenario: str, controller: str, plant: str | None, seed: int | None, lane: str) -> Compared:
-    loaded = load_scenario(scenario, controller=controller, plant=plant, seed=seed)
+def _run(scenario: str, controller: str, stage: str | None, plant: str | None, seed: int | None, lane: str) -> Compared:
+    loaded = load_scenario(scenario, controller=controller, stage=stage, plant=plant, seed=seed)
     require_bus(loaded, lane)
     metrics = Metrics(loaded.trajectory, loaded.bus.period_us)
     times: list[NDArray[np.float64]] = []

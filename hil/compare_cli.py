@@ -22,6 +22,7 @@ def compare(
     controllers: Annotated[
         str, typer.Option(metavar="A,B,...", help="Names or files, separated by commas; default: one for each law.")
     ] = "",
+    stage: Annotated[str | None, typer.Option(help="Name or file, instead of the scenario's.")] = None,
     plant: Annotated[str | None, typer.Option(help="Name or file, instead of the scenario's.")] = None,
     seed: Annotated[int | None, typer.Option(min=0, help="Instead of the scenario's.")] = None,
     lane: Annotated[
@@ -37,11 +38,18 @@ def compare(
 
     names = tuple(name.strip() for name in controllers.split(",") if name.strip()) or DEFAULT
     with progress_bar("laws", quiet=as_json) as tell:
-        runs = run_all(scenario, names, plant=plant, seed=seed, lane=lane.value, on_progress=tell)
-    title = f"{scenario}{f' on {plant}' if plant else ''}"
+        runs = run_all(scenario, names, stage=stage, plant=plant, seed=seed, lane=lane.value, on_progress=tell)
+    title = f"{scenario}{f' on {plant}' if plant else ''}{f', {stage}' if stage else ''}"
     draw(runs, title, out)
     if as_json:
-        data = {"scenario": scenario, "plant": plant, "seed": seed, "lane": lane.value, "picture": str(out)}
+        data = {
+            "scenario": scenario,
+            "stage": stage,
+            "plant": plant,
+            "seed": seed,
+            "lane": lane.value,
+            "picture": str(out),
+        }
         print(json.dumps(data | {"laws": [run.as_dict() for run in runs]}, allow_nan=False))
     else:
         _show(runs, title, out)

@@ -3,6 +3,7 @@
 import importlib.metadata
 from collections.abc import Callable
 from dataclasses import dataclass
+from functools import cached_property
 from typing import Any, Literal
 
 import numpy as np
@@ -13,7 +14,9 @@ from hil.measured_loop import at_point
 from hil.outside_scale import OutsideScale
 from hil.plant_response import PlantResponse, measure_plant
 from hil.setup import Setup
+from pkxyz_ctrl.calibration_config import Calibration, SenseScale
 from pkxyz_ctrl.config import digest, plain
+from pkxyz_ctrl.design.calibrate import Calibrated, SenseGain, calibrate
 from pkxyz_ctrl.design.loop_plant import loop_plant
 from pkxyz_ctrl.design.modal_fit import MODES, ModalFit, fit_modes
 from pkxyz_ctrl.stage import Stage
@@ -37,8 +40,8 @@ class Identification:
     def chain_gain(self) -> tuple[Array, Array]:
         """(3,) sense gain times comb gain over mass of each chain, relative to the stage file, and its deviation."""
         stage, analog = Stage(self.setup.stage), self.setup.bus.analog
-        j = stage.jacobian(stage.forward_kinematics(self.response.strokes_m))
-        drawn = np.diag(j @ j.T) * stage.force_gain_n_per_v2 / stage.config.dynamics.mass_kg
+        position = stage.forward_kinematics(self.response.strokes_m)
+        drawn = np.diag(stage.jacobian(position) @ stage.pulls(position).T) * stage.force_gain_n_per_v2 / stage.mass_kg
         drawn = drawn * stage.sense_gradient_f_per_m / analog.sense_farad_per_count
         found = self.modes
         return np.diag(found.acceleration_gain) / drawn, np.diag(found.acceleration_gain_deviation) / drawn
@@ -46,7 +49,7 @@ class Identification:
     @property
     def comb_gain(self) -> tuple[Array, Array] | None:
         """(3,) comb gains relative to the stage file, if its mass is right, and their deviation; None without an
-        outside reference. What lifts the combs' fingers counts as pull.
+        outside reference.
         """
         if self.outside is None:
             return None
@@ -56,6 +59,43 @@ class Identification:
             np.hypot(deviation / product, self.outside.deviation / self.outside.sense_gain),
         )
         return gain, gain * relative
+
+    @cached_property
+    def calibrated(self) -> Calibrated:
+        """The stage's calibration, by the drawing: not only by the file that was run, which may have one of before."""
+        scale = 1.0 if self.outside is None else self.outside.sense_gain
+        return calibrate(
+            self.setup.stage,
+            self.response.strokes_m / scale,
+            self.modes,
+            self.setup.bus.analog.sense_farad_per_count,
+            self._sense_gain,
+        )
+
+    @property
+    def _sense_gain(self) -> SenseGain:
+        """By the instrument outside, else as the file that was run has it."""
+        before = self.setup.stage.calibration or Calibration()
+        gain, known = np.array(before.sense_gain), before.standard_error
+        error = np.zeros(3) if known is None else np.array(known.sense_gain)
+        if self.outside is None:
+            return SenseGain(gain, error)
+        return SenseGain(gain * self.outside.sense_gain, gain * self.outside.deviation)
+
+    @property
+    def sense_scale(self) -> SenseScale:
+        """Where the calibration's metres come from."""
+        if self.outside is not None:
+            return "instrument"
+        before = self.setup.stage.calibration
+        if before is not None and before.measured_by is not None and not self._sense_gain.assumed:
+            return before.measured_by.sense_scale
+        return "reciprocity" if self.calibrated.differ else "drawing"
+
+    @property
+    def not_known(self) -> str:
+        """What the calibration leaves open."""
+        return MASS_NOT_KNOWN if self.sense_scale == "instrument" else f"{SCALE_NOT_KNOWN}; {MASS_NOT_KNOWN}"
 
     @property
     def drawn_hz(self) -> Array:
@@ -67,7 +107,7 @@ def modes_hz(setup: Setup, strokes_m: Array) -> Array:
     """Natural frequencies (3,) in ascending order by the stage file, about a point, under the forces that hold it."""
     stage = Stage(setup.stage)
     held = loop_plant(stage, setup.bus, strokes_m).stiffness_n_per_m
-    return np.asarray(np.sqrt(np.linalg.eigvalsh(held) / stage.config.dynamics.mass_kg) / (2.0 * np.pi))
+    return np.asarray(np.sqrt(np.linalg.eigvalsh(held) / stage.mass_kg) / (2.0 * np.pi))
 
 
 def exciting(
@@ -108,7 +148,7 @@ def identify(
         period_s=response.period_s,
         delay_periods=response.delay_periods,
         start_hz=modes_hz(run, strokes_m),
-        start_damping=0.5 / setup.stage.dynamics.quality_factor,
+        start_damping=0.5 / Stage(setup.stage).quality_factor,
     )
     return Identification(run, lane, kind, response, modes)
 
@@ -167,6 +207,7 @@ def as_data(found: Identification) -> dict[str, Any]:
         },
         "chain_gain": _list(found.chain_gain[0]),
         "chain_gain_error": _list(found.chain_gain[1]),
+        "calibration": _calibration_data(found),
         "known_from_inside": KNOWN,
         "not_known_from_inside": NOT_KNOWN,
         "reference": None if found.outside is None else _outside_data(found),
@@ -188,11 +229,31 @@ def _outside_data(found: Identification) -> dict[str, Any]:
         "comb_gain": _list(comb[0]),
         "comb_gain_error": _list(comb[1]),
         "comb_n_per_v2": _list(stage.force_gain_n_per_v2 * comb[0]),
-        "assumed_mass_kg": stage.config.dynamics.mass_kg,
+        "assumed_mass_kg": stage.mass_kg,
     }
 
 
-KNOWN = "offsets, resonances, dampings, counts per V^2, and of each chain sense gain times comb gain over mass"
+def _calibration_data(found: Identification) -> dict[str, Any]:
+    calibrated, reciprocal = found.calibrated, found.calibrated.reciprocal
+    return plain(calibrated.calibration) | {
+        "chi_square": calibrated.chi_square,
+        "reciprocal_sense_gain": _list(reciprocal.gain),
+        "reciprocal_sense_gain_error": _list(reciprocal.error),
+        "sense_gains_differ": calibrated.differ,
+        "sense_scale": found.sense_scale,
+        "not_known": found.not_known,
+    }
+
+
+KNOWN = (
+    "offsets, resonances, dampings, delay, counts per V^2, and of each chain sense gain times comb gain over mass; "
+    "springs over mass; ratios of the sense gains, by reciprocity"
+)
+SCALE_NOT_KNOWN = (
+    "metres per count, one factor for all chains, with the newtons per V^2 in inverse proportion: the mean sense gain "
+    "is the drawing's; --reference FILE.csv of an instrument outside tells"
+)
+MASS_NOT_KNOWN = "the mass, and so the scale of all forces and stiffnesses, which is the drawing's: nothing moves by it"
 NOT_KNOWN = "metres per count and newtons per V^2 by themselves; --reference FILE.csv of an instrument outside tells"
 
 

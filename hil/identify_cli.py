@@ -11,12 +11,14 @@ from rich.table import Table
 from hil.choices import Lane, Tones
 from hil.one_line_errors import one_line_errors
 from hil.progress import progress_bar
-from pkxyz_ctrl.config import ConfigError, load
+from pkxyz_ctrl.config import ConfigError, find, load
 
 if TYPE_CHECKING:
     from hil.identification import Identification
 
 _screen = Console(highlight=False)
+
+STAGE = "stage.toml"
 
 AMPLITUDE_NM = {"multisine": 5.0, "stepped": 25.0}
 """Of each tone, by default: one alone may be larger than a hundred at once."""
@@ -52,7 +54,8 @@ def identify(
     ] = None,
     as_json: Annotated[bool, typer.Option("--json", help="Print JSON, and nothing else.")] = False,
 ) -> None:
-    """Frequency response from squared voltages to sense counts, modes, static gains and offsets, in the closed loop.
+    """Frequency response from squared voltages to sense counts, modes, static gains and offsets, in the closed loop;
+    and a stage file with what was found, which runs at once: --stage FOLDER/stage.toml.
 
     Exit code 0 if the fit leaves nothing but noise, 1 if it leaves more (then the errors are no bounds), 2 for bad
     input.
@@ -81,8 +84,9 @@ def identify(
             amplitude_m=amplitude * 1e-9, periods=periods, on_progress=tell,
         )  # fmt: skip
     found = replace(found, outside=outside)
-    data = as_data(found)
-    folder = _write(out, found, data)
+    with one_line_errors():
+        data = as_data(found)
+    folder = _write(out, found, data, find("stages", stage))
     if as_json:
         print(json.dumps(data, allow_nan=False))
     else:
@@ -90,7 +94,8 @@ def identify(
     raise typer.Exit(0 if found.modes.noise_alone else 1)
 
 
-def _write(out: Path | None, found: "Identification", data: dict[str, Any]) -> Path:
+def _write(out: Path | None, found: "Identification", data: dict[str, Any], stage: Path) -> Path:
+    from hil.calibrated_stage import write_calibrated_stage
     from hil.identification import response_csv
     from hil.identify_figures import draw_response
     from hil.run_folder import next_free
@@ -102,8 +107,11 @@ def _write(out: Path | None, found: "Identification", data: dict[str, Any]) -> P
         (folder / "identification.json").write_text(text, encoding="utf-8")
         (folder / "response.csv").write_text(response_csv(found), encoding="utf-8")
         draw_response(found, folder / "response.png")
+        (folder / STAGE).unlink(missing_ok=True)
     except OSError as error:
         raise ConfigError(f"--out: {folder}: {(error.strerror or str(error)).lower()}; give another folder") from None
+    if found.modes.noise_alone:
+        write_calibrated_stage(stage, found, folder.name, folder / STAGE)
     return folder
 
 
@@ -138,9 +146,14 @@ def _show(found: "Identification", data: dict[str, Any], folder: Path) -> None:
         soft_wrap=True,
     )
     _show_gains(found)
+    _show_calibration(found)
     if found.outside is None:
         _screen.print(f"not known from inside: {data['not_known_from_inside']}", soft_wrap=True)
     _screen.print(f"written: {folder}", soft_wrap=True)
+    if modes.noise_alone:
+        _screen.print(f"to run with it: pkxyz sil --stage {folder / STAGE}", soft_wrap=True)
+    else:
+        _screen.print("no stage file was written, as the errors are no bounds; raise --amplitude or --periods")
 
 
 def _show_gains(found: "Identification") -> None:
@@ -155,6 +168,33 @@ def _show_gains(found: "Identification") -> None:
     _screen.print(table)
     if outside is not None:
         _screen.print(f"reference: {outside.points} points, {outside.residual_m * 1e9:.2f} nm rms left")
+
+
+def _show_calibration(found: "Identification") -> None:
+    """By the drawing, as the stage file has it."""
+    numbers = found.calibrated.calibration
+    errors = numbers.standard_error
+    assert errors is not None
+    table = _table("chain", "sense", "comb", "sliders", "cranks")
+    for i in range(3):
+        sense = _pm(numbers.sense_gain[i], errors.sense_gain[i]) if errors.sense_gain[i] else "as drawn"
+        table.add_row(
+            f"{i + 1}", sense, _pm(numbers.comb_gain[i], errors.comb_gain[i]),
+            _pm(numbers.slider_stiffness[i], errors.slider_stiffness[i]),
+            _pm(numbers.crank_stiffness[i], errors.crank_stiffness[i]),
+        )  # fmt: skip
+    _screen.print("calibration, relative to the drawing and its mass:")
+    _screen.print(table)
+    assert numbers.quality_factor is not None
+    assert numbers.sense_delay_s is not None
+    _screen.print(
+        f"links {_pm(numbers.link_stiffness, errors.link_stiffness)}, lift {_pm(numbers.lift, errors.lift)}, "
+        f"Q {_pm(numbers.quality_factor, errors.quality_factor)}, "
+        f"delay {_pm(numbers.sense_delay_s * 1e6, errors.sense_delay_s * 1e6)} us",
+        soft_wrap=True,
+    )
+    if found.calibrated.differ and not errors.sense_gain[0]:
+        _screen.print("[bold red]the ratios of the sense gains contradict reciprocity[/]")
 
 
 def _table(*headings: str) -> Table:

@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 
 from pkxyz_ctrl import cycle as cycling
 from pkxyz_ctrl.core import predictive
-from pkxyz_ctrl.core.kinematics import jacobian
+from pkxyz_ctrl.core.kinematics import jacobian, pulls
 from pkxyz_ctrl.core.linear3 import multiply3_transposed
 from pkxyz_ctrl.direct_call import direct
 from pkxyz_ctrl.safety.modes import LOOP_CLOSED
@@ -43,11 +43,12 @@ class Problem:
         numbers = law["tick"][0]
         predictive_, filter_ = numbers["predictive"], numbers["estimator"]
         n = self.horizon = int(predictive_["horizon"])
-        jacobian0 = np.empty((3, 3))
+        jacobian0, pulls0 = np.empty((3, 3)), np.empty((3, 3))
         jacobian(numbers["geometry"], filter_["operating_point_m"], jacobian0)
-        phi, gamma = filter_["transition"][:, :6], filter_["input"] @ jacobian0.T * FORCE_UNIT_N
+        pulls(numbers["geometry"], filter_["operating_point_m"], pulls0)
+        phi, gamma = filter_["transition"][:, :6], filter_["input"] @ pulls0.T * FORCE_UNIT_N
         stage_cost = np.diag(np.repeat([predictive_["position_weight"], predictive_["velocity_weight"]], 3))
-        force_cost = jacobian0 @ jacobian0.T * FORCE_UNIT_N**2
+        force_cost = pulls0 @ pulls0.T * FORCE_UNIT_N**2
         end_cost = _riccati(phi, filter_["input"], stage_cost)
         # e_1 .. e_n = free e_0 + forced v + jumped c
         powers = [np.eye(6)]
@@ -71,7 +72,7 @@ class Problem:
         at_combs = at_combs.reshape(n, 3, 6 * n)[1::2].reshape(-1, 6 * n)  # every other interval is close enough
         self.stroke_error, self.stroke_jump = at_combs @ free, at_combs @ jumped
         self.stroke_force = at_combs @ forced
-        self.jacobian = jacobian0
+        self.pulls = pulls0
         self.slack_cost = SOFTNESS * float(predictive_["position_weight"]) * STROKE_UNIT_M**2 / unit
 
     def matrices(self) -> tuple[scipy.sparse.csc_matrix, scipy.sparse.csc_matrix]:
@@ -109,7 +110,7 @@ class PredictiveCycle:
             np.ascontiguousarray(m)
             for m in (
                 problem.answer_error, problem.answer_jump, problem.linear_error, problem.linear_jump,
-                problem.stroke_error, problem.stroke_jump, problem.stroke_force, problem.jacobian,
+                problem.stroke_error, problem.stroke_jump, problem.stroke_force, problem.pulls,
             )
         )  # fmt: skip
         self._work = self._rows, self._q, self._v, self._lower, self._upper, self._planned
@@ -120,7 +121,7 @@ class PredictiveCycle:
         self._observe = direct(cycling.observe, law, memory, reference)
         self._respond = direct(cycling.respond, law, memory)
         self._plan = direct(plan, law, memory, reference, self._matrices, self._work)
-        self._adopt = direct(adopt, law, memory, self._v, problem.jacobian, self._planned, 1)
+        self._adopt = direct(adopt, law, memory, self._v, problem.pulls, self._planned, 1)
 
     def __call__(self, law: Records, memory: Records, reference: Array) -> None:
         """One period."""
@@ -154,7 +155,7 @@ class PredictiveCycle:
         info = solver.info
         if info.status_val == osqp.SolverStatus.OSQP_SOLVED:
             self._v[:] = solver.solution.x[:-3]
-            self._adopt(law, memory, self._v, self.problem.jacobian, self._planned, info.iter)
+            self._adopt(law, memory, self._v, self.problem.pulls, self._planned, info.iter)
         else:
             memory["tick"]["solver_iterations"] = -info.iter
             self._is_cold = True
@@ -185,7 +186,7 @@ def plan(law_array: Records, memory_array: Records, reference: Array, matrices: 
     if LOOP_CLOSED[memory["mode"]] == 0:
         planned[:] = 0.0
         return 0
-    state, jacobian0 = memory["tick"], matrices[7]
+    state, pulls0 = memory["tick"], matrices[7]
     for k in range(n + 2):
         cycling.reference_row(law, memory, reference, law["tick"]["delay_periods"] + k, rows[k])
     feedforward, comb, error = np.empty((n, 3)), np.empty((n, 3)), np.empty(6)
@@ -201,7 +202,7 @@ def plan(law_array: Records, memory_array: Records, reference: Array, matrices: 
         q[: 3 * n] += matrices[3] @ flat
         stroke += matrices[5] @ flat
     offset = np.empty(3)
-    offset[:] = np.linalg.solve(jacobian0.T, state["estimate"]["ahead"][6:9])
+    offset[:] = np.linalg.solve(pulls0.T, state["estimate"]["ahead"][6:9])
     predictive.comb_bounds(law["tick"]["drive"], state["count"][0], comb, offset, lower, upper)
     predictive.slew_bounds(law["tick"]["drive"], comb, planned, lower[3 * n :], upper[3 * n :])
     predictive.stroke_bounds(law["tick"], rows[2 : n + 1 : 2].copy(), stroke, lower[6 * n - 3 :], upper[6 * n - 3 :])
@@ -219,18 +220,16 @@ def plan(law_array: Records, memory_array: Records, reference: Array, matrices: 
     stroked = matrices[6] @ v / STROKE_UNIT_M
     if not predictive.is_inside(lower, upper, slewed, stroked, v, n):
         return predictive.LIMITED
-    adopt(law_array, memory_array, v, jacobian0, planned, 0)
+    adopt(law_array, memory_array, v, pulls0, planned, 0)
     return predictive.FREE
 
 
 @njit(cache=True)
-def adopt(
-    law_array: Records, memory_array: Records, v: Array, jacobian0: Array, planned: Array, iterations: int
-) -> None:
+def adopt(law_array: Records, memory_array: Records, v: Array, pulls0: Array, planned: Array, iterations: int) -> None:
     """Make a plan v (3n,) this tick's: its first force less the disturbance goes to the law, all of it is kept."""
     state = memory_array[0]["tick"]
     first = v[0:3] * FORCE_UNIT_N
-    multiply3_transposed(jacobian0, first, state["plan_n"])
+    multiply3_transposed(pulls0, first, state["plan_n"])
     for i in range(3):
         state["plan_n"][i] -= state["estimate"]["ahead"][6 + i]
     state["plan_known"] = 1

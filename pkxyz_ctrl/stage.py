@@ -16,10 +16,11 @@ import numpy as np
 from numba import njit
 from numpy.typing import ArrayLike, NDArray
 
+from pkxyz_ctrl.calibration_config import AS_DRAWN, Calibration
 from pkxyz_ctrl.config import load
 from pkxyz_ctrl.core import elasticity, kinematics
 from pkxyz_ctrl.core.linear3 import inverse3
-from pkxyz_ctrl.mechanics.combs import capacitance_gradient_f_per_m, force_gain_n_per_v2, voltage_for_force_v
+from pkxyz_ctrl.mechanics.combs import capacitance_gradient_f_per_m, force_gain_n_per_v2
 from pkxyz_ctrl.mechanics.flexures import crank_hinge_stiffness, folded_spring_stiffness, link_hinge_stiffness
 from pkxyz_ctrl.stage_config import StageConfig
 
@@ -38,20 +39,29 @@ class Stage:
 
     def __init__(self, config: StageConfig) -> None:
         self.config = config
+        measured = config.calibration or Calibration()
         self.geometry = kinematics.geometry_record(config.geometry)
+        self.geometry["lift"] = measured.lift
         self.elasticity = np.zeros(1, elasticity.ELASTICITY)
-        self.elasticity["slider_n_per_m"] = 4 * folded_spring_stiffness(config.flexures)
-        self.elasticity["crank_n_m_per_rad"] = 4 * crank_hinge_stiffness(config.flexures)
-        self.elasticity["link_n_m_per_rad"] = (
-            4 * config.flexures.out_of_plane_chains * link_hinge_stiffness(config.flexures)
-        )
+        slider, crank = (4 * k(config.flexures) for k in (folded_spring_stiffness, crank_hinge_stiffness))
+        self.elasticity["slider_n_per_m"] = slider * np.array(measured.slider_stiffness)
+        self.elasticity["crank_n_m_per_rad"] = crank * np.array(measured.crank_stiffness)
+        link = 4 * config.flexures.out_of_plane_chains * link_hinge_stiffness(config.flexures)
+        self.elasticity["link_n_m_per_rad"] = link * measured.link_stiffness
         self.geometry.flags.writeable = False
         self.elasticity.flags.writeable = False
-        self.force_gain_n_per_v2 = force_gain_n_per_v2(config.drive_comb)
-        self.sense_gradient_f_per_m = capacitance_gradient_f_per_m(config.sense_comb)
-        self.sense_rest_f = self.sense_gradient_f_per_m * config.sense_comb.overlap_rest_m
+        self.mass_kg = config.dynamics.mass_kg
+        self.quality_factor = measured.quality_factor or config.dynamics.quality_factor
+        delay_s = measured.sense_delay_s
+        self.sense_delay_s = config.sense.delay_s if delay_s is None else delay_s
+        drawn_f_per_m = capacitance_gradient_f_per_m(config.sense_comb)
+        self.force_gain_n_per_v2 = force_gain_n_per_v2(config.drive_comb) * np.array(measured.comb_gain)
+        self.sense_gradient_f_per_m = drawn_f_per_m * np.array(measured.sense_gain)
+        self.sense_rest_f = drawn_f_per_m * config.sense_comb.overlap_rest_m
         self.voltage_max_v = config.limits.voltage_max_v
         self.force_max_n = self.force_gain_n_per_v2 * self.voltage_max_v**2
+        for each in (self.force_gain_n_per_v2, self.sense_gradient_f_per_m, self.force_max_n):
+            each.flags.writeable = False
 
     @classmethod
     def load(cls, name_or_path: str | Path) -> "Stage":
@@ -85,6 +95,12 @@ class Stage:
         """dq/dx (..., 3, 3) at positions (..., 3): row i is the gradient of stroke i. Eq. 12 is its value at rest."""
         return self._at_positions(position_m, _jacobian_each, (3, 3))
 
+    def pulls(self, position_m: ArrayLike) -> Array:
+        """Force at the platform by the pull of each comb (..., 3, 3) at positions (..., 3): row i is the gradient of
+        stroke i, plus what lifts the comb's fingers.
+        """
+        return self._at_positions(position_m, _pulls_each, (3, 3))
+
     def stroke_curvature(self, position_m: ArrayLike) -> Array:
         """d2q/dx2 (..., 3, 3, 3) in 1/m, the chain first: what a constant Jacobian leaves out."""
         return self._at_positions(position_m, _curvature_each, (3, 3, 3))
@@ -102,7 +118,8 @@ class Stage:
         return self._at_elastic(position_m, _stiffness_each, (3, 3))
 
     def comb_force(self, voltage_v: ArrayLike) -> Array:
-        """Pull (...) in N of a comb at a voltage (...) in V (Eq. 33): never negative, the sign of the voltage is lost.
+        """Pull (..., 3) in N of the combs at voltages (..., 3) in V (Eq. 33): never negative, the sign of the voltage
+        is lost. Where all combs are alike, as drawn, any shape will do.
 
         Raises ``StageDomainError`` beyond the device's voltage limit.
         """
@@ -111,26 +128,31 @@ class Stage:
             raise StageDomainError(
                 f"voltage {np.abs(voltage).max():.6g} V is beyond the limit of {self.voltage_max_v:g} V"
             )
-        return np.asarray(self.force_gain_n_per_v2 * voltage * voltage)
+        return np.asarray(self._for_combs(self.force_gain_n_per_v2, voltage, "voltage_v") * voltage * voltage)
 
     def comb_voltage(self, force_n: ArrayLike) -> Array:
-        """Voltage (...) in V, 0 or positive, at which a comb pulls with ``force_n`` (...) in N: the square-root law.
+        """Voltages (..., 3) in V, 0 or positive, at which combs pull with ``force_n`` (..., 3) in N: the square-root
+        law. Where all combs are alike, as drawn, any shape will do.
 
         Raises ``StageDomainError`` for a push (a comb can't) and for a force beyond what the voltage limit gives.
         """
         force = _finite(force_n, "force_n")
         if np.any(force < 0):
             raise StageDomainError(f"force {force.min() * 1e6:.6g} uN is a push, and combs only pull")
-        if np.any(force > self.force_max_n * (1 + 1e-12)):
+        gain = self._for_combs(self.force_gain_n_per_v2, force, "force_n")
+        most = self._for_combs(self.force_max_n, force, "force_n")
+        if np.any(force > most * (1 + 1e-12)):
+            worst = np.argmax(force / most)
+            asked, gives, a_volt = (float(np.broadcast_to(v, force.shape).flat[worst]) for v in (force, most, gain))
             raise StageDomainError(
-                f"force {force.max() * 1e6:.6g} uN needs {math.sqrt(force.max() / self.force_gain_n_per_v2):.1f} V, "
-                f"beyond the limit of {self.voltage_max_v:g} V ({self.force_max_n * 1e6:.6g} uN)"
+                f"force {asked * 1e6:.6g} uN needs {math.sqrt(asked / a_volt):.1f} V, "
+                f"beyond the limit of {self.voltage_max_v:g} V ({gives * 1e6:.6g} uN)"
             )
-        return np.asarray(np.minimum(voltage_for_force_v(self.config.drive_comb, force), self.voltage_max_v))
+        return np.asarray(np.minimum(np.sqrt(force / gain), self.voltage_max_v))
 
     def holding_forces(self, position_m: ArrayLike) -> Array:
-        """Comb forces (..., 3) in N that hold a position: F = J^-T dV/dx (Eq. 23). Negative where combs would have to
-        push.
+        """Comb forces (..., 3) in N that hold a position: F = B^-T dV/dx with ``pulls`` B (Eq. 23). Negative where
+        combs would have to push.
         """
         return self._at_elastic(position_m, _holding_each, (3,))
 
@@ -159,6 +181,14 @@ class Stage:
                 f"capacitance {capacitance.min() * 1e15:.6g} fF is not positive: the sense comb has no overlap there"
             )
         return (capacitance - self.sense_rest_f) / self.sense_gradient_f_per_m
+
+    def _for_combs(self, each: Array, values: Array, name: str) -> Array:
+        """What belongs to each comb (3,), for values (..., 3); that of all for other shapes, if there is one."""
+        if values.ndim and values.shape[-1] == 3:
+            return each
+        if (self.config.calibration or Calibration()).comb_gain != AS_DRAWN:
+            raise StageDomainError(f"{name} must have shape (..., 3), as the combs differ; got {values.shape}")
+        return np.asarray(each[0])
 
     def _at_positions(self, position_m: ArrayLike, kernel: Callable[..., None], shape: tuple[int, ...]) -> Array:
         flat, leading = self._checked(position_m)
@@ -239,6 +269,12 @@ def _jacobian_each(geometry: Records, positions: Array, out: Array) -> None:
 
 
 @njit(cache=True)
+def _pulls_each(geometry: Records, positions: Array, out: Array) -> None:
+    for i in range(len(positions)):
+        kinematics.pulls(geometry[0], positions[i], out[i])
+
+
+@njit(cache=True)
 def _curvature_each(geometry: Records, positions: Array, out: Array) -> None:
     for i in range(len(positions)):
         kinematics.curvature(geometry[0], positions[i], out[i])
@@ -267,7 +303,7 @@ def _holding_each(geometry: Records, elastic: Records, positions: Array, out: Ar
     gradient, j, inverse = np.empty(3), np.empty((3, 3)), np.empty((3, 3))
     for i in range(len(positions)):
         elasticity.energy_gradient(geometry[0], elastic[0], positions[i], gradient)
-        kinematics.jacobian(geometry[0], positions[i], j)
+        kinematics.pulls(geometry[0], positions[i], j)
         inverse3(j, inverse)
         for k in range(3):
             out[i, k] = inverse[0, k] * gradient[0] + inverse[1, k] * gradient[1] + inverse[2, k] * gradient[2]

@@ -5,6 +5,7 @@ from typing import Annotated, Literal, Self
 
 from pydantic import Field, model_validator
 
+from pkxyz_ctrl.calibration_config import Calibration
 from pkxyz_ctrl.config import FrozenModel
 
 Positive = Annotated[float, Field(gt=0)]
@@ -145,3 +146,5 @@ class StageConfig(FrozenModel):
     sense: SenseConfig
     amplifier: AmplifierConfig
     limits: LimitsConfig
+    calibration: Calibration | None = None
+    """what was measured of it; None: all as drawn. The plant does not read it."""

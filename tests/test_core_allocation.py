@@ -12,7 +12,7 @@ from scipy import sparse
 
 from pkxyz_ctrl.core.allocation import allocate
 
-FORCE_MAX_N = stage().force_max_n
+FORCE_MAX_N = float(stage().force_max_n[0])
 WORKSPACE = st.tuples(*[st.floats(-3e-6, 27e-6)] * 3).map(np.array)  # strokes, a little beyond the device's
 SETS = ["".join(s) for s in itertools.product("fLU", repeat=3)]  # free, at the lower bound, at the upper one
 SIZES = st.sampled_from([1e-9, 1e-6, 1e-4, 3e-3, 1e-2, 1.0])

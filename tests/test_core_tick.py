@@ -70,7 +70,7 @@ def test_counts_become_the_position_that_they_mean(strokes_m, surprise_m, zero_f
     meant_m = stage().strokes_from_capacitance(meant_f)
     assert memory["sense_f"] == pytest.approx(meant_f, rel=1e-13)
     assert memory["stroke_m"] == pytest.approx(meant_m, rel=0, abs=1e-17)
-    assert np.abs(memory["stroke_m"] - strokes_m).max() <= 0.5 * 68e-18 / stage().sense_gradient_f_per_m * 1.001
+    assert (np.abs(memory["stroke_m"] - strokes_m) <= 0.5 * 68e-18 / stage().sense_gradient_f_per_m * 1.001).all()
     assert np.abs(memory["measurement_m"] - exact(meant_m)).max() < 0.3e-9
 
 

@@ -42,8 +42,8 @@ def sampled_for(bus_name, model=None, device=None):
 def test_sense_noise_is_2_nm_and_the_counts():
     """5 aF/rtHz over 2.5 kHz are 250 aF; 127.5 fF/um make 1.96 nm of it; counts of 0.53 nm add 0.15 nm."""
     assert stage().sense_gradient_f_per_m == pytest.approx(127.5e-9, rel=1e-3)
-    white_m = 5e-18 * math.sqrt(2500) / stage().sense_gradient_f_per_m
-    count_m = 68e-18 / stage().sense_gradient_f_per_m / math.sqrt(12)
+    white_m = 5e-18 * math.sqrt(2500) / stage().sense_gradient_f_per_m[0]
+    count_m = 68e-18 / stage().sense_gradient_f_per_m[0] / math.sqrt(12)
     assert sense_noise(stage(), bus()) == pytest.approx(math.hypot(white_m, count_m), rel=1e-12)
     assert sense_noise(stage(), bus()) == pytest.approx(1.966e-9, rel=1e-3)
     assert sense_noise(stage(), bus("local_20k")) == pytest.approx(3.92e-9, rel=1e-2)

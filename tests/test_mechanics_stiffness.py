@@ -126,7 +126,9 @@ def test_spring_part_of_the_energy(stage: Stage, position_m: np.ndarray) -> None
     f = stage.config.flexures
     strokes = stage.inverse_kinematics(position_m)
     springs = float(spring_energy_j(flexures.folded_spring_stiffness(f), strokes))
-    assert springs == pytest.approx(0.5 * stage.elasticity["slider_n_per_m"][0] * float(strokes @ strokes), rel=1e-14)
+    assert springs == pytest.approx(
+        0.5 * stage.elasticity["slider_n_per_m"][0, 0] * float(strokes @ strokes), rel=1e-14
+    )
     assert springs <= float(stage.potential_energy(position_m)) * (1 + 1e-12) + 1e-30
 
 

@@ -19,7 +19,7 @@ from pkxyz_ctrl.stage import Stage
 SPAN_M = 25e-6
 
 
-def by_throwing(stage: Stage, count: int, force_max_n: float) -> tuple[float, float]:
+def by_throwing(stage: Stage, count: int, force_max_n: np.ndarray | float) -> tuple[float, float]:
     """Volume in position space by throwing points into a box around the workspace: no Jacobian, no forward
     kinematics.
     """
@@ -29,7 +29,7 @@ def by_throwing(stage: Stage, count: int, force_max_n: float) -> tuple[float, fl
     strokes = stage.inverse_kinematics(points)
     force = stage.holding_forces(points)
     inside = ((strokes >= limits.stroke_min_m) & (strokes <= limits.stroke_max_m)).all(axis=1)
-    inside &= np.isinf(force_max_n) | ((force >= 0) & (force <= force_max_n)).all(axis=1)
+    inside &= np.isinf(force_max_n).all() | ((force >= 0) & (force <= force_max_n)).all(axis=1)
     box = float(np.prod(high - low))
     share = float(inside.mean())
     return box * share, box * float(np.sqrt(share * (1 - share) / count))

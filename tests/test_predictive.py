@@ -64,7 +64,7 @@ def test_without_limits_it_is_the_regulator():
     """First force of the plan without limits against the regulator's gains, which python-control found: P is right."""
     problem, feedback = Problem(law()), law()["tick"][0]["feedback"]
     gains = np.hstack([feedback["position_gain_n_per_m"], feedback["velocity_gain_n_s_per_m"]])
-    first = problem.jacobian.T @ problem.answer_error[:3] * FORCE_UNIT_N
+    first = problem.pulls.T @ problem.answer_error[:3] * FORCE_UNIT_N
     assert np.abs(first + gains).max(axis=0) == pytest.approx(0.0, abs=1e-6 * np.abs(gains).max())
     assert first[:, :3] == pytest.approx(-gains[:, :3], rel=1e-5, abs=1e-6 * np.abs(gains[:, :3]).max())
 

@@ -67,7 +67,7 @@ def draw_quantisation(figure: Figure) -> None:
     """Spectrum of the voltage's rounding error while holding, with and without noise shaping."""
     setup = load_scenario("raster").setup()
     axes = figure.add_subplot(1, 2, 2)
-    gain = float(setup.law["tick"]["drive"]["force_gain_n_per_v2"][0])
+    gain = setup.law["tick"]["drive"]["force_gain_n_per_v2"][0]
     for name, colour in (("no noise shaping", ORANGE), ("noise shaping", BLUE)):
         rows = rows_of(setup, changed(setup, name))
         hold = rows[(rows["t_us"] > 950_000)]

@@ -20,8 +20,8 @@ Array = NDArray[np.float64]
 
 ELASTICITY = np.dtype(
     [
-        ("slider_n_per_m", "f8"),  # 4 K1: one slider on its four folded springs
-        ("crank_n_m_per_rad", "f8"),  # 4 K2: one chain's parallelogram
+        ("slider_n_per_m", "f8", (3,)),  # 4 K1: each slider on its four folded springs
+        ("crank_n_m_per_rad", "f8", (3,)),  # 4 K2: each chain's parallelogram
         ("link_n_m_per_rad", "f8"),  # 4 c K3: the out-of-plane hinges of the c chains that count
     ],
     align=True,
@@ -34,11 +34,12 @@ def energy(geometry: np.void, elasticity: np.void, position_m: Array) -> float:
     x, y = position_m[0], position_m[1]
     _, delta, drop = link(geometry, position_m[2])
     total = 0.0
+    k1, k2 = elasticity["slider_n_per_m"], elasticity["crank_n_m_per_rad"]
     for i in range(3):
         s, c = crank(geometry, i, x, y)
         q = stroke(geometry, i, x, y, s, c, drop)
         theta = math.asin(s / geometry["crank_m"])
-        total += 0.5 * elasticity["slider_n_per_m"] * q * q + 0.5 * elasticity["crank_n_m_per_rad"] * theta * theta
+        total += 0.5 * k1[i] * q * q + 0.5 * k2[i] * theta * theta
     tilt = _elevation_change(geometry, position_m[2], delta)
     return total + 0.5 * elasticity["link_n_m_per_rad"] * tilt * tilt
 
@@ -62,8 +63,8 @@ def energy_gradient(geometry: np.void, elasticity: np.void, position_m: Array, o
     fx = fy = pull = 0.0
     for i in range(3):
         s, c = crank(geometry, i, x, y)
-        force = k1 * stroke(geometry, i, x, y, s, c, drop)
-        across = (force * s + k2 * math.asin(s / geometry["crank_m"])) / c
+        force = k1[i] * stroke(geometry, i, x, y, s, c, drop)
+        across = (force * s + k2[i] * math.asin(s / geometry["crank_m"])) / c
         fx += force * e[i, 0] + across * n[i, 0]
         fy += force * e[i, 1] + across * n[i, 1]
         pull += force
@@ -83,13 +84,14 @@ def stiffness(geometry: np.void, elasticity: np.void, position_m: Array, out: Ar
     z, delta, drop = link(geometry, position_m[2])
     for a in range(3):
         for b in range(3):
-            out[a, b] = k1 * (j[0, a] * j[0, b] + j[1, a] * j[1, b] + j[2, a] * j[2, b])
+            out[a, b] = k1[0] * (j[0, a] * j[0, b] + j[1, a] * j[1, b] + j[2, a] * j[2, b])
+            out[a, b] += (k1[1] - k1[0]) * j[1, a] * j[1, b] + (k1[2] - k1[0]) * j[2, a] * j[2, b]
     for i in range(3):
         s, c = crank(geometry, i, x, y)
         q = stroke(geometry, i, x, y, s, c, drop)
-        across = k1 * q * crank_bend(geometry, c) + k2 * (1.0 / c**2 + math.asin(s / length) * s / c**3)
+        across = k1[i] * q * crank_bend(geometry, c) + k2[i] * (1.0 / c**2 + math.asin(s / length) * s / c**3)
         for a in range(2):
             for b in range(2):
                 out[a, b] += across * n[i, a] * n[i, b]
-        out[2, 2] += k1 * q * link_bend(geometry, delta)
+        out[2, 2] += k1[i] * q * link_bend(geometry, delta)
     out[2, 2] += k3 * (1.0 / delta**2 + _elevation_change(geometry, position_m[2], delta) * z / delta**3)

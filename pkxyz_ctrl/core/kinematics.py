@@ -29,6 +29,7 @@ GEOMETRY = np.dtype(
         ("elevation_rest_rad", "f8"),  # alpha_0
         ("e", "f8", (3, 2)),  # inward unit vectors e_i
         ("n", "f8", (3, 2)),  # e_i turned by +90 degrees about z
+        ("lift", "f8"),  # force up a comb's fingers by its pull
     ],
     align=True,
 )
@@ -114,8 +115,18 @@ def jacobian(geometry: np.void, position_m: Array, out: Array) -> None:
 
 
 @njit(cache=True)
+def pulls(geometry: np.void, position_m: Array, out: Array) -> None:
+    """B (3,3) at ``position_m``: row i is the force at the platform by the pull of comb i, the gradient of its stroke
+    and what lifts its fingers. Without lift the Jacobian.
+    """
+    jacobian(geometry, position_m, out)
+    for i in range(3):
+        out[i, 2] += geometry["lift"]
+
+
+@njit(cache=True)
 def platform_force(geometry: np.void, position_m: Array, comb_force_n: Array, out: Array) -> None:
-    """J^T F (3,) in N: what comb forces (3,) do to the platform at ``position_m`` (Eq. 23)."""
+    """What comb forces (3,) do to the platform at ``position_m``, (3,) in N: J^T F (Eq. 23), and their lift."""
     e, n = geometry["e"], geometry["n"]
     z, delta, _ = link(geometry, position_m[2])
     fx = fy = pull = 0.0
@@ -127,7 +138,7 @@ def platform_force(geometry: np.void, position_m: Array, comb_force_n: Array, ou
         pull += comb_force_n[i]
     out[0] = fx
     out[1] = fy
-    out[2] = pull * z / delta
+    out[2] = pull * z / delta + geometry["lift"] * pull
 
 
 @njit(cache=True)

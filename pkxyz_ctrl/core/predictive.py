@@ -6,9 +6,10 @@ With e = [x - r, v - r'] at the start of interval k, nu = u + d (u: force beside
     e+ = Phi e + Gamma nu + c,   minimise  sum e^T Q e + nu^T nu  + e_N^T P e_N
 
 c is where the reference jumps. P solves the regulator's Riccati equation, so the plan without limits begins with the
-regulator's own answer. The variables are comb forces v = J_0^-T nu about those of the feed-forward, so that their
-limits are bounds; slew limits are linear about the forces of the last plan, strokes about the reference. Beyond the
-first interval the limits are predictions: what goes out is held to the exact ones by allocation and voltage.
+regulator's own answer. The variables are comb forces v = B_0^-T nu (B_0: ``kinematics.pulls``) about those of the
+feed-forward, so that their limits are bounds; slew limits are linear about the forces of the last plan, strokes about
+the reference. Beyond the first interval the limits are predictions: what goes out is held to the exact ones by
+allocation and voltage.
 """
 
 import numpy as np
@@ -44,13 +45,13 @@ _JUMP_M = 2e-9  # smooth references miss their own polynomial by 0.1 nm where th
 def feedforwards(law: np.void, rows: Array, force_n: Array, comb_n: Array) -> None:
     """Feed-forward at the platform (n,3) and at the combs (n,3) in each interval of the reference rows (n+1, 9)."""
     gains, row = law["feedback"], np.empty(9)
-    jacobian, inverse = np.empty((3, 3)), np.empty((3, 3))
+    pulls, inverse = np.empty((3, 3)), np.empty((3, 3))
     for k in range(len(rows) - 1):
         feedback.ahead(gains, rows[k], rows[k + 1], row)
         energy_gradient(law["geometry"], law["elasticity"], row[0:3], force_n[k])
         feedback.add_motion(gains, row, force_n[k])
-        kinematics.jacobian(law["geometry"], row[0:3], jacobian)
-        inverse3(jacobian, inverse)
+        kinematics.pulls(law["geometry"], row[0:3], pulls)
+        inverse3(pulls, inverse)
         multiply3_transposed(inverse, force_n[k], comb_n[k])
 
 
@@ -83,15 +84,15 @@ def jumps(period_s: float, rows: Array, jump_m: Array) -> bool:
 @njit(cache=True)
 def comb_bounds(drive: np.void, count: Array, comb_n: Array, offset_n: Array, lower: Array, upper: Array) -> None:
     """Bounds (3n,) of v from what the voltages can be after 1, 2, ... periods of slewing from the last counts (3,);
-    ``offset_n`` (3,) = J_0^-T d.
+    ``offset_n`` (3,) = B_0^-T d.
     """
     gain, scale = drive["force_gain_n_per_v2"], drive["volt_per_count"]
     for k in range(len(comb_n)):
         slew = (k + 1) * drive["count_slew_max"]
         for i in range(3):
             low, high = scale * max(0, count[i] - slew), scale * min(drive["count_max"], count[i] + slew)
-            lower[3 * k + i] = gain * low * low - comb_n[k, i] + offset_n[i]
-            upper[3 * k + i] = gain * high * high - comb_n[k, i] + offset_n[i]
+            lower[3 * k + i] = gain[i] * low * low - comb_n[k, i] + offset_n[i]
+            upper[3 * k + i] = gain[i] * high * high - comb_n[k, i] + offset_n[i]
 
 
 @njit(cache=True)
@@ -101,10 +102,10 @@ def slew_bounds(drive: np.void, comb_n: Array, planned_n: Array, lower: Array, u
     step_v = drive["volt_per_count"] * drive["count_slew_max"]
     for k in range(1, len(comb_n)):
         for i in range(3):
-            volt = np.sqrt(max(planned_n[k, i], 0.0) / gain)  # planned for k then is k - 1 now
+            volt = np.sqrt(max(planned_n[k, i], 0.0) / gain[i])  # planned for k then is k - 1 now
             change = comb_n[k, i] - comb_n[k - 1, i]
-            lower[3 * k - 3 + i] = -gain * step_v * max(2.0 * volt - step_v, step_v) - change
-            upper[3 * k - 3 + i] = gain * step_v * (2.0 * volt + step_v) - change
+            lower[3 * k - 3 + i] = -gain[i] * step_v * max(2.0 * volt - step_v, step_v) - change
+            upper[3 * k - 3 + i] = gain[i] * step_v * (2.0 * volt + step_v) - change
 
 
 @njit(cache=True)

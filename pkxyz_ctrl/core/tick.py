@@ -25,7 +25,7 @@ SENSE = np.dtype(
         ("farad_per_count", "f8"),
         ("offset_f", "f8"),  # capacitance of count 0
         ("rest_f", "f8"),  # nominal capacitance at rest
-        ("metre_per_farad", "f8"),
+        ("metre_per_farad", "f8", (3,)),  # of each chain
     ],
     align=True,
 )
@@ -55,7 +55,7 @@ DELAY_MAX = 2
 
 SCRATCH = np.dtype(
     [
-        ("jacobian", "f8", (3, 3)),
+        ("pulls", "f8", (3, 3)),
         ("inverse", "f8", (3, 3)),
         ("state", "f8", (9,)),
         ("row", "f8", (9,)),
@@ -107,10 +107,10 @@ def measure(law: np.void, memory: np.void, sense_count: NDArray[np.int32]) -> No
     sense = law["sense"]
     capacitance, stroke, position = memory["sense_f"], memory["stroke_m"], memory["measurement_m"]
     predicted, origin = memory["estimate"]["predicted"], law["estimator"]["operating_point_m"]
-    residual = memory["residual_m"]
+    residual, metre_per_farad = memory["residual_m"], sense["metre_per_farad"]
     for i in range(3):
         capacitance[i] = sense["offset_f"] + sense["farad_per_count"] * sense_count[i] - memory["sense_zero_f"][i]
-        stroke[i] = (capacitance[i] - sense["rest_f"]) * sense["metre_per_farad"]
+        stroke[i] = (capacitance[i] - sense["rest_f"]) * metre_per_farad[i]
         position[i] = origin[i] + predicted[i]
     kinematics.strokes(law["geometry"], position, residual)
     for i in range(3):
@@ -154,12 +154,12 @@ def act(law: np.void, memory: np.void, here: Array, now: Array, after: Array, la
     """
     geometry, gains, drive, scratch = law["geometry"], law["feedback"], law["drive"], memory["scratch"]
     demand, force, count = memory["demand_n"], memory["force_n"], memory["count"]
-    j, inverse, row, given = scratch["jacobian"], scratch["inverse"], scratch["row"], scratch["w_n"]
+    j, inverse, row, given = scratch["pulls"], scratch["inverse"], scratch["row"], scratch["w_n"]
     following = scratch["next_n"]
     feedback.ahead(gains, after, later, row)
     feedforward(law, row, following)
     feedback.ahead(gains, now, after, row)
-    kinematics.jacobian(geometry, row[0:3], j)
+    kinematics.pulls(geometry, row[0:3], j)
     inverse3(j, inverse)
     energy_gradient(geometry, law["elasticity"], row[0:3], demand)
     share = feedback.authority(gains, inverse, demand)
@@ -254,7 +254,7 @@ def is_discharged(memory: np.void) -> bool:
 
 @njit(cache=True)
 def unexplained_force(law: np.void, memory: np.void, out_n: Array) -> None:
-    """Comb forces (3,) that would explain what was seen: J^-T (d + K_0 e), with the Jacobian of the last ``act``; d is
+    """Comb forces (3,) that would explain what was seen: B^-T (d + K_0 e), with ``pulls`` of the last ``act``; d is
     the estimated disturbance, which takes its time, and K_0 e what holds the stage where it is instead of where it
     was expected.
 

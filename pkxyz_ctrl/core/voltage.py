@@ -1,8 +1,8 @@
 """Comb forces to amplifier counts: limits, the square-root law and first-order noise shaping, compiled.
 
-F = G V^2 (Eq. 33), V = scale x count. What a count cannot express is carried into the next tick, so the quantisation
-error of the voltage is pushed to high frequency, where the stage does not follow: its spectrum gains the factor |1 -
-z^-1|.
+F = G V^2 (Eq. 33), each comb with its own G; V = scale x count. What a count cannot express is carried into the next
+tick, so the quantisation error of the voltage is pushed to high frequency, where the stage does not follow: its
+spectrum gains the factor |1 - z^-1|.
 """
 
 import math
@@ -16,7 +16,7 @@ Counts = NDArray[np.int32]
 
 DRIVE = np.dtype(
     [
-        ("force_gain_n_per_v2", "f8"),  # G
+        ("force_gain_n_per_v2", "f8", (3,)),  # G of each comb
         ("volt_per_count", "f8"),
         ("count_max", "i4"),
         ("count_slew_max", "i4"),  # most that a count may change in one tick
@@ -38,8 +38,8 @@ def force_limits(drive: np.void, count_last: Counts, lower_n: Array, upper_n: Ar
     for i in range(3):
         low = scale * max(0, count_last[i] - slew)
         high = scale * min(most, count_last[i] + slew)
-        lower_n[i] = gain * low * low
-        upper_n[i] = gain * high * high
+        lower_n[i] = gain[i] * low * low
+        upper_n[i] = gain[i] * high * high
 
 
 @njit(cache=True)
@@ -50,10 +50,9 @@ def counts_for_forces(drive: np.void, force_n: Array, count_last: Counts, carry_
     the last one.
     """
     slew, most, scale = drive["count_slew_max"], drive["count_max"], drive["volt_per_count"]
+    gain = drive["force_gain_n_per_v2"]
     for i in range(3):
-        wanted = (
-            math.sqrt(force_n[i] / drive["force_gain_n_per_v2"]) if force_n[i] > 0.0 else 0.0
-        )  # NaN counts as no force
+        wanted = math.sqrt(force_n[i] / gain[i]) if force_n[i] > 0.0 else 0.0  # NaN counts as no force
         if drive["noise_shaping"] != 0 and wanted > 0.0:
             wanted += carry_v[i]
         low, high = max(0, count_last[i] - slew), min(most, count_last[i] + slew)
@@ -64,7 +63,8 @@ def counts_for_forces(drive: np.void, force_n: Array, count_last: Counts, carry_
 
 @njit(cache=True)
 def forces_of_counts(drive: np.void, count: Counts, force_n: Array) -> None:
-    """Comb forces (3,) in N that counts (3,) give by the nominal law."""
+    """Comb forces (3,) in N that counts (3,) give by the law."""
+    gain = drive["force_gain_n_per_v2"]
     for i in range(3):
         voltage = drive["volt_per_count"] * count[i]
-        force_n[i] = drive["force_gain_n_per_v2"] * voltage * voltage
+        force_n[i] = gain[i] * voltage * voltage

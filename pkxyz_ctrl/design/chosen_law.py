@@ -49,7 +49,7 @@ def chosen_law(stage: Stage, controller: ControllerConfig, bus: BusConfig) -> tu
 
 def _law(stage: Stage, controller: ControllerConfig, bus: BusConfig, plant: LoopPlant) -> DiscreteLaw:
     if controller.pi_notch is not None:
-        return pi_notch(plant, stage.config.dynamics.mass_kg, controller.pi_notch)
+        return pi_notch(plant, stage.mass_kg, controller.pi_notch)
     if controller.irc is not None:
         return irc(plant, controller.irc)
     if controller.hinf is not None:

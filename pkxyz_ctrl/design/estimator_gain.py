@@ -31,24 +31,27 @@ def process_noise(model: LinearStage, config: EstimatorConfig, period_s: float) 
     return van_loan_discretization(model.a, shaping, period_s)
 
 
-def sense_noise(stage: Stage, bus: BusConfig) -> float:
-    """Standard deviation in m of one stroke sample: white noise up to half the sampling rate, and quantisation."""
+def sense_noise(stage: Stage, bus: BusConfig) -> Array:
+    """Standard deviation (3,) in m of one sample of each stroke: white noise up to half the sampling rate, and
+    quantisation.
+    """
     sigma_f = stage.config.sense.noise_density_f_per_rthz * math.sqrt(0.5 / bus.period_s)
     step_f = bus.analog.sense_farad_per_count
-    return math.sqrt(sigma_f**2 + step_f**2 / 12) / stage.sense_gradient_f_per_m
+    return np.asarray(math.sqrt(sigma_f**2 + step_f**2 / 12) / stage.sense_gradient_f_per_m)
 
 
 def measurement_noise(stage: Stage, model: LinearStage, bus: BusConfig) -> Array:
-    """R (3,3) in m^2 in platform coordinates: J^-1 R_q J^-T."""
-    inverse = np.linalg.inv(model.jacobian)
-    return sense_noise(stage, bus) ** 2 * inverse @ inverse.T
+    """R (3,3) in m^2 in platform coordinates: J^-1 diag(sigma^2) J^-T."""
+    sigma_m = sense_noise(stage, bus)
+    inverse = np.linalg.inv(model.jacobian) * (sigma_m / sigma_m[0])
+    return sigma_m[0] ** 2 * inverse @ inverse.T
 
 
 def measurement_matrix(stage: Stage) -> Array:
     """H (3,9): a sample shows the position a sense delay ago, x - tau v."""
     h = np.zeros((3, 9))
     h[:, 0:3] = np.eye(3)
-    h[:, 3:6] = -stage.config.sense.delay_s * np.eye(3)
+    h[:, 3:6] = -stage.sense_delay_s * np.eye(3)
     return h
 
 

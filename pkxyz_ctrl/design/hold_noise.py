@@ -51,7 +51,7 @@ def rounding_force_n(stage: Stage, bus: BusConfig, model: LinearStage) -> Array:
 def _force_per_count(stage: Stage, bus: BusConfig, model: LinearStage) -> Array:
     """(3,3) in N: force at the platform for one more count on each comb, about the voltages that hold the point."""
     volts = stage.holding_voltages(model.position_m)
-    return model.jacobian.T * (2.0 * stage.force_gain_n_per_v2 * volts * bus.analog.drive_volt_per_count)
+    return stage.pulls(model.position_m).T * (2.0 * stage.force_gain_n_per_v2 * volts * bus.analog.drive_volt_per_count)
 
 
 def _stationary(a: Array, q: Array) -> Array:

@@ -91,7 +91,7 @@ def _fill_estimator(
     law["gain"] = kalman_gain(sampled, q, measurement_matrix(stage), r)
     law["stiffness_n_per_m"] = model.stiffness_n_per_m
     law["operating_point_m"] = model.position_m
-    law["sense_delay_s"] = stage.config.sense.delay_s
+    law["sense_delay_s"] = stage.sense_delay_s
     law["half_period_s"] = 0.5 * bus.period_s
 
 

@@ -80,14 +80,14 @@ def loop_plant(stage: Stage, bus: BusConfig, strokes_m: ArrayLike, perturbation:
     )
     damping = model.damping_n_s_per_m * math.sqrt((1.0 + perturbation.mass) * (1.0 + perturbation.stiffness))
     if perturbation.quality_factor is not None:
-        damping = damping * stage.config.dynamics.quality_factor / perturbation.quality_factor
-    rows = model.jacobian.T
+        damping = damping * stage.quality_factor / perturbation.quality_factor
+    rows = stage.pulls(model.position_m).T
     comb_error = rows @ np.diag(1.0 + np.array(perturbation.comb_gain)) @ np.linalg.inv(rows)
     phi, gamma = _sampled(stiffness, damping, mass, comb_error, _amplifier_s(stage), bus.period_s)
     a, b = _delayed(phi, gamma, bus.delay_periods)
     c = np.zeros((3, len(a)))
     c[:, 0:3] = np.eye(3)
-    c[:, 3:6] = -stage.config.sense.delay_s * np.eye(3)
+    c[:, 3:6] = -stage.sense_delay_s * np.eye(3)
     return LoopPlant(bus.period_s, a, b, c, strokes, stiffness)
 
 

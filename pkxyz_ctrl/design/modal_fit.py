@@ -53,6 +53,11 @@ class ModalFit:
     static_gain_deviation: Array
     acceleration_gain_deviation: Array
     """standard deviations, shapes as above"""
+    lag_s: float
+    """of the response beyond whole periods: amplifier and sense chain together, from all modes"""
+    lag_deviation_s: float
+    gains_covariance: Array
+    """(18, 18) of static and acceleration gain, row by row: both come from the same poles and residues"""
     chi_square: float
     """weighted residual's mean square, 1 where noise alone is left"""
     used_hz: tuple[float, float]
@@ -131,10 +136,11 @@ def fit_modes(
     spare = residual.size - 3 * unknowns - 2 * MODES
     chi_square = float((residual**2).sum() / spare)
     covariance = _covariance(modes, theta, columns, weight) * max(1.0, chi_square)
-    static, static_deviation = _propagated(_static_gain, modes, theta, covariance, period_s, delay_periods)
-    acceleration, acceleration_deviation = _propagated(
-        _acceleration_gain, modes, theta, covariance, period_s, delay_periods
-    )
+    values, values_covariance = _propagated(modes, theta, covariance, period_s, delay_periods)
+    static, acceleration = values[:18].reshape(2, 3, 3)
+    gains_covariance = values_covariance[:18, :18]
+    lag_s, lag_deviation_s = combined(values[18:], values_covariance[18:, 18:])
+    static_deviation, acceleration_deviation = np.sqrt(np.diag(gains_covariance)).reshape(2, 3, 3)
     deviation = np.sqrt(np.diag(covariance))
     hz, ratio = np.exp(modes[:MODES]), np.exp(modes[MODES:])
     if not (hz.min() > low and hz.max() < high):
@@ -151,6 +157,9 @@ def fit_modes(
         damping_deviation=ratio * deviation[MODES : 2 * MODES],
         static_gain_deviation=static_deviation,
         acceleration_gain_deviation=acceleration_deviation,
+        lag_s=lag_s,
+        lag_deviation_s=lag_deviation_s,
+        gains_covariance=gains_covariance,
         chi_square=chi_square,
         used_hz=(low, float(f.max())),
         _coefficients=_per_input(theta),
@@ -188,34 +197,46 @@ def _static_gain(modes: Array, theta: Array, period_s: float, delay_periods: int
     return np.asarray(np.einsum("b,bij->ij", basis, _per_input(theta)))
 
 
-def _acceleration_gain(modes: Array, theta: Array, period_s: float, delay_periods: int) -> Array:
-    """Sum of the modes' numerators, (3, 3), from their residues. The lag of amplifier and sense chain within a period
-    turns those of a mode by a common angle, which is taken back.
+def combined(values: Array, covariance: Array) -> tuple[float, float]:
+    """The one number that (n,) values with a covariance (n, n) say together, and its standard deviation."""
+    weight = np.linalg.solve(covariance, np.ones(len(values)))
+    return float(weight @ values / weight.sum()), float(weight.sum() ** -0.5)
+
+
+def _sudden(modes: Array, theta: Array, period_s: float, delay_periods: int) -> tuple[Array, Array]:
+    """Sum of the modes' numerators, (3, 3), from their residues, and the lag of amplifier and sense chain within a
+    period in s as each mode (3,) shows it: it turns a mode's numerators by a common angle, which is taken back.
     """
-    coefficients, total = _per_input(theta), np.zeros((3, 3))
+    coefficients, total, lags_s = _per_input(theta), np.zeros((3, 3)), np.zeros(MODES)
     for i in range(MODES):
         w, d = 2.0 * math.pi * math.exp(modes[i]), math.exp(modes[MODES + i])
         s = w * complex(-d, math.sqrt(1.0 - d * d))
         p = np.exp(s * period_s)
         residue = p ** (1 - delay_periods) * (coefficients[2 * i] + coefficients[2 * i + 1] / p) / (p - p.conjugate())
         numerator = residue * p**delay_periods * s / (p - 1.0) * (s - s.conjugate())
-        lag_s = max(0.0, -0.5 * float(np.angle((numerator**2).sum())) / s.imag)
-        total += (numerator * np.exp(s * lag_s)).real
-    return total
+        lags_s[i] = -0.5 * float(np.angle((numerator**2).sum())) / s.imag
+        total += (numerator * np.exp(s * max(0.0, lags_s[i]))).real
+    return total, lags_s
+
+
+def _values(modes: Array, theta: Array, period_s: float, delay_periods: int) -> Array:
+    """(21,): static and acceleration gain, row by row, and the modes' lags."""
+    acceleration, lags_s = _sudden(modes, theta, period_s, delay_periods)
+    static = _static_gain(modes, theta, period_s, delay_periods)
+    return np.concatenate([static.ravel(), acceleration.ravel(), lags_s])
 
 
 def _propagated(
-    of: Callable[[Array, Array, float, int], Array], modes: Array, theta: Array, covariance: Array, period_s: float,
-    delay_periods: int,
-) -> tuple[Array, Array]:  # fmt: skip
-    """A function (3, 3) of the fit and its standard deviation, by central differences."""
-    slopes = np.zeros((3, 3, len(covariance)))
+    modes: Array, theta: Array, covariance: Array, period_s: float, delay_periods: int
+) -> tuple[Array, Array]:
+    """``_values`` and their covariance, by central differences."""
+    slopes = np.zeros((18 + MODES, len(covariance)))
     for n in range(len(covariance)):
         step = np.zeros(len(covariance))
         linear = n - 2 * MODES
         step[n] = 1e-6 if linear < 0 else 1e-6 * max(1.0, float(np.abs(theta).max()))
         pair = [
-            of(
+            _values(
                 modes + sign * step[: 2 * MODES],
                 theta + sign * step[2 * MODES :].reshape(3, -1).T,
                 period_s,
@@ -223,9 +244,8 @@ def _propagated(
             )
             for sign in (1.0, -1.0)
         ]
-        slopes[:, :, n] = (pair[0] - pair[1]) / (2.0 * step[n])
-    variance = np.einsum("ijn,nm,ijm->ij", slopes, covariance, slopes)
-    return of(modes, theta, period_s, delay_periods), np.sqrt(variance)
+        slopes[:, n] = (pair[0] - pair[1]) / (2.0 * step[n])
+    return _values(modes, theta, period_s, delay_periods), slopes @ covariance @ slopes.T
 
 
 def _covariance(modes: Array, theta: Array, columns: Callable[[Array], Array], weight: Array) -> Array:

@@ -51,12 +51,11 @@ def linearise(stage: Stage, strokes_m: Array) -> LinearStage:
     C = sqrt(m) K(0)^(1/2) / Q, which damps a mode of angular frequency omega by m omega / Q.
     """
     position = stage.forward_kinematics(strokes_m)
-    dynamics = stage.config.dynamics
     root = scipy.linalg.sqrtm(stage.stiffness(np.zeros(3))).real
     return LinearStage(
         position_m=position,
-        mass_kg=dynamics.mass_kg,
-        damping_n_s_per_m=math.sqrt(dynamics.mass_kg) * root / dynamics.quality_factor,
+        mass_kg=stage.mass_kg,
+        damping_n_s_per_m=math.sqrt(stage.mass_kg) * root / stage.quality_factor,
         stiffness_n_per_m=stage.stiffness(position),
         jacobian=stage.jacobian(position),
     )

@@ -110,6 +110,7 @@ class Selection:
 def candidate(need: Requirements, template: StageConfig, crank_m: float, projection_m: float, name: str) -> StageConfig:
     """The stage of ``template``'s flexures and combs in the wafer of ``need``, with the crank and link given."""
     data = plain(template)
+    data.pop("calibration", None)  # of another device
     data["name"] = name
     data["geometry"] = {
         "base_radius_m": need.base_radius_m,
@@ -149,7 +150,7 @@ def margins(need: Requirements, template: StageConfig, crank_m: float, projectio
     rest = float(stage.geometry["elevation_rest_rad"][0])
     out[1] = frequency[0] / need.frequency_min_hz - 1
     out[2] = need.frequency_max_hz / frequency[2] - 1
-    out[3] = stage.force_max_n / float(stage.holding_forces(corners).max()) - 1
+    out[3] = float((stage.force_max_n / stage.holding_forces(corners).max(axis=0)).min()) - 1
     out[4] = linear_standing_cube_m(float(stage.jacobian(middle)[0, 2]), need.stroke_m) / need.cube_side_m - 1
     out[5] = crank_hinge_range_rad(stage.config.flexures) / float(np.abs(crank).max()) - 1
     out[6] = link_hinge_range_rad(stage.config.flexures) / float(np.abs(link - rest).max()) - 1

@@ -13,7 +13,6 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 from scipy.optimize import minimize
 
-from pkxyz_ctrl.mechanics.combs import voltage_for_force_v
 from pkxyz_ctrl.mechanics.errors import GeometryError
 from pkxyz_ctrl.stage import Stage, StageDomainError
 
@@ -92,8 +91,8 @@ def voltage_needed_v(stage: Stage, strokes_m: ArrayLike) -> Array:
     must push.
     """
     force = stage.holding_forces(stage.forward_kinematics(strokes_m))
-    voltage = voltage_for_force_v(stage.config.drive_comb, np.where(abs(force) < _PUSH_N, 0.0, force))
-    return np.asarray(voltage.max(axis=-1))
+    pull = np.where(abs(force) < _PUSH_N, 0.0, force)
+    return np.asarray(np.sqrt(np.where(pull >= 0, pull, np.nan) / stage.force_gain_n_per_v2).max(axis=-1))
 
 
 def held_volume(stage: Stage, voltage_max_v: float, cells: int = 32) -> Volume:
@@ -128,7 +127,7 @@ def _expansion(stage: Stage, strokes_m: Array) -> Array:
     return np.asarray(1 / np.linalg.det(stage.jacobian(stage.forward_kinematics(strokes_m))))
 
 
-def _held(stage: Stage, strokes_m: Array, force_max_n: float) -> NDArray[np.bool_]:
+def _held(stage: Stage, strokes_m: Array, force_max_n: Array) -> NDArray[np.bool_]:
     force = stage.holding_forces(stage.forward_kinematics(strokes_m))
     return np.asarray((force >= -_PUSH_N).all(axis=-1) & (force <= force_max_n).all(axis=-1))
 
@@ -158,7 +157,7 @@ def _composite_gauss(cells: int, low: float, high: float) -> tuple[Array, Array]
     return np.sort(np.concatenate([centres - offset, centres + offset])), np.full(2 * cells, width / 2)
 
 
-def _held_along(stage: Stage, apex: Array, rays: Array, force_max_n: float) -> Array:
+def _held_along(stage: Stage, apex: Array, rays: Array, force_max_n: Array) -> Array:
     """Integral of u^2 det(dx/dq) over the held u in (0, 1] along each ray apex + u d (n, 3): (n,)."""
     stations = np.linspace(0, 1, 17)
     held = np.stack([_held(stage, apex + u * rays, force_max_n) for u in stations], axis=1)

@@ -30,7 +30,7 @@ def check_against(stage: Stage, trajectory: Trajectory, drive: DriveLimits | Non
     """Raise ``TrajectoryError`` at the first sampled instant that the stage can't follow, naming the limit.
 
     Links close, strokes are in range, and the comb forces that hold, brake and accelerate the platform,
-    J^-T (grad V + C v + m a), are pulls within the voltage limit. With ``drive`` they are also within the controller's,
+    B^-T (grad V + C v + m a), are pulls within the voltage limit. With ``drive`` they are also within the controller's,
     and voltages change by no more than its slew limit from any instant to a period later; announced jumps are left out
     of that. Looked at every 100 us or closer, 40 times in a period of the highest frequency, and at the very end.
     """
@@ -78,12 +78,11 @@ def comb_forces(stage: Stage, rows: Array) -> Array:
 
     Damping is that of the stage file, modal about rest: C = sqrt(m) K(0)^(1/2) / Q.
     """
-    dynamics = stage.config.dynamics
     eigenvalue, mode = np.linalg.eigh(stage.stiffness(np.zeros(3)))
-    damping = math.sqrt(dynamics.mass_kg) / dynamics.quality_factor * (mode * np.sqrt(eigenvalue)) @ mode.T
+    damping = math.sqrt(stage.mass_kg) / stage.quality_factor * (mode * np.sqrt(eigenvalue)) @ mode.T
     position, velocity, acceleration = rows[:, 0:3], rows[:, 3:6], rows[:, 6:9]
-    demand = stage.energy_gradient(position) + velocity @ damping + dynamics.mass_kg * acceleration
-    return np.linalg.solve(np.swapaxes(stage.jacobian(position), -1, -2), demand[..., None])[..., 0]
+    demand = stage.energy_gradient(position) + velocity @ damping + stage.mass_kg * acceleration
+    return np.linalg.solve(np.swapaxes(stage.pulls(position), -1, -2), demand[..., None])[..., 0]
 
 
 def within_limits(stage: Stage, rows: Array, drive: DriveLimits) -> bool:
@@ -135,7 +134,7 @@ def _first_beyond(
     elif pull_n < 0:
         why = f"comb {comb + 1} would have to push with {-pull_n * 1e6:.4g} uN, and combs only pull"
     else:
-        voltage_v = float(np.sqrt(pull_n / stage.force_gain_n_per_v2))
+        voltage_v = float(np.sqrt(pull_n / stage.force_gain_n_per_v2[comb]))
         why = f"comb {comb + 1} would need {voltage_v:.1f} V, beyond the limit of {limit_v:g} V"
     return int(t_us[n]), rows[n, 0:3], why
 

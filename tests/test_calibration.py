@@ -1,0 +1,410 @@
+"""[calibration] of a stage file: found from a plant's response, written, read, and used wherever the model is."""
+
+import dataclasses
+import json
+from functools import cache
+
+import numpy as np
+import pytest
+import tomlkit
+from finite_differences import assert_derivative
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from loop_rig import MIDDLE, bus, controller, rows_of, stage
+from sim_truth import truth_about
+from typer.testing import CliRunner
+
+from hil.calibrated_stage import calibration_of, write_calibrated_stage
+from hil.cli import app
+from hil.identification import identify
+from hil.scenario import load_scenario
+from hil.setup import bare_setup
+from pkxyz_ctrl.calibration_config import Calibration
+from pkxyz_ctrl.config import CONFIG_DIR, ConfigError, load, plain
+from pkxyz_ctrl.core import tick
+from pkxyz_ctrl.design.calibrate import SenseGain, calibrate, gains
+from pkxyz_ctrl.design.law import design_law
+from pkxyz_ctrl.design.modal_fit import FitError, ModalFit
+from pkxyz_ctrl.stage import Stage, StageDomainError
+from pkxyz_ctrl.stage_config import StageConfig
+from pkxyz_ctrl.trajectory import Hold, Move, Trajectory, TrajectoryError
+from pkxyz_ctrl.trajectory.check import check_against, comb_forces
+from sim.config import Device, PlantConfig
+
+DRAWN = load("stages", "reconstructed", StageConfig)
+COUNT_F = bus().analog.sense_farad_per_count
+AS_DRAWN = SenseGain(np.ones(3), np.zeros(3))
+ODD = Calibration(
+    comb_gain=(1.08, 0.9, 1.05), lift=0.05, sense_gain=(1.02, 0.99, 1.0), slider_stiffness=(1.1, 0.92, 1.06),
+    crank_stiffness=(1.1, 1.05, 0.9), link_stiffness=1.08, quality_factor=12.0, sense_delay_s=8e-6,
+)  # fmt: skip
+
+
+def calibrated(numbers: Calibration) -> Stage:
+    return Stage(DRAWN.model_copy(update={"calibration": numbers}))
+
+
+def odd() -> Stage:
+    return calibrated(ODD)
+
+
+# -- the numbers, from a response -----------------------------------------------------------------------------------
+
+
+def plant_with(**effects):
+    """The software plant on a bench that has these effects and no other."""
+    on = {name: {"on": True, **values} for name, values in effects.items()}
+    config = PlantConfig.model_validate({"name": "odd", **on})
+    return dataclasses.replace(bare_setup("reconstructed", "nominal", controller(), bus(), 1), plant=config).new_plant()
+
+
+def measured(static, acceleration, relative=1e-6) -> ModalFit:
+    """As if the modal fit had found these gains."""
+    scale = relative * np.repeat([np.abs(static).max(), np.abs(acceleration).max()], 9)
+    spread = np.full(3, 1e-4)
+    return ModalFit(
+        frequency_hz=np.full(3, 600.0), frequency_deviation_hz=spread, damping=np.full(3, 0.025),
+        damping_deviation=spread, static_gain=static, static_gain_deviation=scale[:9].reshape(3, 3),
+        acceleration_gain=acceleration, acceleration_gain_deviation=scale[9:].reshape(3, 3),
+        gains_covariance=np.diag(scale**2), lag_s=5.3e-6, lag_deviation_s=1e-7, chi_square=1.0,
+        used_hz=(5.0, 1500.0), _coefficients=np.zeros(0), _period_s=200e-6, _delay_periods=1,
+    )  # fmt: skip
+
+
+few = st.floats(-0.1, 0.1)
+each = st.tuples(few, few, few).map(np.array)
+
+
+@settings(deadline=None, max_examples=25)
+@given(each, each, each, few, few, st.floats(-0.02, 0.06), each.map(lambda g: 0.1 * g))
+def test_the_plants_own_numbers_are_found(comb, leaf, crank, link, mass, lift, sense):
+    """From its equations, which share nothing with the fit; relative to its mass, with the sense gains known."""
+    crank = crank - crank.mean() + leaf.mean()
+    plant = plant_with(
+        comb_mismatch={"relative": comb.tolist()}, levitation={"ratio": max(lift, 0.0)},
+        stiffness_mismatch={"leaf": leaf.tolist(), "crank_hinge": crank.tolist(), "link_hinge": [link] * 3},
+        mass_error={"relative": mass}, sense_gain={"relative": sense.tolist(), "curvature_per_25um": 0.0},
+    )  # fmt: skip
+    squared_v2 = np.full(3, 130.0**2)
+    truth, strokes_m = truth_about(plant, squared_v2, 0.0), strokes_under(plant, squared_v2)
+    response = measured(truth.static_gain, truth.acceleration_gain)
+    found = calibrate(DRAWN, strokes_m, response, COUNT_F, SenseGain(1.0 + sense, np.full(3, 1e-6)))
+    numbers = found.calibration
+    assert np.array(numbers.comb_gain) == pytest.approx((1 + comb) / (1 + mass), rel=2e-4)
+    assert numbers.lift == pytest.approx(max(lift, 0.0), abs=2e-4)
+    assert np.array(numbers.slider_stiffness) == pytest.approx((1 + leaf) / (1 + mass), abs=2e-3)
+    assert np.array(numbers.crank_stiffness) == pytest.approx((1 + crank) / (1 + mass), abs=5e-4)
+    assert numbers.link_stiffness == pytest.approx((1 + link) / (1 + mass), abs=5e-4)
+    assert found.reciprocal.gain == pytest.approx(1 + sense, rel=5e-4)
+    assert not found.differ
+
+
+def strokes_under(plant, squared_v2):
+    """Where the plant rests."""
+    from sim.geometry import strokes
+    from sim.parameters import equilibrium
+
+    p, s = plant.params[0], plant.state[0].copy()
+    s["force_n"] = p["weight_n"]
+    q = np.empty(3)
+    strokes(p, np.concatenate([equilibrium(p, s, squared_v2), np.zeros(3)]), q)
+    return q
+
+
+@settings(deadline=None, max_examples=10)
+@given(st.integers(0, 2**32 - 1))
+def test_standard_errors_are_those_of_the_errors(seed):
+    """Noise of 0.1 % on what ODD would show: each number within 5 of its standard errors, none absurdly wide."""
+    rng = np.random.default_rng(seed)
+    clean = gains(odd(), MIDDLE, COUNT_F)
+    noisy = clean + 1e-3 * rng.normal(size=clean.shape) * np.abs(clean).max(axis=(1, 2), keepdims=True)
+    found = calibrate(DRAWN, MIDDLE, measured(*noisy, 1e-3), COUNT_F, SenseGain(np.array(ODD.sense_gain), np.zeros(3)))
+    numbers, errors = found.calibration, found.calibration.standard_error
+    common = np.mean(ODD.slider_stiffness) - np.mean(ODD.crank_stiffness)
+    assert abs(common) < 0.011  # the fit takes these means alike, so ODD is off by that
+    for name in ("comb_gain", "lift", "link_stiffness"):
+        off = np.abs(np.array(getattr(numbers, name)) - np.array(getattr(ODD, name)))
+        error = np.array(getattr(errors, name))
+        assert (off < 5 * error + abs(common)).all()
+        assert (error < 0.01).all()
+
+
+def test_a_sense_channel_that_is_off_is_noticed_from_inside():
+    """3 % of one chain's gain: what the combs do to one another's strokes would not be mutual."""
+    off = Calibration(sense_gain=(1.03, 1.0, 1.0))
+    response = measured(*gains(calibrated(off), MIDDLE, COUNT_F), 1e-3)
+    found = calibrate(DRAWN, MIDDLE, response, COUNT_F, AS_DRAWN)
+    assert found.differ
+    mean = 1.03 ** (1 / 3)
+    assert np.array(found.calibration.sense_gain) == pytest.approx(np.array(off.sense_gain) / mean, rel=1e-3)
+    assert np.prod(found.calibration.sense_gain) == pytest.approx(1.0, rel=1e-12)
+    known = SenseGain(np.ones(3), np.full(3, 1e-4))  # by an instrument: it keeps the last word
+    kept = calibrate(DRAWN, MIDDLE, response, COUNT_F, known)
+    assert kept.differ
+    assert kept.calibration.sense_gain == (1.0, 1.0, 1.0)
+
+
+def test_another_device_is_refused():
+    response = measured(*(20.0 * gains(Stage(DRAWN), MIDDLE, COUNT_F)))
+    with pytest.raises(FitError, match="not this drawing: comb_gain"):
+        calibrate(DRAWN, MIDDLE, response, COUNT_F, AS_DRAWN)
+
+
+# -- what uses them -------------------------------------------------------------------------------------------------
+
+
+def test_all_ones_is_no_calibration_bit_for_bit():
+    stage_as_drawn = calibrated(Calibration())
+    for name in ("lqg", "hinf"):
+        config = load("controllers", name, type(controller()))
+        laws = [design_law(s, config, bus(), autostart=True) for s in (Stage(DRAWN), stage_as_drawn)]
+        assert laws[0].tobytes() == laws[1].tobytes()
+
+
+def test_the_plant_does_not_read_it(tmp_path):
+    path = tmp_path / "stage.toml"
+    path.write_text(tomlkit.dumps(plain(odd().config)), encoding="utf-8")
+    assert load("stages", path, StageConfig).calibration == ODD
+    assert Device.load(path) == Device.load(CONFIG_DIR / "stages" / "reconstructed.toml")
+
+
+def test_each_comb_has_its_own_law():
+    device, volts = odd(), np.array([50.0, 120.0, 199.0])
+    force = device.comb_force(volts)
+    assert force / stage().comb_force(volts) == pytest.approx(np.array(ODD.comb_gain), rel=1e-14)
+    assert device.comb_voltage(force) == pytest.approx(volts, rel=1e-14)
+    assert device.comb_voltage(device.force_max_n) == pytest.approx(np.full(3, 200.0), rel=1e-15)
+    beyond = device.force_max_n * [1.0, 1.01, 1.0]
+    with pytest.raises(StageDomainError, match=r"needs 201\.0 V"):
+        device.comb_voltage(beyond)
+    for of_one in (device.comb_force, device.comb_voltage):
+        with pytest.raises(StageDomainError, match=r"must have shape \(\.\.\., 3\), as the combs differ"):
+            of_one(1e-6)
+
+
+def test_each_chain_has_its_own_sense_comb():
+    strokes_m = np.array([5e-6, 10e-6, 20e-6])
+    changed = odd().sense_capacitance(strokes_m) - odd().sense_capacitance(np.zeros(3))
+    assert changed / (stage().sense_gradient_f_per_m * strokes_m) == pytest.approx(np.array(ODD.sense_gain), rel=1e-12)
+    assert odd().strokes_from_capacitance(odd().sense_capacitance(strokes_m)) == pytest.approx(strokes_m, abs=5e-20)
+    assert odd().sense_capacitance(np.zeros(3)) == pytest.approx(stage().sense_capacitance(np.zeros(3)), rel=1e-15)
+
+
+@settings(deadline=None, max_examples=30)
+@given(st.tuples(st.floats(-8e-6, 8e-6), st.floats(-8e-6, 8e-6), st.floats(0.0, 30e-6)).map(np.array))
+def test_springs_of_each_chain_are_one_energy(position_m):
+    assert_derivative(odd().potential_energy, odd().energy_gradient, position_m, step=2e-6, rtol=1e-8, floor=1e-4)
+    assert_derivative(odd().energy_gradient, odd().stiffness, position_m, step=2e-6, rtol=1e-8)
+
+
+def test_holding_forces_hold_with_lift():
+    at = odd().forward_kinematics(MIDDLE)
+    force = odd().holding_forces(at)
+    up = np.array([0.0, 0.0, ODD.lift * force.sum()])
+    assert odd().jacobian(at).T @ force + up == pytest.approx(odd().energy_gradient(at), rel=1e-12)
+    assert odd().comb_force(odd().holding_voltages(at)) == pytest.approx(force, rel=1e-12)
+
+
+def test_a_tick_reads_strokes_and_sets_voltages_by_it():
+    law = design_law(odd(), controller(), bus(), autostart=True)["tick"][0]
+    memory = np.zeros(1, tick.MEMORY)[0]
+    at = odd().forward_kinematics(MIDDLE)
+    tick.set_position(law, memory, at)
+    farad = odd().sense_capacitance(MIDDLE)
+    analog = bus().analog
+    tick.measure(law, memory, np.round((farad - analog.sense_offset_f) / COUNT_F).astype(np.int32))
+    assert np.abs(memory["stroke_m"] - MIDDLE).max() < 0.6 * COUNT_F / odd().sense_gradient_f_per_m.min()
+    row = np.concatenate([at, np.zeros(6)])
+    for _ in range(400):  # slewing there
+        tick.estimate(law, memory, True)
+        tick.act(law, memory, row, row, row, row)
+        tick.set_position(law, memory, at)
+    volts = memory["count"][0] * analog.drive_volt_per_count
+    assert volts == pytest.approx(odd().holding_voltages(at), abs=2 * analog.drive_volt_per_count)
+    assert memory["slack_n"] == pytest.approx(np.zeros(3), abs=1e-9)
+
+
+def test_a_reference_is_checked_against_each_combs_own_limit():
+    """A comb at a quarter of its pull needs twice the voltage."""
+    weak = calibrated(Calibration(comb_gain=(1.0, 0.3, 1.0)))
+    top = weak.forward_kinematics(MIDDLE)
+    hold = Trajectory([
+        Move(kind="move", to_m=(0.0, 0.0, float(top[2])), velocity_max_m_per_s=1e-3, acceleration_max_m_per_s2=0.1,
+             jerk_max_m_per_s3=1e2),
+        Hold(kind="hold", duration_s=0.01),
+    ])  # fmt: skip
+    check_against(stage(), hold)
+    with pytest.raises(TrajectoryError, match="comb 2 would need 2"):
+        check_against(weak, hold)
+    row = np.concatenate([top, np.zeros(6)])[None]
+    assert comb_forces(odd(), row)[0] == pytest.approx(odd().holding_forces(top), rel=1e-12)
+
+
+@pytest.mark.parametrize(
+    ("keys", "words"),
+    [
+        ({"comb_gain": [1.0, 1.0]}, "calibration.comb_gain"),
+        ({"comb_gain": [1.0, 1.0, 0.0]}, "greater than 0.1"),
+        ({"gain": [1.0, 1.0, 1.0]}, "unknown key"),
+        ({"lift": 0.7}, "less than 0.5"),
+        ({"standard_error": {"lift": 0.1}}, "calibration.standard_error.comb_gain: missing"),
+    ],
+)
+def test_the_section_is_strict(tmp_path, keys, words):
+    path = tmp_path / "stage.toml"
+    path.write_text(tomlkit.dumps(plain(DRAWN) | {"calibration": keys}), encoding="utf-8")
+    with pytest.raises(ConfigError, match=words):
+        Stage.load(path)
+
+
+# -- identified, written, run ---------------------------------------------------------------------------------------
+
+HARSH = "harsh"
+
+
+def identified(stage_file="reconstructed", seed=1, plant=HARSH):
+    return identify(bare_setup(str(stage_file), plant, controller(), bus(), seed), MIDDLE, "fast")
+
+
+@cache
+def first():
+    return identified()
+
+
+@pytest.fixture(scope="module")
+def file(tmp_path_factory):
+    path = tmp_path_factory.mktemp("identified") / "stage.toml"
+    write_calibrated_stage(CONFIG_DIR / "stages" / "reconstructed.toml", first(), "bench", path)
+    return path
+
+
+@cache
+def scan_errors_nm(stage_file, plant):
+    """(n, 3) true position less reference on the raster."""
+    scenario = load_scenario(f"raster_{plant}", stage=stage_file)
+    (window,) = [s.scan_us for s in scenario.trajectory.segments if s.scan_us]
+    rows, result = rows_of(scenario.setup(), "fast")
+    assert not result.faults
+    t_us = rows["reference_tick"] * scenario.bus.period_us
+    scan = rows[(rows["reference_tick"] >= 0) & (t_us >= window[0]) & (t_us < window[1])]
+    return (scan["position_m"] - scan["reference_m"]) * 1e9
+
+
+def rms(values):
+    return np.sqrt((values**2).mean(axis=0))
+
+
+def test_the_harsh_plant_follows_six_times_better_save_an_offset(file):
+    """What moves about the mean falls to the plant's own noise; the mean is the sense chain's and the tilt's."""
+    before, after = scan_errors_nm("reconstructed", HARSH), scan_errors_nm(str(file), HARSH)
+    assert rms(before) == pytest.approx([19.3, 26.3, 29.9], rel=0.05)
+    assert rms(after) == pytest.approx([19.4, 23.0, 12.4], rel=0.05)
+    assert before.std(axis=0) == pytest.approx([5.0, 13.9, 27.4], rel=0.05)
+    assert after.std(axis=0) == pytest.approx([2.6, 2.7, 2.2], rel=0.1)
+    assert np.abs(after.mean(axis=0) - before.mean(axis=0)).max() < 1.0
+
+
+def test_a_second_run_from_the_file_finds_what_it_says(file):
+    """Gains of 1 relative to the file, and the same numbers, within their standard errors; another seed's noise."""
+    again = identified(file, seed=2)
+    product, deviation = again.chain_gain
+    numbers, errors = first().calibrated.calibration, first().calibrated.calibration.standard_error
+    here, here_errors = again.calibrated.calibration, again.calibrated.calibration.standard_error
+    assert product == pytest.approx(np.ones(3), abs=0.005)
+    assert (np.abs(product - 1.0) < 4.5 * np.hypot(deviation, np.array(errors.comb_gain))).all()
+    for name in ("comb_gain", "lift", "slider_stiffness", "crank_stiffness", "link_stiffness", "sense_delay_s"):
+        apart = np.array(getattr(here, name)) - np.array(getattr(numbers, name))
+        spread = np.hypot(np.array(getattr(here_errors, name)), np.array(getattr(errors, name)))
+        assert (np.abs(apart) < 4.5 * spread).all(), name
+    assert here.quality_factor == pytest.approx(numbers.quality_factor, rel=0.02)
+    assert again.drawn_hz == pytest.approx(again.modes.frequency_hz, rel=0.002)
+    origin = calibration_of(again, "bench_2").measured_by
+    assert origin.sense_scale == "drawing"
+    assert origin.stage == "reconstructed_calibrated"
+
+
+def test_the_file_is_the_one_it_began_with_and_says_where_each_number_comes_from(file):
+    text = file.read_text(encoding="utf-8")
+    config = load("stages", file, StageConfig)
+    assert config.calibration == calibration_of(first(), "bench")
+    as_it_was = {"name": DRAWN.name, "calibration": None}
+    assert config.model_copy(update=as_it_was) == DRAWN
+    assert "# r, paper IV.E" in text
+    data = tomlkit.parse(text)["calibration"]
+    origin = data["measured_by"]
+    assert (origin["run"], origin["seed"], origin["plant"]) == ("bench", 1, HARSH)
+    assert origin["sense_scale"] == "drawing"
+    assert "metres per count" in origin["not_known"]
+    for line in text.partition("[calibration]")[2].partition("[calibration.standard_error]")[0].splitlines():
+        if " = " in line:
+            assert f"bench, {origin['digest']}, seed 1" in line or "taken as drawn" in line
+
+
+def held_points(setup, points_m):
+    """What an ideal instrument sees: mean true positions (n, 3) while the controller holds points."""
+    segments = []
+    for point in points_m:
+        to = (float(point[0]), float(point[1]), float(point[2]))
+        segments.append(Move(kind="move", to_m=to, velocity_max_m_per_s=1e-3, acceleration_max_m_per_s2=0.1,
+                             jerk_max_m_per_s3=1e2))  # fmt: skip
+        segments.append(Hold(kind="hold", duration_s=0.1, settle_s=0.05))
+    trajectory = Trajectory(segments)
+    run = dataclasses.replace(setup, trajectory=trajectory, duration_s=trajectory.duration_us * 1e-6 + 0.3)
+    rows, _ = rows_of(run, "fast")
+    t_us = rows["reference_tick"] * run.bus.period_us
+    stills = [s.still_us for s in trajectory.segments if s.still_us]
+    return np.array([rows["position_m"][(t_us >= a) & (t_us < b)].mean(axis=0) for a, b in stills])
+
+
+POINTS_M = np.array([[0, 0, 10], [2, 0, 18], [-2, 1, 18], [0, -2, 24], [1, 1.5, 21], [0, 0, 19.25]]) * 1e-6
+
+
+@pytest.fixture(scope="module")
+def instrument(tmp_path_factory):
+    """CSV of an instrument with an origin of its own that watched the harsh plant."""
+    path = tmp_path_factory.mktemp("instrument") / "reference.csv"
+    seen = held_points(bare_setup("reconstructed", HARSH, controller(), bus(), 3), POINTS_M)
+    seen += np.array([3e-6, -7e-6, 1e-6])
+    head = "commanded_x_um,commanded_y_um,commanded_z_um,seen_x_um,seen_y_um,seen_z_um\n"
+    lines = [",".join(f"{v:.5f}" for v in row) for row in np.hstack([POINTS_M, seen]) * 1e6]
+    path.write_text(head + "\n".join(lines) + "\n", encoding="utf-8")
+    return path
+
+
+def test_with_an_instrument_the_metres_are_applied(instrument, tmp_path):
+    """The harsh plant's own sense gains, with what curvature and feedthrough add over these points."""
+    out = tmp_path / "seen"
+    done = CliRunner().invoke(
+        app, ["identify", "--plant", HARSH, "--reference", str(instrument), "--out", str(out), "--json"]
+    )
+    assert done.exit_code == 0, done.output
+    config = load("stages", out / "stage.toml", StageConfig)
+    origin = config.calibration.measured_by
+    assert (origin.sense_scale, origin.run) == ("instrument", "seen")
+    assert "metres" not in origin.not_known
+    true_gain = np.array([1.0010, 0.9992, 1.0006]) + 0.7e-3  # curvature: 1e-3 over 25 um
+    assert np.array(config.calibration.sense_gain) == pytest.approx(true_gain, abs=5e-4)
+    assert max(config.calibration.standard_error.sense_gain) < 2e-4
+    error = scan_errors_nm(str(out / "stage.toml"), HARSH)
+    assert error.mean(axis=0) == pytest.approx([-9.4, -13.7, 3.7], abs=1.0)
+    tilt_m = (
+        np.array([-15e-3, -20e-3, 0.0]) * 1.05 * DRAWN.dynamics.mass_kg * 9.80665 / stage().stiffness(np.zeros(3))[0, 0]
+    )
+    assert error.mean(axis=0)[:2] == pytest.approx(tilt_m[:2] * 1e9, abs=1.5)
+    assert rms(error) == pytest.approx([9.8, 13.9, 4.1], rel=0.1)
+
+
+def test_the_command_writes_a_stage_that_runs_at_once(tmp_path):
+    out = tmp_path / "found"
+    runner = CliRunner()
+    done = runner.invoke(app, ["identify", "--plant", "mild", "--out", str(out)])
+    assert done.exit_code == 0, done.output
+    assert "to run with it: pkxyz sil --stage" in done.output
+    path = out / "stage.toml"
+    ran = runner.invoke(
+        app, ["sil", "raster_mild", "--lane", "fast", "--stage", str(path), "--out", str(tmp_path / "run"), "--json"]
+    )
+    assert ran.exit_code == 0, ran.output
+    found = np.array(list(json.loads(ran.stdout)["rms_error_nm"].values()))
+    assert found == pytest.approx([2.36, 2.96, 2.41], rel=0.1)
+    assert found == pytest.approx(rms(scan_errors_nm(str(path), "mild")), rel=1e-9)
