@@ -1,16 +1,21 @@
-"""The predictive law's problem at one tick: what the stage would do by itself, what the combs and strokes still allow,
-and the plan that ignores limits; compiled.
+"""The predictive law's problem at one tick: where a plan leads, what the combs and strokes still allow beside it, and
+whether it keeps all limits; compiled.
 
-With e = [x - r, v - r'] at the start of interval k, nu = u + d (u: force beside the feed-forward, d: disturbance)::
+With e = [x - r, v - r'] at the start of interval k, and nu the force that the linear model is given::
 
     e+ = Phi e + Gamma nu + c,   minimise  sum e^T Q e + nu^T nu  + e_N^T P e_N
 
 c is where the reference jumps. P solves the regulator's Riccati equation, so the plan without limits begins with the
-regulator's own answer. The variables are comb forces v = B_0^-T nu (B_0: ``kinematics.pulls``) about those of the
-feed-forward, so that their limits are bounds; slew limits are linear about the forces of the last plan, strokes about
-the reference. Beyond the first interval the limits are predictions: what goes out is held to the exact ones by
-allocation and voltage.
+regulator's own answer. What the combs must give for nu is not linear::
+
+    B(x)^T F = grad V(x) + C r' + m r'' - K_0 (x - r) + nu - d
+
+taken in mid-interval, as the filter takes it; so the model is exact wherever the stage goes, and K_0 and B_0 at one
+point serve everywhere (B: ``kinematics.pulls``). The variables are comb forces v = B_0^-T nu. Limits of F and of
+strokes become limits of v about those that the last plan leads to; from tick to tick they become exact.
 """
+
+import math
 
 import numpy as np
 from numba import njit
@@ -18,12 +23,15 @@ from numpy.typing import NDArray
 
 from pkxyz_ctrl.core import feedback, kinematics
 from pkxyz_ctrl.core.elasticity import energy_gradient
-from pkxyz_ctrl.core.linear3 import inverse3, multiply3_transposed
+from pkxyz_ctrl.core.linear3 import inverse3, multiply3, multiply3_transposed
 
 Array = NDArray[np.float64]
 
 PREDICTIVE = np.dtype(
     [
+        ("cost_to_go", "f8", (6, 6)),  # P
+        ("closed", "f8", (6, 6)),  # Phi - Gamma K
+        ("answer", "f8", (3, 6)),  # (1 + Gamma^T P Gamma)^-1 Gamma^T
         ("position_weight", "f8"),  # of Q, (N/m)^2
         ("velocity_weight", "f8"),  # (N s/m)^2
         ("stroke_min_m", "f8"),
@@ -35,33 +43,23 @@ PREDICTIVE = np.dtype(
     align=True,
 )
 
-FREE, LIMITED = 1, 2
-"""Whether the plan without limits keeps them all, and so is the solution, or has to be solved for."""
+NO_PLAN, FREE, LIMITED = 0, 1, 2
+"""What there is: nothing; the plan without limits, which keeps them all and so is the solution; a problem to solve."""
 
 _JUMP_M = 2e-9  # smooth references miss their own polynomial by 0.1 nm where the jerk switches
 
 
 @njit(cache=True)
-def feedforwards(law: np.void, rows: Array, force_n: Array, comb_n: Array) -> None:
-    """Feed-forward at the platform (n,3) and at the combs (n,3) in each interval of the reference rows (n+1, 9)."""
-    gains, row = law["feedback"], np.empty(9)
-    pulls, inverse = np.empty((3, 3)), np.empty((3, 3))
-    for k in range(len(rows) - 1):
-        feedback.ahead(gains, rows[k], rows[k + 1], row)
-        energy_gradient(law["geometry"], law["elasticity"], row[0:3], force_n[k])
-        feedback.add_motion(gains, row, force_n[k])
-        kinematics.pulls(law["geometry"], row[0:3], pulls)
-        inverse3(pulls, inverse)
-        multiply3_transposed(inverse, force_n[k], comb_n[k])
-
-
-@njit(cache=True)
-def deviation(law: np.void, memory: np.void, rows: Array, force_n: Array, error: Array) -> None:
+def deviation(law: np.void, memory: np.void, rows: Array, error: Array) -> None:
     """e (6,) at the start of the first interval, as the state feedback sees it."""
-    target, last = np.empty(9), force_n[0].copy()
+    gains, row, target, force = law["feedback"], np.empty(9), np.empty(9), np.empty(3)
+    feedback.ahead(gains, rows[0], rows[1], row)
+    energy_gradient(law["geometry"], law["elasticity"], row[0:3], force)
+    feedback.add_motion(gains, row, force)
+    last = force.copy()
     if memory["feedforward_known"] != 0:
         last[:] = memory["feedforward_n"]
-    feedback.sampled_target(law["feedback"], rows[0], force_n[0], last, target)
+    feedback.sampled_target(gains, rows[0], force, last, target)
     ahead, origin = memory["estimate"]["ahead"], law["estimator"]["operating_point_m"]
     for i in range(3):
         error[i] = origin[i] + ahead[i] - target[i]
@@ -82,56 +80,181 @@ def jumps(period_s: float, rows: Array, jump_m: Array) -> bool:
 
 
 @njit(cache=True)
-def comb_bounds(drive: np.void, count: Array, comb_n: Array, offset_n: Array, lower: Array, upper: Array) -> None:
+def free_plan(law: np.void, error: Array, jump_m: Array, jumps: bool, e: Array, nu_n: Array) -> None:
+    """The plan nu (n,3) that knows no limits, and where it leads from the deviation ``error`` (6,): e (n+1, 6).
+
+    nu_k = -K e_k - B (P c_k + h_k+1), where h carries later jumps back: h_k = (Phi - Gamma K)^T (P c_k + h_k+1).
+    """
+    numbers, gains, after, seen = law["predictive"], law["feedback"], np.zeros(6), np.empty(6)
+    nu_n[:] = 0.0
+    if jumps:
+        for k in range(len(nu_n) - 1, -1, -1):
+            for i in range(6):
+                seen[i] = after[i]
+                for j in range(3):
+                    seen[i] += numbers["cost_to_go"][i, j] * jump_m[k, j]
+            for i in range(3):
+                for j in range(6):
+                    nu_n[k, i] -= numbers["answer"][i, j] * seen[j]
+            for i in range(6):
+                after[i] = 0.0
+                for j in range(6):
+                    after[i] += numbers["closed"][j, i] * seen[j]
+    e[0] = error
+    for k in range(len(nu_n)):
+        for i in range(3):
+            for j in range(3):
+                nu_n[k, i] -= gains["position_gain_n_per_m"][i, j] * e[k, j]
+                nu_n[k, i] -= gains["velocity_gain_n_s_per_m"][i, j] * e[k, 3 + j]
+        _step(law["estimator"], e[k], nu_n[k], jump_m[k], e[k + 1])
+
+
+@njit(cache=True)
+def predict(law: np.void, error: Array, jump_m: Array, nu_n: Array, e: Array) -> None:
+    """Where a plan nu (n,3) leads from the deviation ``error`` (6,): e (n+1, 6)."""
+    e[0] = error
+    for k in range(len(nu_n)):
+        _step(law["estimator"], e[k], nu_n[k], jump_m[k], e[k + 1])
+
+
+@njit(cache=True)
+def _step(estimator: np.void, e: Array, nu_n: Array, jump_m: Array, out: Array) -> None:
+    phi, gamma = estimator["transition"], estimator["input"]
+    for i in range(6):
+        total = jump_m[i] if i < 3 else 0.0
+        for j in range(6):
+            total += phi[i, j] * e[j]
+        for j in range(3):
+            total += gamma[i, j] * nu_n[j]
+        out[i] = total
+
+
+@njit(cache=True)
+def slope(law: np.void, pulls0: Array, e: Array, out: Array) -> None:
+    """Half the derivative (3n,) of the cost by v at v = 0, from where that leads: e (n+1, 6). Backwards, as adjoints
+    go.
+    """
+    numbers, phi, gamma = law["predictive"], law["estimator"]["transition"], law["estimator"]["input"]
+    adjoint, before, by_nu = np.empty(6), np.empty(6), np.empty(3)
+    n = len(e) - 1
+    for i in range(6):
+        adjoint[i] = 0.0
+        for j in range(6):
+            adjoint[i] += numbers["cost_to_go"][i, j] * e[n, j]
+    for k in range(n - 1, -1, -1):
+        for i in range(3):
+            by_nu[i] = 0.0
+            for j in range(6):
+                by_nu[i] += gamma[j, i] * adjoint[j]
+        multiply3(pulls0, by_nu, out[3 * k : 3 * k + 3])
+        for i in range(6):
+            before[i] = (numbers["position_weight"] if i < 3 else numbers["velocity_weight"]) * e[k, i]
+            for j in range(6):
+                before[i] += phi[j, i] * adjoint[j]
+        adjoint[:] = before
+
+
+@njit(cache=True)
+def comb_forces(
+    law: np.void, now: Array, after: Array, e: Array, nu_n: Array, disturbance_n: Array, comb_n: Array
+) -> bool:
+    """F (3,) that gives nu (3,) in the interval between two rows (9,) of the reference, from deviation e (6,) at its
+    start. False where the links do not reach.
+    """
+    gains, filter_ = law["feedback"], law["estimator"]
+    row, middle, force = np.empty(9), np.empty(3), np.empty(3)
+    pulls, inverse, off = np.empty((3, 3)), np.empty((3, 3)), np.empty(3)
+    feedback.ahead(gains, now, after, row)
+    for i in range(3):
+        off[i] = e[i] + filter_["half_period_s"] * e[3 + i]
+        middle[i] = row[i] + off[i]
+    if kinematics.in_domain(law["geometry"], middle) != 0:
+        return False
+    energy_gradient(law["geometry"], law["elasticity"], middle, force)
+    feedback.add_motion(gains, row, force)
+    for i in range(3):
+        force[i] += nu_n[i] - disturbance_n[i]
+        for k in range(3):
+            force[i] -= filter_["stiffness_n_per_m"][i, k] * off[k]
+    kinematics.pulls(law["geometry"], middle, pulls)
+    inverse3(pulls, inverse)
+    multiply3_transposed(inverse, force, comb_n)
+    return True
+
+
+@njit(cache=True)
+def forces_and_strokes(
+    law: np.void, rows: Array, e: Array, nu_n: Array, disturbance_n: Array, comb_n: Array, stroke_m: Array
+) -> bool:
+    """Comb forces (n,3) that a plan nu (n,3) takes along rows (n+1, 9), with its e (n+1, 6), and strokes (n,3) at the
+    ends of the intervals. False where the links do not reach.
+    """
+    position = np.empty(3)
+    for k in range(len(nu_n)):
+        if not comb_forces(law, rows[k], rows[k + 1], e[k], nu_n[k], disturbance_n, comb_n[k]):
+            return False
+        for i in range(3):
+            position[i] = rows[k + 1, i] + e[k + 1, i]
+        if kinematics.in_domain(law["geometry"], position) != 0:
+            return False
+        kinematics.strokes(law["geometry"], position, stroke_m[k])
+    return True
+
+
+@njit(cache=True)
+def stroke_limits(law: np.void, rows: Array, lower_m: Array, upper_m: Array) -> None:
+    """Limits (n, 3) of those strokes, where a reference that is beyond them has its own."""
+    asked = np.empty(3)
+    low, high = law["predictive"]["stroke_min_m"], law["predictive"]["stroke_max_m"]
+    for m in range(len(lower_m)):
+        kinematics.strokes(law["geometry"], rows[m + 1, 0:3], asked)
+        for i in range(3):
+            lower_m[m, i] = min(low, asked[i])
+            upper_m[m, i] = max(high, asked[i])
+
+
+@njit(cache=True)
+def is_inside(drive: np.void, count: Array, comb_n: Array, stroke_m: Array, lower_m: Array, upper_m: Array) -> bool:
+    """Whether comb forces (n,3) after the last counts (3,) keep voltage and slew, and strokes (n,3) their limits."""
+    gain, most = drive["force_gain_n_per_v2"], drive["volt_per_count"] * drive["count_max"]
+    step = drive["volt_per_count"] * drive["count_slew_max"]
+    for i in range(3):
+        before = drive["volt_per_count"] * count[i]
+        for k in range(len(comb_n)):
+            if not 0.0 <= comb_n[k, i] <= gain[i] * most * most:
+                return False
+            volt = math.sqrt(comb_n[k, i] / gain[i])
+            if abs(volt - before) > step:
+                return False
+            before = volt
+        for m in range(len(stroke_m)):
+            if not lower_m[m, i] <= stroke_m[m, i] <= upper_m[m, i]:
+                return False
+    return True
+
+
+@njit(cache=True)
+def comb_bounds(drive: np.void, count: Array, about_n: Array, lower: Array, upper: Array) -> None:
     """Bounds (3n,) of v from what the voltages can be after 1, 2, ... periods of slewing from the last counts (3,);
-    ``offset_n`` (3,) = B_0^-T d.
+    ``about_n`` (n,3): comb forces less v, as a plan has them.
     """
     gain, scale = drive["force_gain_n_per_v2"], drive["volt_per_count"]
-    for k in range(len(comb_n)):
+    for k in range(len(about_n)):
         slew = (k + 1) * drive["count_slew_max"]
         for i in range(3):
             low, high = scale * max(0, count[i] - slew), scale * min(drive["count_max"], count[i] + slew)
-            lower[3 * k + i] = gain[i] * low * low - comb_n[k, i] + offset_n[i]
-            upper[3 * k + i] = gain[i] * high * high - comb_n[k, i] + offset_n[i]
+            lower[3 * k + i] = gain[i] * low * low - about_n[k, i]
+            upper[3 * k + i] = gain[i] * high * high - about_n[k, i]
 
 
 @njit(cache=True)
-def slew_bounds(drive: np.void, comb_n: Array, planned_n: Array, lower: Array, upper: Array) -> None:
-    """Bounds (3n-3,) of v_k - v_(k-1) from the slew limit, about the comb forces (n,3) planned at the last tick."""
+def slew_bounds(drive: np.void, about_n: Array, comb_n: Array, lower: Array, upper: Array) -> None:
+    """Bounds (3n-3,) of v_k - v_(k-1) from the slew limit, about comb forces (n,3) that were planned."""
     gain = drive["force_gain_n_per_v2"]
     step_v = drive["volt_per_count"] * drive["count_slew_max"]
-    for k in range(1, len(comb_n)):
+    for k in range(1, len(about_n)):
         for i in range(3):
-            volt = np.sqrt(max(planned_n[k, i], 0.0) / gain[i])  # planned for k then is k - 1 now
-            change = comb_n[k, i] - comb_n[k - 1, i]
+            volt = math.sqrt(max(comb_n[k - 1, i], 0.0) / gain[i])
+            change = about_n[k, i] - about_n[k - 1, i]
             lower[3 * k - 3 + i] = -gain[i] * step_v * max(2.0 * volt - step_v, step_v) - change
             upper[3 * k - 3 + i] = gain[i] * step_v * (2.0 * volt + step_v) - change
-
-
-@njit(cache=True)
-def stroke_bounds(law: np.void, rows: Array, free_m: Array, lower: Array, upper: Array) -> None:
-    """Bounds (3m,) in m of the strokes that v adds, for the rows (m, 9) at the ends of as many intervals and the
-    strokes (3m,) about them that come by themselves.
-    """
-    stroke = np.empty(3)
-    low, high = law["predictive"]["stroke_min_m"], law["predictive"]["stroke_max_m"]
-    for k in range(len(rows)):
-        kinematics.strokes(law["geometry"], rows[k, 0:3], stroke)
-        for i in range(3):
-            lower[3 * k + i] = min(low - stroke[i], 0.0) - free_m[3 * k + i]  # a reference may go to a limit
-            upper[3 * k + i] = max(high - stroke[i], 0.0) - free_m[3 * k + i]
-
-
-@njit(cache=True)
-def is_inside(lower: Array, upper: Array, slewed: Array, stroked: Array, v: Array, n: int) -> bool:
-    """Whether a plan v (3n,) keeps bounds, slew and strokes; the latter's values as ``slewed`` (3n-3,) and ``stroked``
-    (3m,).
-    """
-    inside = True
-    for i in range(3 * n):
-        inside = inside and lower[i] <= v[i] <= upper[i]
-    for i in range(len(stroked)):
-        inside = inside and lower[6 * n - 3 + i] <= stroked[i] <= upper[6 * n - 3 + i]
-    for i in range(3 * n - 3):
-        inside = inside and lower[3 * n + i] <= slewed[i] <= upper[3 * n + i]
-    return inside

@@ -16,7 +16,7 @@ from pkxyz_ctrl.design.discrete_law import LawError
 from pkxyz_ctrl.design.estimator_gain import kalman_gain, measurement_matrix, measurement_noise, process_noise
 from pkxyz_ctrl.design.loop_plant import loop_plant
 from pkxyz_ctrl.design.plant_model import LinearStage, SampledStage, linearise, sample
-from pkxyz_ctrl.design.regulator import regulator_gain
+from pkxyz_ctrl.design.regulator import cost_to_go, regulator_gain
 from pkxyz_ctrl.drive_limits import count_max, slew_counts
 from pkxyz_ctrl.law_config import Mpc
 from pkxyz_ctrl.stage import Stage
@@ -44,7 +44,7 @@ def design_law(stage: Stage, controller: ControllerConfig, bus: BusConfig, *, au
         law["tick"]["kind"] = LINEAR
         _fill_linear(law["tick"]["linear"], stage, controller, bus)
     if controller.mpc is not None:
-        _fill_predictive(law["tick"]["predictive"], controller.mpc, controller.regulator)
+        _fill_predictive(law["tick"], controller.mpc, controller.regulator)
     law["tick"]["delay_periods"] = bus.delay_periods
     law["period_us"] = bus.period_us
     law["homing_ticks"] = max(1, round(controller.homing_s / bus.period_s))
@@ -117,9 +117,15 @@ def _fill_linear(record: Any, stage: Stage, controller: ControllerConfig, bus: B
     record["d"], record["unwind"][:, :n], record["order"] = law.d, unwind, n
 
 
-def _fill_predictive(record: Any, mpc: Mpc, regulator: RegulatorConfig) -> None:
-    record["position_weight"] = (regulator.force_n / regulator.position_error_m) ** 2
-    record["velocity_weight"] = (regulator.force_n / regulator.velocity_error_m_per_s) ** 2
+def _fill_predictive(law: Any, mpc: Mpc, regulator: RegulatorConfig) -> None:
+    record, filter_, feedback = law["predictive"], law["estimator"][0], law["feedback"][0]
+    position_weight = (regulator.force_n / regulator.position_error_m) ** 2
+    velocity_weight = (regulator.force_n / regulator.velocity_error_m_per_s) ** 2
+    gain = np.hstack([feedback["position_gain_n_per_m"], feedback["velocity_gain_n_s_per_m"]])
+    record["position_weight"], record["velocity_weight"] = position_weight, velocity_weight
+    record["cost_to_go"], record["closed"], record["answer"] = cost_to_go(
+        filter_["transition"][:, :6], filter_["input"], gain, position_weight, velocity_weight
+    )
     for name, value in mpc.model_dump().items():
         record[name] = value
 

@@ -2,6 +2,7 @@
 
 import control
 import numpy as np
+import scipy.linalg
 from numpy.typing import NDArray
 
 from pkxyz_ctrl.controller_config import RegulatorConfig
@@ -37,3 +38,18 @@ def regulator_gain(sampled: SampledStage, config: RegulatorConfig) -> tuple[Arra
         )
     physical = gain * config.force_n / scale[None, :]
     return physical[:, :3], physical[:, 3:]
+
+
+def cost_to_go(
+    phi: Array, gamma: Array, gain: Array, position_weight: float, velocity_weight: float
+) -> tuple[Array, Array, Array]:
+    """P (6,6) of e^T P e, what the regulator w = -K e costs from a state e on for weights of position and velocity and
+    a unit weight of force; Phi - Gamma K; and (1 + Gamma^T P Gamma)^-1 Gamma^T, which is K's counterpart for what is
+    added to e at the end of the period.
+    """
+    closed = phi - gamma @ gain
+    scale = np.repeat([position_weight, velocity_weight], 3) ** -0.5  # the unit state costs 1
+    a, k = closed * scale[None, :] / scale[:, None], gain * scale[None, :]
+    unit = scipy.linalg.solve_discrete_lyapunov(a.T, np.eye(6) + k.T @ k)
+    cost = (unit + unit.T) / 2.0 / np.outer(scale, scale)
+    return cost, closed, np.linalg.solve(np.eye(3) + gamma.T @ cost @ gamma, gamma.T)
