@@ -102,7 +102,9 @@ def sil(
     refresh: run_cli.Refresh = None,
     as_json: Annotated[bool, typer.Option("--json", help="Print the summary as JSON, and nothing else.")] = False,
 ) -> None:
-    """Close the loop on a scenario; exit code 0 if its checks hold, 1 if not, 2 for bad input, 130 if interrupted."""
+    """Close the loop on a scenario; exit code 0 if its checks hold, 1 if not, 2 for bad input or a full disk, 130 if
+    interrupted.
+    """
     _say_if_compiling(quiet=as_json)
     from hil.faults.fault import parse
     from hil.scenario import load_scenario
@@ -123,7 +125,9 @@ def sil(
     try:
         summary = _run_with_progress(folder, loaded, lane.value, quiet=as_json)
         draw(folder, summary)
-    except (RecordingError, StartUpError, DesignError) as error:
+    except RecordingError as error:
+        raise ConfigError(str(error)) from None
+    except (StartUpError, DesignError) as error:
         print(f"pkxyz: {error}", file=sys.stderr)
         raise typer.Exit(1) from None
     if as_json:

@@ -60,8 +60,11 @@ def faults(
     if out is not None:
         from hil.faults.picture import draw
 
-        (out / "faults.json").write_text(json.dumps(result, indent=1) + "\n", encoding="utf-8")
-        draw(outcomes, cases, out / "faults.png")
+        try:
+            (out / "faults.json").write_text(json.dumps(result, indent=1) + "\n", encoding="utf-8")
+            draw(outcomes, cases, out / "faults.png")
+        except OSError as error:
+            raise ConfigError(f"--out: {out}: {(error.strerror or str(error)).lower()}; give another folder") from None
     if as_json:
         print(json.dumps(result))
     else:

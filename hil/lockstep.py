@@ -119,7 +119,7 @@ class LockstepRig:
             clock: Clock = self.clock
             taking: Callable[[int], object] = record
             if injection is not None:
-                clock, taking = injection.arm(), injection.clearing(record)
+                clock, taking = injection.arm(), injection.clearing(record, reference.begin_anew)
             if not self.controller.can.driver.protection:
                 clock = _Draining(clock, self._endpoint, self.controller)
             with _seldom_collected():
@@ -184,6 +184,10 @@ class _Reference:
             self._next += self._blocks.next_count(self._memory)
             self._rows = self._blocks.reference(self._memory)
         return self._rows
+
+    def begin_anew(self, tick: int) -> None:
+        """The trajectory starts over after ``tick``: the block ends here, since its rows do not reach back so far."""
+        self._next = tick + 1
 
 
 def _exchange_in_blocks(rig: LockstepRig, blocks: Blocks) -> tuple[_Reference, _Recorder]:

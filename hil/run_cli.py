@@ -10,7 +10,12 @@ import typer
 from pkxyz_ctrl.config import ConfigError
 
 Scenario = Annotated[str, typer.Argument(help="A shipped scenario's name or a TOML file.")]
-Bus = Annotated[str, typer.Option(help="Name or file of the bus to meet on.")]
+Bus = Annotated[
+    str | None,
+    typer.Option(
+        help="Name or file of the bus to meet on, instead of the scenario's. Where that is simulated: unix_2k."
+    ),
+]
 Json = Annotated[bool, typer.Option("--json", help="Print JSON, and nothing else.")]
 Learn = Annotated[bool, typer.Option("--learn", help="Learn what errs alike in every period of the scan.")]
 Replay = Annotated[
@@ -24,7 +29,7 @@ _DEFAULT_BUS = "unix_2k"
 
 def run(
     scenario: Scenario = "raster",
-    bus: Bus = _DEFAULT_BUS,
+    bus: Bus = None,
     out: Annotated[Path | None, typer.Option(help="Folder to write; default: runs/<scenario>-wall-<n>.")] = None,
     stage: Annotated[str | None, typer.Option(help="Name or file, instead of the scenario's.")] = None,
     controller: Annotated[str | None, typer.Option(help="Name or file, instead of the scenario's.")] = None,
@@ -34,7 +39,8 @@ def run(
     refresh: Refresh = None,
     as_json: Json = False,
 ) -> None:
-    """Control an amplifier at rate; exit code 0 if the checks hold, 1 if not, 2 for bad input, 128 + signal if ended.
+    """Control an amplifier at rate; exit code 0 if the checks hold, 1 if not, 2 for bad input or a full disk, 128 +
+    signal if ended.
 
     Ctrl-C, SIGTERM and errors leave the combs at 0 V. Errors of position are those of the estimate.
     """
@@ -53,12 +59,15 @@ def run(
         if summary["ticks"]:
             from hil.wall_figure import draw_wall
 
-            draw_wall(folder.recording, summary, result.lateness_us, folder.picture)
-            if summary.get("learning_factor") is not None:
-                from hil.learning_figure import draw_learning
+            with folder.in_one_line():
+                draw_wall(folder.recording, summary, result.lateness_us, folder.picture)
+                if summary.get("learning_factor") is not None:
+                    from hil.learning_figure import draw_learning
 
-                draw_learning(folder.recording, summary, folder.learning_picture)
-    except (RecordingError, StartUpError, DesignError) as error:
+                    draw_learning(folder.recording, summary, folder.learning_picture)
+    except RecordingError as error:
+        raise ConfigError(str(error)) from None
+    except (StartUpError, DesignError) as error:
         print(f"pkxyz: {error}", file=sys.stderr)
         raise typer.Exit(1) from None
     if as_json:
@@ -70,7 +79,7 @@ def run(
 
 def plant(
     scenario: Annotated[str, typer.Argument(help="The scenario whose stage, plant and seed to serve.")] = "raster",
-    bus: Bus = _DEFAULT_BUS,
+    bus: Bus = None,
     plant_config: Annotated[
         str | None, typer.Option("--plant", help="Name or file, instead of the scenario's.")
     ] = None,
@@ -83,13 +92,12 @@ def plant(
 ) -> None:
     """Serve amplifier node and plant on a bus until Ctrl-C or SIGTERM."""
     from hil.ending import Ended, Ending
-    from hil.scenario import load_scenario
     from hil.wall import require_real_bus
     from hil.wall_plant import WallPlant, WitnessedPlant
     from pkxyz_ctrl.io.can_port import open_bus
     from pkxyz_ctrl.io.realtime import go_real_time, settle_memory
 
-    loaded = load_scenario(scenario, seed=seed, stage=stage, plant=plant_config, bus=bus)
+    loaded = _met(scenario, seed=seed, stage=stage, plant=plant_config, bus=bus)
     can_config = require_real_bus(loaded.bus)
 
     def show(t_s: float, state: str, driven: bool) -> None:
@@ -123,12 +131,22 @@ def learning_of(learn: bool, replay: str | None, refresh: str | None) -> dict[st
     return asked[0] if asked else None
 
 
-def _load(scenario: str, duration_s: float | None, **instead: Any) -> Any:
-    import dataclasses
-
+def _met(scenario: str, **instead: Any) -> Any:
+    """The scenario on the bus that was given, else on its own, unless that is simulated and ends with its process."""
     from hil.scenario import load_scenario
 
     loaded = load_scenario(scenario, **instead)
+    can_config = loaded.bus.can
+    if instead["bus"] is not None or (can_config is not None and can_config.interface != "pkxyz-sim"):
+        return loaded
+    _tell(f"the scenario's bus, {loaded.bus.name}, is simulated; meeting on {_DEFAULT_BUS}, as without --bus")
+    return load_scenario(scenario, **instead | {"bus": _DEFAULT_BUS})
+
+
+def _load(scenario: str, duration_s: float | None, **instead: Any) -> Any:
+    import dataclasses
+
+    loaded = _met(scenario, **instead)
     if duration_s is None:
         return loaded
     if not 0 < duration_s <= 36_000:

@@ -3,6 +3,8 @@
 import json
 import re
 import shutil
+from collections.abc import Iterator
+from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
@@ -69,8 +71,22 @@ class RunFolder:
         return resolved
 
     def write_summary(self, summary: dict[str, Any]) -> None:
-        """Write the summary."""
-        self.summary.write_text(json.dumps(summary, indent=2, allow_nan=False) + "\n", encoding="utf-8")
+        """Write the summary. Raises ``ConfigError``."""
+        with self.in_one_line():
+            self.summary.write_text(json.dumps(summary, indent=2, allow_nan=False) + "\n", encoding="utf-8")
+
+    @contextmanager
+    def in_one_line(self) -> Iterator[None]:
+        """Raise ``ConfigError`` for what the disk refuses inside, which says what is left."""
+        try:
+            yield
+        except OSError as error:
+            reason = (error.strerror or str(error)).lower()
+            where = self.path / Path(error.filename).name if isinstance(error.filename, str) else self.path
+            raise ConfigError(
+                f"{where}: cannot be written: {reason}; what was recorded before is kept there and opens as ever; make "
+                "room, or give another --out"
+            ) from None
 
 
 def next_free(runs: Path, scenario: str, lane: str) -> Path:

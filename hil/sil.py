@@ -21,7 +21,7 @@ def run_into(
     """Run ``scenario`` in ``lane`` and leave everything in ``folder``; returns the summary.
 
     Interrupted by the keyboard, it keeps what was recorded and says so in the summary. Raises ``ConfigError`` for a
-    bus that the lane can't use and ``RecordingError`` when the disk fails.
+    bus that the lane can't use, and it or ``RecordingError`` when the disk fails.
     """
     require_bus(scenario, lane)
     resolved = folder.write_config(scenario)
@@ -39,7 +39,8 @@ def run_into(
 
         try:
             setup = scenario.setup()
-            result = lanes.run(setup, lane, on_block=on_block, on_progress=on_progress, frame_log=folder.frames)
+            with folder.in_one_line():
+                result = lanes.run(setup, lane, on_block=on_block, on_progress=on_progress, frame_log=folder.frames)
         except KeyboardInterrupt:
             interrupted = True
     figures = metrics.figures()
@@ -74,8 +75,9 @@ def draw(folder: RunFolder, summary: dict[str, Any]) -> None:
         return
     from hil.report import draw_report  # matplotlib takes as long to import as a run takes
 
-    draw_report(folder.recording, folder.frames, summary, folder.picture)
-    if summary.get("learning_factor") is not None:
-        from hil.learning_figure import draw_learning
+    with folder.in_one_line():
+        draw_report(folder.recording, folder.frames, summary, folder.picture)
+        if summary.get("learning_factor") is not None:
+            from hil.learning_figure import draw_learning
 
-        draw_learning(folder.recording, summary, folder.learning_picture)
+            draw_learning(folder.recording, summary, folder.learning_picture)

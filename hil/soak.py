@@ -57,6 +57,12 @@ class Soaked:
     """fingers snapped or the mechanism broken"""
     memory_mb: list[float] = field(default_factory=list)
     """resident, after each recording"""
+    minutes_each: float = 0.0
+    """stage time of a recording; the last one may be shorter"""
+    faults_each: list[int] = field(default_factory=list)
+    """faults that began in each recording, and likewise:"""
+    decisions_each: list[int] = field(default_factory=list)
+    returns_each: list[int] = field(default_factory=list)
     realtime_factor: float = 0.0
     problems: list[str] = field(default_factory=list)
 
@@ -96,6 +102,7 @@ def soak(
     )
     rig = LockstepRig(setup)
     soaked = Soaked(seed, law, setup.ticks, faults=len(setup.faults))
+    soaked.minutes_each = rows_each * setup.bus.period_s / 60.0
     log = _Log(soaked, rig, folder, rows_each, keep)
     blocks = Blocks(setup.trajectory, setup.bus.period_us, setup.ticks, log.take, on_progress)
     begin_s = time.perf_counter()
@@ -147,7 +154,12 @@ class _Log:
         self._soaked.recorded_ticks += len(ticks)
         if not self._keep:
             writer.path.unlink()
-        self._soaked.memory_mb.append(_resident_mb())
+        soaked, period_us = self._soaked, self._rig.setup.bus.period_us
+        soaked.memory_mb.append(_resident_mb())
+        began = sum(f.at_us < soaked.recorded_ticks * period_us for f in self._rig.setup.faults)
+        soaked.faults_each.append(began - sum(soaked.faults_each))
+        soaked.decisions_each.append(soaked.decisions - sum(soaked.decisions_each))
+        soaked.returns_each.append(soaked.returns - sum(soaked.returns_each))
 
     def _observe(self, rows: NDArray[np.void]) -> None:
         soaked = self._soaked

@@ -19,7 +19,9 @@ def soak(
     minutes: Annotated[float, typer.Option(help="Of stage time.", min=0.01, max=600)] = 30.0,
     seed: Annotated[int, typer.Option(help="Of noise and faults.", min=0)] = 1,
     law: Annotated[str, typer.Option(help="A controller's name or file.")] = "lqg",
-    out: Annotated[Path | None, typer.Option(help="Folder for soak.json and, with --keep, the recordings.")] = None,
+    out: Annotated[
+        Path | None, typer.Option(help="Folder for soak.json, soak.png and, with --keep, recordings.")
+    ] = None,
     keep: Annotated[bool, typer.Option("--keep", help="Keep the recordings, 100 MB a minute.")] = False,
     as_json: Annotated[bool, typer.Option("--json", help="Print JSON, and nothing else.")] = False,
 ) -> None:
@@ -28,6 +30,7 @@ def soak(
     Exit code 0 if not, 1 if so, 2 for bad input. Some minutes for half an hour.
     """
     from hil import soak as soaking
+    from hil.recording import RecordingError
 
     if keep and out is None:
         raise ConfigError("--keep: needs --out, the folder to keep the recordings in")
@@ -36,8 +39,15 @@ def soak(
         with progress_bar("soak", quiet=as_json) as tell:
             soaked = soaking.soak(60.0 * minutes, seed, law, folder, keep=keep, on_progress=tell)
         if out is not None:
+            from hil.soak_figure import draw_soak
+
             text = json.dumps(soaking.as_json(soaked), indent=1) + "\n"
             (out / "soak.json").write_text(text, encoding="utf-8")
+            draw_soak(soaked, out / "soak.png")
+    except RecordingError as error:
+        raise ConfigError(str(error)) from None
+    except OSError as error:
+        raise ConfigError(f"--out: {out}: {(error.strerror or str(error)).lower()}; give another folder") from None
     finally:
         if out is None:
             shutil.rmtree(folder, ignore_errors=True)

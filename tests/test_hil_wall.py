@@ -289,7 +289,7 @@ def test_a_full_disk_ends_at_0_v_with_one_line_and_what_was_written_opens(bench,
         [sys.executable, "-c", script, "run", *words], cwd=bench, text=True, check=False, capture_output=True,
         env={**os.environ, "PYTHONPATH": str(ROOT)}, timeout=120,
     )  # fmt: skip
-    assert run.returncode == 1
+    assert run.returncode == 2
     complaints = [line for line in run.stderr.splitlines() if line.startswith("pkxyz: ")]
     assert len(complaints) == 1, run.stderr
     assert "file too large" in complaints[0]

@@ -7,6 +7,7 @@ from hil.endpoint import Endpoint
 from hil.faults.catalogue import KINDS
 from hil.node_drive import DriveReceiver
 from hil.recording import Recording
+from hil.scenario import load_scenario
 from hil.soak import random_faults, soak
 
 
@@ -26,9 +27,31 @@ def test_nothing_is_lost_and_nothing_breaks(soaked):
     assert sum(found.reasons.values()) >= found.decisions
     assert 100.0 < found.voltage_max_v < 231.0
     parts = sorted(folder.glob("*.parquet"))
-    assert len(parts) == len(found.memory_mb) == 4
+    assert len(parts) == len(found.memory_mb) == 3
+    for total, each in (
+        (found.faults, found.faults_each),
+        (found.decisions, found.decisions_each),
+        (found.returns, found.returns_each),
+    ):
+        assert len(each) == 3
+        assert sum(each) == total
     ticks = np.concatenate([Recording.open(part)["tick"] for part in parts])
     assert np.array_equal(ticks, np.arange(25_000))
+
+
+def test_a_reference_that_begins_anew_begins_at_its_beginning(soaked):
+    """A block of rows reaches 0.8 s ahead, and not back: where a fault is cleared in its middle, it ends there."""
+    _, folder = soaked
+    trajectory = load_scenario("faults").trajectory
+    anew = 0
+    for part in sorted(folder.glob("*.parquet")):
+        recording = Recording.open(part)
+        index, reference = recording["reference_tick"], recording.vector("reference_m")
+        tracking = np.flatnonzero(index >= 0)
+        anew += int(np.count_nonzero(index[tracking] == 0))
+        rows = trajectory.sample(0, int(index.max()) + 1, 200)[index[tracking], 0:3]
+        assert np.array_equal(reference[tracking], rows)
+    assert anew >= 4
 
 
 def test_time_is_that_of_the_ticks_whatever_failed(soaked):

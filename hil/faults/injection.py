@@ -56,8 +56,10 @@ class Injection:
         self._wire.arm(self._origin_us)
         return FaultyClock(rig.clock, self.faults, self._origin_us, rig.setup.bus.period_us)
 
-    def clearing(self, record: Callable[[int], object]) -> Callable[[int], object]:
-        """``record`` and, so many ticks after a fault decision, a clear; a look at the combs, if one is wanted."""
+    def clearing(self, record: Callable[[int], object], begin_anew: Callable[[int], object]) -> Callable[[int], object]:
+        """``record`` and, so many ticks after a fault decision, a clear; a look at the combs, if one is wanted.
+        ``begin_anew`` is told the tick after which the trajectory starts over.
+        """
         clear_s, controller, watched = self._rig.setup.clear_s, self._rig.controller, self.watched
         if watched is not None:
             record = self._watching(record, watched)
@@ -69,6 +71,8 @@ class Injection:
         def record_and_clear(tick: int) -> None:
             nonlocal waited
             record(tick)
+            if controller.mode == Mode.ENABLED:
+                begin_anew(tick)
             waited = waited + 1 if controller.mode in (Mode.FAULT, Mode.BOOT) else 0
             if waited % patience == patience - 1:
                 controller.clear()
