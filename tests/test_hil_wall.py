@@ -313,3 +313,15 @@ def test_bad_input_is_refused_with_one_line(bench, monkeypatch):
         with pytest.raises(ConfigError, match=expected):
             command(**words)
     assert not (bench / "runs").exists()
+
+
+def test_run_and_plant_meet_on_the_scenarios_bus_unless_it_is_simulated(bench, monkeypatch, capsys):
+    monkeypatch.chdir(bench)
+    assert run_cli._met("on_quick.toml", bus=None).bus == load_scenario("on_quick.toml").bus
+    assert run_cli._met("on_quick.toml", bus="slow.toml").bus == load_scenario("on_quick.toml", bus="slow.toml").bus
+    assert capsys.readouterr().err == ""
+    met = run_cli._met("raster", bus=None)
+    assert met.bus.name == "unix_2k"
+    assert "fd_5k, is simulated; meeting on unix_2k" in capsys.readouterr().err
+    with pytest.raises(ConfigError, match="is simulated"):  # asked for by name, it is refused
+        run_cli.run("raster", bus="fd_5k")
