@@ -297,6 +297,14 @@ class IgnoresCounter(_OtherDrive):
         return data
 
 
+class TakesLateFrames(_OtherDrive):
+    """drive PDO: late"""
+
+    def drive_data(self, data: bytes) -> bytes:
+        self._drive._is_owed = False
+        return data
+
+
 class PadsShortFrames(_OtherDrive):
     """drive PDO: too short"""
 

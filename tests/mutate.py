@@ -35,6 +35,7 @@ TARGETS = {
     "pkxyz_ctrl.safety.sdo_rules": ("test_safety_gate.py", "test_safety_gate_sweep.py"),
     "pkxyz_ctrl.safety.modes": ("test_safety_modes.py",),
     "pkxyz_ctrl.safety.monitors": ("test_safety_monitors.py",),
+    "pkxyz_ctrl.safety.thresholds": ("test_safety_monitors.py",),
     "pkxyz_ctrl.safety.trips": ("test_safety_monitors.py", "test_safety_modes.py"),
     "pkxyz_ctrl.core.voltage": ("test_core_voltage.py",),
     "pkxyz_ctrl.core.allocation": ("test_core_allocation.py",),

@@ -55,6 +55,7 @@ def test_a_plain_cia_401_module_passes_what_applies_to_it() -> None:
         "sense PDO: CRC",
         "drive PDO: wrong CRC",
         "drive PDO: wrong alive counter",
+        "drive PDO: late",
         "outputs, with voltage: drive PDO missing",
         "outputs, with voltage: drive by SDO",
     }

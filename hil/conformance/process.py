@@ -207,6 +207,20 @@ def _wrong_counter(talker: Talker) -> str:
     return _refused(talker, 0xFF11, frames())
 
 
+def _late(talker: Talker) -> str:
+    _require_protection(talker)
+
+    def frames() -> Iterator[tuple[str, bytes]]:
+        for syncs in (1, 2):
+            counts = _anew(talker)
+            for _ in range(syncs):  # the first applies what came before it, the others find nothing
+                talker.cycle()
+            late = talker.drive_codec.encode(counts, talker.drive_counter + 1 & 0xFF)
+            yield f"the next counter, {syncs} SYNCs too late", late
+
+    return _refused(talker, 0xFF13, frames())
+
+
 def _too_short(talker: Talker) -> str:
     def frames() -> Iterator[tuple[str, bytes]]:
         for length in (0, 2, talker.drive_codec.length - 1):
@@ -286,6 +300,7 @@ CHECKS = (
     Check(_C, "accepted", "valid drive PDOs are applied, 0x6411 reads back, no EMCY", _accepted),
     Check(_C, "wrong CRC", "refused with EMCY 0xFF10", _wrong_crc),
     Check(_C, "wrong alive counter", "repeated, skipped or old: refused with EMCY 0xFF11", _wrong_counter),
+    Check(_C, "late", "the next one after a SYNC that found none: refused with EMCY 0xFF13", _late),
     Check(_C, "too short", "refused with EMCY 0x8210", _too_short),
     Check(_C, "too long", "refused with EMCY 0x8220", _too_long),
     Check(_C, "negative count", "refused with EMCY 0xFF12", _negative),
