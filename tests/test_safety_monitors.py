@@ -392,6 +392,16 @@ def test_another_combs_single_outlier_does_not_clear_the_culprit() -> None:
     assert bench.tick({"implausible_combs": 0b001, "innovation_m": 1e-6}) == 0b111 * Trip.INNOVATION_X
 
 
+@pytest.mark.parametrize(("worst", "other"), [(i, k) for i in range(3) for k in range(3) if i != k])
+def test_a_comb_that_the_worst_one_drags_along_is_not_named(worst: int, other: int) -> None:
+    """Whichever two they are; from a third of it on, the other is one by itself."""
+    limits = default_limits()[0]
+    for share, named in ((0.3, [worst]), (0.34, [worst, other])):
+        residual_m = np.zeros(3)
+        residual_m[worst], residual_m[other] = -6e-6, share * 6e-6
+        assert implausible_combs(limits, residual_m) == sum(1 << comb for comb in named)
+
+
 def test_opening_the_loop_forgets_what_only_the_loop_can_do() -> None:
     limits = only("innovation_count", 5)
     limits["saturation_count"] = limits["solver_count"] = limits["slew_count"] = 5
