@@ -2,6 +2,7 @@
 
 import itertools
 import json
+import os
 import sys
 import tomllib
 from pathlib import Path
@@ -45,6 +46,7 @@ KINDS = ("scenarios", "stages", "plants", "controllers", "buses", "tolerances", 
 
 def main() -> NoReturn:
     """Entry point: runs the command line and turns what can go wrong into one line each and an exit code."""
+    os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")  # small matrices: threads would only wait for each other
     try:
         code = app(standalone_mode=False)  # what typer.Exit said, or the command's None
     except ConfigError as error:

@@ -21,6 +21,7 @@ def montecarlo(
     seed: Annotated[int, typer.Option(min=0, help="The first plant's.")] = 1,
     tolerances: Annotated[str, typer.Option(help="Name or file of what they are drawn from.")] = "wide",
     controller: Annotated[str | None, typer.Option(help="Name or file, instead of the scenario's.")] = None,
+    stage: Annotated[str | None, typer.Option(help="Name or file, instead of the scenario's.")] = None,
     plant: Annotated[str | None, typer.Option(help="Name or file of the plant that is changed.")] = None,
     bus: Annotated[str | None, typer.Option(help="Name or file, instead of the scenario's.")] = None,
     workers: Annotated[int | None, typer.Option(min=1, help="Processes; default: as many as cores.")] = None,
@@ -45,7 +46,7 @@ def montecarlo(
     from pkxyz_ctrl.config import load
     from pkxyz_ctrl.design.tolerances import Tolerances
 
-    loaded = load_scenario(scenario, controller=controller, plant=plant, bus=bus)
+    loaded = load_scenario(scenario, controller=controller, stage=stage, plant=plant, bus=bus)
     study = Study(loaded, load("tolerances", tolerances, Tolerances))
     if replay is not None:
         _replay(study, replay, out, as_json=as_json)

@@ -1,5 +1,9 @@
 """Shared by all tests: kernels from the cache that is named after their sources, and the same examples in every run."""
 
+import os
+
+os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")  # small matrices: on a busy machine threads only wait for each other
+
 from hypothesis import settings
 
 import pkxyz_ctrl  # noqa: F401
