@@ -4,6 +4,7 @@ import numpy as np
 import pytest
 from filterpy.kalman import KalmanFilter
 from loop_rig import MIDDLE, bus, controller, new_tick_memory, stage, tick_law
+from scipy.integrate import solve_ivp
 from scipy.stats import chi2
 
 from pkxyz_ctrl.core import estimator as filtering
@@ -65,9 +66,10 @@ def test_the_tick_predicts_with_the_exact_forces(delay_periods):
     law["delay_periods"] = delay_periods
     record, state, device = law["estimator"], memory["estimate"], stage()
     origin, twin = record["operating_point_m"].copy(), filterpy_twin(law["estimator"])
-    count = np.array([[26_000, 25_500, 24_800], [25_800, 25_700, 24_900], [25_900, 25_200, 25_000]], np.int32)
+    holding = device.holding_voltages(origin) / law["drive"]["volt_per_count"]
+    count = np.round(holding + np.array([[60, -50, 20], [-20, 70, -10], [10, -80, 0]])).astype(np.int32)
     memory["count"][:] = count
-    state["predicted"][:] = rng.normal(size=9) * np.repeat([2e-6, 5e-4, 1e-6], 3)
+    state["predicted"][:] = rng.normal(size=9) * np.repeat([1e-7, 3e-4, 1e-6], 3)
     memory["measurement_m"][:] = origin + state["predicted"][:3] + rng.normal(size=3) * 1e-8
     twin.x = state["predicted"].copy()[:, None]
     twin.update_steadystate((memory["measurement_m"] - origin)[:, None])
@@ -80,10 +82,42 @@ def test_the_tick_predicts_with_the_exact_forces(delay_periods):
         jacobian = device.jacobian(at)
         w = jacobian.T @ force[age] - device.energy_gradient(at) + record["stiffness_n_per_m"] @ (at - origin)
         twin.predict_steadystate(np.concatenate([w, jacobian.T @ (force[age + 1] - force[age])])[:, None])
+        assert not filtering.goes_far(record, s, twin.x[:, 0])
         steps.append(twin.x[:, 0].copy())
     for name, expected in (("predicted", steps[0]), ("ahead", steps[-1])):
         assert np.abs((state[name] - expected) / SIZE).max() <= 1e-11, name
     assert (np.abs(state["ahead"] - state["predicted"]).max() > 0) == (delay_periods == 2)
+
+
+@pytest.mark.parametrize("seed", range(8))
+def test_far_ways_are_predicted_by_simpsons_rule(seed):
+    """Ways of some um in a period, at up to 50 mm/s and under forces that are out of balance by up to half: the
+    differential equation, solved by scipy, is met three times as well as with the input of mid-period, and to 6 nm.
+    """
+    law, rng = tick_law(), np.random.default_rng(seed)
+    record, device = law["estimator"], stage()
+    linear, origin = model()[0], record["operating_point_m"]
+    s = np.concatenate([rng.uniform(-6e-6, 6e-6, 3), rng.uniform(-1, 1, 3) * [5e-3, 5e-3, 5e-2], np.zeros(3)])
+    old = device.holding_forces(origin + s[:3])
+    force, tau_s = old * rng.uniform(0.6, 1.4), amplifier_time_constant_s(device)
+
+    def motion(t_s, state):
+        acting = force + (old - force) * np.exp(-t_s / tau_s)
+        at = origin + state[:3]
+        pull = device.jacobian(at).T @ acting - device.energy_gradient(at) - linear.damping_n_s_per_m @ state[3:]
+        return np.concatenate([state[3:], pull / linear.mass_kg])
+
+    exact = solve_ivp(motion, (0.0, bus().period_s), s[:6], rtol=1e-10, atol=1e-14).y[:, -1]
+    middle, w, w_change, once, twice = np.empty(3), np.empty(3), np.empty(3), np.empty(9), np.empty(9)
+    filtering.midway(record, s, middle)
+    filtering.net_input(law["geometry"], law["elasticity"], record, middle, force, old, w, w_change)
+    filtering.predict(record, s, w, w_change, once)
+    twice[:] = once
+    filtering.predict_far(law["geometry"], law["elasticity"], record, s, force, old, twice)
+    assert filtering.goes_far(record, s, once)
+    worst = [np.abs((out[:6] - exact) / np.repeat([1e-9, 5e-6], 3)).max() for out in (once, twice)]  # 1 nm a period
+    assert worst[1] < min(worst[0] / 3.0, 6.0)
+    assert worst[0] > 5.0
 
 
 def riccati_by_filterpy(bus_name="fd_5k"):

@@ -156,9 +156,10 @@ def _far_jump() -> list[Figure]:
         and planned["stroke_max_um"] <= 25.0 and planned["stroke_min_um"] >= -0.5
     )  # fmt: skip
     there_and_back = {n: " and ".join(f"{t:.1f}" for t in d["settle_ms"]) for n, d in (("l", clipped), ("p", planned))}
+    later = max(p - c for p, c in zip(planned["settle_ms"], clipped["settle_ms"], strict=True))
     return [
-        Figure("control.mpc_settle", max(planned["settle_ms"]) - max(clipped["settle_ms"]), "ms", 0.0, "at most", None,
-               f"4 to 35 um of height and back, the slower of the two, less that of lqg: "
+        Figure("control.mpc_settle", later, "ms", 0.0, "at most", None,
+               f"4 to 35 um of height and back, less than lqg takes, the worse of the two directions: "
                f"mpc {there_and_back['p']} ms, lqg {there_and_back['l']} ms, {clipped['saturated']} ticks at a limit"),
         Figure("control.mpc_violations", 0.0 if inside else 1.0, "count", 0.0, "at most", None,
                f"{planned['voltage_max_v']:.1f} of 200 V, {planned['step_max_v']:.2f} of 20 V a tick, "
@@ -168,20 +169,24 @@ def _far_jump() -> list[Figure]:
 
 
 def _mpc_tick() -> Figure:
-    """Wall time of every tick of the far jump, called as the fast lane calls it."""
+    """Wall time of the ticks of the far jump that solve a problem, called as the fast lane calls them."""
     taken = mpc_tick_us()
-    limited = taken["solved"]
+    solved = taken["solved"]
     detail = (
-        f"the whole tick, all of a far jump; median {np.percentile(taken['all'], 50):.1f} us; the {len(limited)} ticks "
-        f"with a problem to solve {np.percentile(limited, 50):.0f} us, p99 {np.percentile(limited, 99):.0f} us"
+        f"the {len(solved)} ticks of a far jump that solve a problem, each whole, Python included, the least of "
+        f"{REPEATS} runs with the same bits: median {np.percentile(solved, 50):.0f} us, longest {solved.max():.0f} us; "
+        f"all ticks: median {np.percentile(taken['all'], 50):.1f} us, p99 {np.percentile(taken['all'], 99):.0f} us"
     )
-    p99_us = float(np.percentile(taken["all"], 99))
-    return Figure("control.mpc_tick", p99_us, "us at p99", 100.0, "at most", None, detail)
+    return Figure("control.mpc_tick", float(np.percentile(solved, 99)), "us at p99", 100.0, "at most", None, detail)
 
 
-def mpc_tick_us(repeats: int = 5) -> dict[str, NDArray[np.float64]]:
-    """Time of each tick of the far jump in us, the best of several runs, which have the same bits: ``all`` of them, and
-    those that ``solved`` a problem.
+REPEATS = 15
+"""Others on the machine lengthen a tick, never shorten it."""
+
+
+def mpc_tick_us(repeats: int = REPEATS) -> dict[str, NDArray[np.float64]]:
+    """Time of each tick of the far jump in us, the least of several runs, which have the same bits: ``all`` of them,
+    and those that ``solved`` a problem.
     """
     jump = Steps(kind="steps", by_m=(0.0, 0.0, WAY_M), count=1, dwell_s=0.04)
     setup, _ = setup_of([jump], "mpc", "nominal", LOW_M)

@@ -10,9 +10,9 @@ regulator's own answer. What the combs must give for nu is not linear::
 
     B(x)^T F = grad V(x) + C r' + m r'' - K_0 (x - r) + nu - d
 
-taken in mid-interval, as the filter takes it; so the model is exact wherever the stage goes, and K_0 and B_0 at one
-point serve everywhere (B: ``kinematics.pulls``). The variables are comb forces v = B_0^-T nu. Limits of F and of
-strokes become limits of v about those that the last plan leads to; from tick to tick they become exact.
+taken in mid-interval, on the cubic that joins both its ends; so the model holds wherever the stage goes, and K_0 and
+B_0 at one point serve everywhere (B: ``kinematics.pulls``). The variables are comb forces v = B_0^-T nu. Limits of F
+and of strokes become limits of v about those that the last plan leads to; from tick to tick they become exact.
 """
 
 import math
@@ -162,11 +162,12 @@ def comb_forces(
     start. False where the links do not reach.
     """
     gains, filter_ = law["feedback"], law["estimator"]
-    row, middle, force = np.empty(9), np.empty(3), np.empty(3)
-    pulls, inverse, off = np.empty((3, 3)), np.empty((3, 3)), np.empty(3)
+    row, middle, force, end = np.empty(9), np.empty(3), np.empty(3), np.empty(6)
+    pulls, inverse, off = np.empty((3, 3)), np.empty((3, 3)), np.zeros(3)
     feedback.ahead(gains, now, after, row)
+    _step(filter_, e, nu_n, off, end)
     for i in range(3):
-        off[i] = e[i] + filter_["half_period_s"] * e[3 + i]
+        off[i] = 0.5 * (e[i] + end[i]) + 0.25 * filter_["half_period_s"] * (e[3 + i] - end[3 + i])
         middle[i] = row[i] + off[i]
     if kinematics.in_domain(law["geometry"], middle) != 0:
         return False

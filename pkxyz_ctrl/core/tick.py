@@ -140,6 +140,8 @@ def estimate(law: np.void, memory: np.void, has_measurement: bool) -> None:
         filtering.midway(estimator, start, position)
         filtering.net_input(law["geometry"], law["elasticity"], estimator, position, acting, acted, w, w_change)
         filtering.predict(estimator, start, w, w_change, ahead)
+        if filtering.goes_far(estimator, start, ahead):
+            filtering.predict_far(law["geometry"], law["elasticity"], estimator, start, acting, acted, ahead)
         if step == 0:
             state["predicted"][:] = ahead
         start[:] = ahead

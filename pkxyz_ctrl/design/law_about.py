@@ -3,7 +3,7 @@
 import numpy as np
 from numpy.typing import NDArray
 
-from pkxyz_ctrl.core.tick import LINEAR, OPEN_LOOP, STATE_FEEDBACK
+from pkxyz_ctrl.core.tick import LINEAR, OPEN_LOOP
 from pkxyz_ctrl.design.discrete_law import DiscreteLaw, LawError
 from pkxyz_ctrl.design.loop_plant import NOMINAL, Perturbation
 from pkxyz_ctrl.design.lqg_equivalent import lqg_equivalent
@@ -27,9 +27,7 @@ def law_about(
         raise LawError("this law only feeds forward: there is no loop, hence no margin; choose another controller")
     if kind == LINEAR:
         return _linear(stage, law, np.asarray(strokes_m, dtype=np.float64))
-    if kind == STATE_FEEDBACK:
-        return lqg_equivalent(stage, law, strokes_m, perturbation)
-    raise LawError(f"margins of laws of kind {kind} are not known: they are not linear")
+    return lqg_equivalent(stage, law, strokes_m, perturbation)
 
 
 def _linear(stage: Stage, law: NDArray[np.void], strokes_m: Array) -> DiscreteLaw:

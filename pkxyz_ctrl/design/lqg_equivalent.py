@@ -1,4 +1,5 @@
-"""The default law as a linear law from measured position to force: what its filter and regulator amount to.
+"""The default law, and the predictive one far from its limits, as a linear law from measured position to force: what
+filter and regulator amount to.
 
 The tick's filter knows the forces that it asked for, so they are states too: x = [s(9), w(k-1), w(k-2), ...]. Its net
 input is taken at the estimate's own mid-period position, so where the stage's gradient is not that of the design point
@@ -8,6 +9,7 @@ the difference M (x + T/2 v) is part of the prediction.
 import numpy as np
 from numpy.typing import NDArray
 
+from pkxyz_ctrl.core.tick import PREDICTIVE
 from pkxyz_ctrl.design.discrete_law import DiscreteLaw
 from pkxyz_ctrl.design.loop_plant import NOMINAL, Perturbation, held_force_softening
 from pkxyz_ctrl.stage import Stage
@@ -21,6 +23,9 @@ def lqg_equivalent(
     """The linear law that ``law``, the (1,) array of ``design_law``, is about the position of ``strokes_m`` (3,), far
     from every limit and without quantisation.
 
+    The predictive law, as long as its plans meet no limit, is the regulator without what the stage adds to the design
+    point's stiffness: it knows that in advance.
+
     The stage is the controller's belief. The perturbation of the real one only matters through the forces that the
     controller thinks it holds the point with.
     """
@@ -32,8 +37,17 @@ def lqg_equivalent(
     softening = held_force_softening(stage, position, believed)
     softening = softening - (stage.stiffness(position) - filter_["stiffness_n_per_m"])
     share = float(np.clip(holding.min() / feedback["authority_force_n"], 0.0, 1.0))
-    gains = share * np.hstack([feedback["position_gain_n_per_m"], feedback["velocity_gain_n_s_per_m"], np.eye(3)])
+    gains = np.hstack([feedback["position_gain_n_per_m"], feedback["velocity_gain_n_s_per_m"], np.eye(3)])
+    if numbers["kind"] == PREDICTIVE:
+        gains[:, :6] += softening @ _midway(filter_, gains[:, :6])
+    gains *= share
     return _assemble(filter_, softening, gains, delay, float(law["period_us"][0]) * 1e-6)
+
+
+def _midway(filter_: np.void, gains: Array) -> Array:
+    """(3,6): deviation in the middle of a period by that at its start, where the regulator's ``gains`` (3,6) act."""
+    closed, bend_s = filter_["transition"][:, :6] - filter_["input"] @ gains, 0.25 * filter_["half_period_s"]
+    return np.hstack([0.5 * np.eye(3), bend_s * np.eye(3)]) + 0.5 * closed[:3] - bend_s * closed[3:]
 
 
 def _assemble(filter_: np.void, softening: Array, gains: Array, delay: int, period_s: float) -> DiscreteLaw:
