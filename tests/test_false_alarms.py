@@ -11,6 +11,7 @@ import numpy as np
 import pytest
 from loop_rig import rows_of, stage
 
+from hil.faults.fault import parse
 from hil.scenario import load_scenario
 from pkxyz_ctrl.config import load
 from pkxyz_ctrl.controller_config import MonitorConfig
@@ -125,6 +126,19 @@ def test_the_worst_device_that_a_law_has_to_bear_is_no_fault(stiffness, combs, m
     assert Trip(int(np.bitwise_or.reduce(rows["trips"]))) == Trip(0)
     assert rows["mode"][-1] == Mode.TRACKING
     assert 0.4e-3 < np.abs(lacking_n(rows)).max() < 0.7e-3
+
+
+@pytest.mark.parametrize(
+    "text",
+    ["controller:lost_tick@0.512,ticks=2", "controller:lost_tick@0.5205,ticks=8", "bus.sense:drop@0.5203+0.0006"],
+)
+def test_lost_ticks_and_frames_in_a_scan_on_the_harsh_plant_are_survived(text):
+    """Fewer than the monitors of ticks and frames allow: no other monitor takes their echo for something else."""
+    run = load_scenario("raster_harsh", faults=[parse(text)]).setup()
+    rows, result = rows_of(run, "lockstep")
+    assert result.faults == ()
+    assert result.missed_ticks in (2, 8, 3)
+    assert rows["mode"][-1] == Mode.TRACKING
 
 
 def test_a_controller_file_that_says_nothing_has_the_limits_of_the_monitors():
