@@ -264,6 +264,18 @@ def test_an_imperfect_device_is_in_proportion_and_a_stuck_comb_is_not() -> None:
         assert any(found) is tripped, share
 
 
+def test_a_change_that_is_just_in_proportion_is_permitted() -> None:
+    """With a trend that stands still: 40 uN and 40 % of 0.5 mN are 240 uN."""
+    limits = only("unexplained_force_count", 1)
+    limits["force_trend_share"] = 0.0
+    edge = float(limits["force_change_max_n"][0] + limits["force_change_share"][0] * 0.5e-3)
+    assert edge == pytest.approx(240e-6)
+    for comb in range(3):
+        asked = {"commanded_force_n": beyond(comb, -0.5e-3)}
+        for value, trips in ((edge, Trip(0)), (math.nextafter(edge, 1.0), Trip(Trip.COMB_FORCE_1 << comb))):
+            assert Bench(limits=limits).tick({**asked, "unexplained_force_n": beyond(comb, value)}) == trips
+
+
 @pytest.mark.parametrize("value", [math.nan, math.inf, -math.inf])
 @pytest.mark.parametrize("name", ["unexplained_force_n", "commanded_force_n"])
 def test_a_force_that_is_not_finite_counts_and_leaves_no_trace(name: str, value: float) -> None:
