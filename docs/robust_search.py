@@ -9,10 +9,9 @@ from pkxyz_ctrl.bus_config import BusConfig
 from pkxyz_ctrl.config import CONFIG_DIR, load
 from pkxyz_ctrl.controller_config import ControllerConfig
 from pkxyz_ctrl.design.estimator_gain import measurement_noise
-from pkxyz_ctrl.design.glover_mcfarlane import hinf
 from pkxyz_ctrl.design.hold_noise import rounding_force_n
 from pkxyz_ctrl.design.law import design_law
-from pkxyz_ctrl.design.loop_plant import LoopPlant, loop_plant
+from pkxyz_ctrl.design.loop_plant import LoopPlant, Perturbation, loop_plant
 from pkxyz_ctrl.design.lqg_equivalent import lqg_equivalent
 from pkxyz_ctrl.design.minimax import AxisLaw, Bounds, axis_law, minimax
 from pkxyz_ctrl.design.plant_model import linearise
@@ -23,6 +22,17 @@ ENDS = ("middle", "3/3/3 um", "22/22/22 um")
 """Points that the search looks at; the tests look at all of them."""
 
 
+MIDDLE = np.full(3, 12.5e-6)
+COMBINED = [
+    Perturbation(stiffness, mass, 200.0, (comb,) * 3)
+    for stiffness, mass in ((-0.2, 0.1), (0.2, -0.1))
+    for comb in (0.1, -0.1)
+]
+"""All at once at the ends of the tolerances "wide": soft, heavy and hardly damped, and the opposite. With one thing
+changed at a time the search found a law that 6 of 200 drawn plants were unstable with.
+"""
+
+
 def plants(stage: Stage, bus: BusConfig, axis: int, *, changed: bool) -> list[LoopPlant]:
     """Of one axis: as drawn first, then the changes that don't couple the axes."""
     cases = [
@@ -31,35 +41,49 @@ def plants(stage: Stage, bus: BusConfig, axis: int, *, changed: bool) -> list[Lo
     return [loop_plant(stage, bus, c.strokes_m, c.perturbation).axis(axis) for c in (cases if changed else cases[:1])]
 
 
-def search(bus_name: str) -> dict[int, AxisLaw]:
-    """Laws of x (and y) and z: from known laws on, further in steps."""
-    stage, bus = Stage.load("reconstructed"), load("buses", bus_name, BusConfig)
-    middle = np.full(3, 12.5e-6)
-    wide = design_law(stage, load("controllers", "lqg_wide", ControllerConfig), bus, autostart=True)
-    lqg = lqg_equivalent(stage, wide, middle)
-    model = linearise(stage, middle)
-    sense, force = np.sqrt(np.diag(measurement_noise(stage, model, bus))), rounding_force_n(stage, bus, model)
-    robust = bus_name == "fd_5k"
-    if robust:
-        starts = {0: axis_law(hinf(loop_plant(stage, bus, middle)).law, 0, extra_poles=[0.3])}
-        starts[2] = axis_law(lqg, 2, extra_poles=[0.3])
-        steps_hz, noise_m, changed = (150.0, 180.0, 190.0, 195.0, 201.0), 1.45e-9, 2.9
-        effort, ring_s = 10.0, 5e-3  # what hinf and lqg_wide need near half the sampling rate; half the stage's own
-    else:
-        starts = {axis: axis_law(lqg, axis, extra_poles=[0.3, 0.5]) for axis in (0, 2)}
-        steps_hz, noise_m, changed, effort, ring_s = (400.0, 500.0, 600.0, 660.0), 2.5e-9, 3.0, np.inf, np.inf
+def start(stage: Stage, bus: BusConfig, controller: str, axis: int, room: list[float]) -> AxisLaw:
+    """An axis of a shipped LQG law, with poles added that are cancelled by zeros: room for the search."""
+    designed = design_law(stage, load("controllers", controller, ControllerConfig), bus, autostart=True)
+    return axis_law(lqg_equivalent(stage, designed, MIDDLE), axis, extra_poles=room)
+
+
+def robust(stage: Stage, bus: BusConfig) -> dict[int, AxisLaw]:
+    """Laws of x (and y) and z on fd_5k, for all devices: in steps of bandwidth, each from the law before."""
+    steps_hz = (120.0, 150.0, 170.0, 180.0, 190.0, 195.0, 201.0)
+    starts = {0: start(stage, bus, "lqg_wide", 0, [0.3, 0.2, -0.2, 0.1]), 2: start(stage, bus, "lqg", 2, [0.3])}
     found = {}
     for axis, law in starts.items():
-        these = plants(stage, bus, axis, changed=robust)
+        these = plants(stage, bus, axis, changed=True)
+        combined = [loop_plant(stage, bus, MIDDLE, change).axis(axis) for change in COMBINED]
         for bandwidth_hz in steps_hz:
             bounds = Bounds(
-                bandwidth_hz, noise_m, float(sense[axis]), float(force[axis]), peak_s_changed=changed, effort=effort,
-                ring_s=ring_s,
+                bandwidth_hz, 1.45e-9, *noise(stage, bus, axis), slope=1.0, peak_s_changed=2.9, peak_s_combined=4.0,
+                effort=8.0, ring_s=2e-3,
             )  # fmt: skip
-            law, worst = minimax(these, law, bounds)
-            print(f"{bus_name}, axis {axis}, {bandwidth_hz:g} Hz: {worst:.3f} of the bounds", flush=True)
+            law, worst = minimax(these, law, bounds, combined=combined)
+            print(f"fd_5k, axis {axis}, {bandwidth_hz:g} Hz: {worst:.3f} of the bounds", flush=True)
         found[axis] = law
     return found
+
+
+def robust_20k(stage: Stage, bus: BusConfig) -> dict[int, AxisLaw]:
+    """Laws of x (and y) and z on local_20k, for the stage as drawn."""
+    found = {}
+    for axis in (0, 2):
+        law = start(stage, bus, "lqg_wide", axis, [0.3, 0.5])
+        for bandwidth_hz in (400.0, 500.0, 600.0, 660.0):
+            bounds = Bounds(bandwidth_hz, 2.5e-9, *noise(stage, bus, axis), peak_s_changed=3.0)
+            law, worst = minimax(plants(stage, bus, axis, changed=False), law, bounds)
+            print(f"local_20k, axis {axis}, {bandwidth_hz:g} Hz: {worst:.3f} of the bounds", flush=True)
+        found[axis] = law
+    return found
+
+
+def noise(stage: Stage, bus: BusConfig, axis: int) -> tuple[float, float]:
+    """Of a measured position in m, and of the rounded force in N."""
+    model = linearise(stage, MIDDLE)
+    sense = np.sqrt(np.diag(measurement_noise(stage, model, bus)))
+    return float(sense[axis]), float(rounding_force_n(stage, bus, model)[axis])
 
 
 def write(name: str, found: dict[int, AxisLaw]) -> None:
@@ -73,5 +97,6 @@ def write(name: str, found: dict[int, AxisLaw]) -> None:
 
 
 if __name__ == "__main__":
-    for name, bus in (("robust", "fd_5k"), ("robust_20k", "local_20k")):
-        write(name, search(bus))
+    device = Stage.load("reconstructed")
+    write("robust", robust(device, load("buses", "fd_5k", BusConfig)))
+    write("robust_20k", robust_20k(device, load("buses", "local_20k", BusConfig)))

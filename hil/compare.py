@@ -15,7 +15,7 @@ from pkxyz_ctrl.config import ConfigError
 
 Rows = NDArray[np.void]
 
-DEFAULT = ("lqg", "lqg_wide", "hinf", "pi_notch", "irc", "mpc", "open_loop")
+DEFAULT = ("lqg", "lqg_wide", "robust", "hinf", "pi_notch", "irc", "mpc", "open_loop")
 """What is compared if nobody says what."""
 
 

@@ -12,6 +12,7 @@ from hil.compare import Compared
 
 COLOURS = ("#0072B2", "#56B4E9", "#009E73", "#D55E00", "#8a8a8a", "#CC79A7", "#E69F00", "#2b2b2b")
 _BINS = 700
+_SHOWN = {"rms_error_nm": "rms while scanning", "hold_noise_nm": "hold noise"}
 
 
 def draw(runs: Sequence[Compared], title: str, path: Path) -> None:
@@ -43,16 +44,22 @@ def draw(runs: Sequence[Compared], title: str, path: Path) -> None:
 def _bars(figure: Figure, grid: object, shown: Sequence[Compared]) -> None:
     axes = figure.add_subplot(grid[:, 1])  # type: ignore[index]
     rows = np.arange(len(shown))
-    for k, (name, words) in enumerate((("rms_error_nm", "rms while scanning"), ("hold_noise_nm", "hold noise"))):
+    for k, (name, words) in enumerate(_SHOWN.items()):
         values = [max(run.figures[name].values()) if run.figures.get(name) else np.nan for run in shown]
         alpha = 1.0 if k == 0 else 0.45
         colours = [COLOURS[n % len(COLOURS)] for n in range(len(shown))]
         bars = axes.barh(rows + 0.2 - 0.4 * k, values, 0.36, color=colours, alpha=alpha)
         axes.bar_label(bars, [f" {v:.3g} {words}" for v in values], fontsize=8)
     axes.set_yticks(rows, [run.controller for run in shown], fontsize=9)
-    axes.set_xscale("log")
-    left, right = axes.get_xlim()
-    axes.set_xlim(left, right * (right / left) ** 0.9)  # room for the words
+    seen = [v for run in shown for k in _SHOWN for v in (run.figures.get(k) or {}).values()]
+    right = max(seen)
+    if right > 20.0 * min(seen):
+        axes.set_xscale("log")
+        left, right = axes.get_xlim()
+        axes.set_xlim(left, right * (right / left) ** 0.9)  # room for the words
+        axes.xaxis.set_major_formatter("{x:g}")
+    else:
+        axes.set_xlim(0.0, 1.8 * right)
     axes.invert_yaxis()
     axes.set_xlabel("nm, worst axis", fontsize=9)
     axes.spines[["top", "right"]].set_visible(False)

@@ -78,6 +78,8 @@ def _show(data: dict, objective: str) -> None:  # type: ignore[type-arg]
     table = Table(box=None, pad_edge=False, show_header=False)
     table.add_row(objective, f"{found['value']:.4g}", f"trial {found['number']}")
     for name, value in found["figures"].items():
+        if name == objective:
+            continue
         table.add_row(name, f"{value:.4g}", "")
     for key, value in found["numbers"].items():
         share = data["importance"].get(key)

@@ -160,7 +160,8 @@ def write_controller(problem: Problem, found: Best, path: Path) -> None:
     for key, value in found.numbers.items():
         put(document, key, value)
     document["name"] = path.stem
-    figures = ", ".join(f"{name} {value:.4g}" for name, value in found.figures.items())
+    others = {name: value for name, value in found.figures.items() if name != problem.search.objective}
+    figures = ", ".join(f"{name} {value:.4g}" for name, value in others.items())
     unit = "Hz" if problem.maximise else "nm"
     head = (
         f"# {problem.search.controller}, tuned by the search {problem.search.name!r} ({problem.digest()}).\n"
@@ -170,6 +171,12 @@ def write_controller(problem: Problem, found: Best, path: Path) -> None:
         path.write_text(head + tomlkit.dumps(document), encoding="utf-8")
     except OSError as error:
         raise ConfigError(f"{path}: {(error.strerror or str(error)).lower()}; give another --out") from None
+
+
+_WORDS = {
+    "rms_error_nm": "rms error while scanning, mean of the plants (nm)",
+    "bandwidth_hz": "|S| < -3 dB up to (Hz)",
+}
 
 
 def draw(study: optuna.Study, problem: Problem, folder: Path) -> dict[str, float]:
@@ -187,7 +194,9 @@ def draw(study: optuna.Study, problem: Problem, folder: Path) -> dict[str, float
     axes = figure.subplots()
     _history(axes, study, finished, problem.maximise)
     axes.set(
-        xlabel="trial", ylabel=problem.search.objective, title=f"{problem.search.name}: {len(study.trials)} trials"
+        xlabel="trial",
+        ylabel=_WORDS[problem.search.objective],
+        title=f"{problem.search.name}: {len(study.trials)} trials, {len(finished)} of them keep every goal",
     )
     figure.savefig(folder / "history.png")
     if importance:
@@ -196,7 +205,7 @@ def draw(study: optuna.Study, problem: Problem, folder: Path) -> dict[str, float
         axes = figure.subplots()
         names = list(importance)[::-1]
         axes.barh(names, [importance[name] for name in names], color="#0072b2")
-        axes.set(xlabel="importance (PED-ANOVA), among the trials that were run", title=problem.search.name)
+        axes.set(xlabel="importance (PED-ANOVA), among the trials that keep every goal", title=problem.search.name)
         axes.spines[["top", "right"]].set_visible(False)
         figure.savefig(folder / "importance.png")
     return {name: float(value) for name, value in importance.items()}

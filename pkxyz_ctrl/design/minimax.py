@@ -3,8 +3,8 @@
 K = X / ((1 - 1/z) Y), X and Y polynomials in 1/z with Y = 1 + ..., so an integrator is always in it. With P_j the
 plants, of which P_0 is the one as drawn, S_j = 1 / (1 + P_j K), and T_0 = 1 - S_0, minimise the largest of::
 
-    |S_0| sqrt(2) up to the bandwidth,   |S_0| / Ms,   |S_0 - 1/2| alpha,   |S_j| / Ms_j,   |K S_0| / (effort k),
-    noise at hold / its bound,   2 - rate of decay of each pole of the loop as drawn / the least one wanted
+    |S_0| sqrt(2) (f_b / f)^slope up to the bandwidth f_b,   |S_0| / Ms,   |S_0 - 1/2| alpha,   |S_j| / Ms_j,
+    |K S_0| / (effort k),   noise at hold / its bound,   2 - rate of decay of each pole of the loop / the least rate
 
 so 1 means that every bound is kept (k is the stiffness as drawn). A search uses whatever no bound forbids: without the
 bounds of K S_0 and of the poles it found a law with a gain of 62 k near half the sampling rate, where no S tells, and
@@ -43,9 +43,14 @@ class Bounds:
     """of a measured position"""
     rounding_n: float
     """of the force at the platform, from rounded voltages; its difference acts, as noise is shaped"""
+    slope: float = 0.0
+    """... falling below with this power of the frequency; 1: in proportion, as one integrator lets it"""
     peak_s: float = 2.0
     disk_margin: float = 0.6
     peak_s_changed: float = 3.0
+    """of each plant that has one thing changed"""
+    peak_s_combined: float = 6.0
+    """of each plant that has several changed at once: to stay stable"""
     effort: float = math.inf
     """|K S| over the stage's stiffness, as drawn: force for a deviation in what is measured, at any frequency"""
     ring_s: float = math.inf
@@ -93,11 +98,20 @@ def axis_law(law: DiscreteLaw, axis: int, *, extra_poles: Sequence[float] = ()) 
 
 
 def minimax(
-    plants: Sequence[LoopPlant], start: AxisLaw, bounds: Bounds, *, enough: float = 0.97, steps: int = 200
+    drawn_and_changed: Sequence[LoopPlant],
+    start: AxisLaw,
+    bounds: Bounds,
+    *,
+    combined: Sequence[LoopPlant] = (),
+    enough: float = 0.97,
+    steps: int = 200,
 ) -> tuple[AxisLaw, float]:
-    """The law, and the largest value over its bound; stops where that is ``enough``. ``plants`` have one input; the
-    first is as drawn. Raises ``LawError`` for a start that leaves one of them unstable.
+    """The law, and the largest value over its bound; stops where that is ``enough``. Plants have one input; the first
+    is as drawn, and ``combined`` have a bound of their own. Raises ``LawError`` for a start that leaves one of them
+    unstable.
     """
+    plants = [*drawn_and_changed, *combined]
+    most = [bounds.peak_s_changed] * len(drawn_and_changed) + [bounds.peak_s_combined] * len(combined)
     size, unit = len(start.numerator), float(plants[0].stiffness_n_per_m[0, 0])
     x = np.concatenate([start.numerator / unit, np.polydiv(start.denominator, [1.0, -1.0])[0][1:]])
     extra: list[Array] = [np.empty(0) for _ in plants]
@@ -108,7 +122,7 @@ def minimax(
             np.union1d(known, _about_poles(_closed(plant, _law(x, size, unit)), plant.period_s))
             for known, plant in zip(extra, plants, strict=True)
         ]
-        problem = _Problem(plants, bounds, extra)
+        problem = _Problem(plants, bounds, extra, most)
         if problem.evaluate(x, size)[0].max() <= enough:
             break
         x = _descend(problem, x, size, enough, steps)
@@ -176,7 +190,9 @@ def _step(values: Array, slopes: Array, trust: float) -> tuple[Array, float]:
 class _Problem:
     """All bounds on a grid of frequencies, as functions of the coefficients [X / unit, Y without its 1]."""
 
-    def __init__(self, plants: Sequence[LoopPlant], bounds: Bounds, extra: Sequence[Array]) -> None:
+    def __init__(
+        self, plants: Sequence[LoopPlant], bounds: Bounds, extra: Sequence[Array], most: Sequence[float]
+    ) -> None:
         self._plants = plants
         self._period_s = plants[0].period_s
         self.unit = float(plants[0].stiffness_n_per_m[0, 0])
@@ -190,14 +206,19 @@ class _Problem:
             f = f[(f > 1.0) & (f < nyquist)]
             p = self._response(plant, f)
             if j > 0:
-                parts.append((f, p, np.zeros(len(f)), np.full(len(f), bounds.peak_s_changed)))
+                parts.append((f, p, np.zeros(len(f)), np.full(len(f), most[j])))
                 continue
             self._drawn_plant, self._drawn_late = p, self._delays(f)
             low = np.append(f[f < bounds.bandwidth_hz], bounds.bandwidth_hz)
             parts += [
                 (f, p, np.zeros(len(f)), np.full(len(f), bounds.peak_s)),
                 (f, p, np.full(len(f), 0.5), np.full(len(f), 1.0 / bounds.disk_margin)),
-                (low, self._response(plant, low), np.zeros(len(low)), np.full(len(low), HALF_POWER)),
+                (
+                    low,
+                    self._response(plant, low),
+                    np.zeros(len(low)),
+                    HALF_POWER * (low / bounds.bandwidth_hz) ** bounds.slope,
+                ),
             ]
         frequency, self._plant, self._centre, self._bound = (
             np.concatenate([part[k] for part in parts]) for k in range(4)
