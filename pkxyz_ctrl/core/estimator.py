@@ -115,17 +115,18 @@ def predict(estimator: np.void, s: Array, w: Array, w_change: Array, out: Array)
         out[i] = s[i]
 
 
-_FAR_M = 0.25e-6
+_FAR_M = 1e-6
 
 
 @njit(cache=True)
 def goes_far(estimator: np.void, s: Array, after: Array) -> bool:
-    """Whether from a state (9,) to the one a period later the way, or what it bends aside in the middle, is so long
-    that the input in mid-period no longer stands for all of it: at 10 um a period that errs by 80 nm.
+    """Whether from a state (9,) to the one a period later the way, or what it differs by from the first half to the
+    second, is so long that the input in mid-period no longer stands for all of it: at 10 um that errs by 80 nm. Up to
+    some nm the feed-forward errs alike, and the disturbance makes up for both.
     """
-    bend_s, far = 0.25 * estimator["half_period_s"], False
+    half_s, far = estimator["half_period_s"], False
     for i in range(3):
-        far = far or abs(after[i] - s[i]) > _FAR_M or abs(bend_s * (after[3 + i] - s[3 + i])) > _FAR_M
+        far = far or abs(after[i] - s[i]) > _FAR_M or abs(half_s * (after[3 + i] - s[3 + i])) > _FAR_M
     return far
 
 
