@@ -70,6 +70,7 @@ def margins(
         data: dict[str, Any] = {
             "controller": config.name, "stage": device.config.name, "bus": on_bus.name,
             "strokes_um": [float(q) * 1e6 for q in strokes], "computed": as_data(computed),
+            "holds": _WHILE_FREE if config.law == "mpc" else "everywhere inside the limits",
         }  # fmt: skip
         changed = None
         if perturbed:
@@ -156,6 +157,8 @@ def _write(
     draw_nyquist(out / "nyquist.png", title, loop.response(strokes, f), others, measured)
 
 
+_WHILE_FREE = "while no plan meets a limit"
+
 _COLUMNS = ("", "Ms", "Mt", "disk", "-3 dB (Hz)", "gain", "phase (deg)", "delay (us)")
 """Peaks of S and T, disk margin, where |S| passes -3 dB, and the margins of gain, phase and delay."""
 
@@ -166,6 +169,8 @@ def _show(
 ) -> None:  # fmt: skip
     strokes = " / ".join(f"{q:g}" for q in data["strokes_um"])
     _screen.print(f"{data['controller']} on {data['bus']}, strokes {strokes} um")
+    if data["holds"] == _WHILE_FREE:
+        _screen.print(f"[yellow]holds {_WHILE_FREE}[/]: there it is linear")
     if not computed.stable:
         _screen.print(f"[bold red]unstable[/]: spectral radius {computed.spectral_radius:.4f}")
     table = Table(box=None, pad_edge=False, header_style="dim")

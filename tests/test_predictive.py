@@ -9,7 +9,9 @@ import osqp
 import pytest
 import scipy.linalg
 from loop_rig import bus, controller, first_difference, rows_of, setup, shortened, stage
+from typer.testing import CliRunner
 
+from hil.cli import app
 from hil.excitation import excitation, tones
 from hil.fast_lane import run_block, run_block_in_steps
 from hil.loop_margins import Loop, agreement
@@ -154,6 +156,13 @@ def test_its_margins_are_those_of_the_running_loop():
     middle = Loop(stage(), bus(), law()).margins(np.full(3, 12.5e-6))
     assert middle.stable
     assert 1.3 < middle.mimo.peak_s < 1.8
+
+
+def test_margins_say_where_they_hold():
+    shown = CliRunner().invoke(app, ["margins", "--controller", "mpc"])
+    assert shown.exit_code == 0
+    assert "holds while no plan meets a limit" in shown.output
+    assert "limit" not in CliRunner().invoke(app, ["margins", "--controller", "lqg"]).output
 
 
 def test_both_lanes_have_the_same_bits_while_it_solves():
