@@ -49,7 +49,7 @@ def _bars(figure: Figure, grid: object, shown: Sequence[Compared]) -> None:
         alpha = 1.0 if k == 0 else 0.45
         colours = [COLOURS[n % len(COLOURS)] for n in range(len(shown))]
         bars = axes.barh(rows + 0.2 - 0.4 * k, values, 0.36, color=colours, alpha=alpha)
-        axes.bar_label(bars, [f" {v:.3g} {words}" for v in values], fontsize=8)
+        axes.bar_label(bars, [f" {v:.3g} {words}" if v < 1000.0 else f" {v:.0f} {words}" for v in values], fontsize=8)
     axes.set_yticks(rows, [run.controller for run in shown], fontsize=9)
     seen = [v for run in shown for k in _SHOWN for v in (run.figures.get(k) or {}).values()]
     right = max(seen)
@@ -58,6 +58,7 @@ def _bars(figure: Figure, grid: object, shown: Sequence[Compared]) -> None:
         left, right = axes.get_xlim()
         axes.set_xlim(left, right * (right / left) ** 0.9)  # room for the words
         axes.xaxis.set_major_formatter("{x:g}")
+        axes.set_xticks([10.0**n for n in range(-3, 7) if left <= 10.0**n <= right], minor=False)
     else:
         axes.set_xlim(0.0, 1.8 * right)
     axes.invert_yaxis()

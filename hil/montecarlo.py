@@ -197,7 +197,8 @@ def draw(study: Study, results: Sequence[Result], path: Path) -> None:
     for axes, (name, unit) in zip(panels[0], FIGURES.items(), strict=True):
         values = [v for r in results if (v := getattr(r, name)) is not None]
         axes.hist(values, bins=min(40, max(5, len(values) // 5)), color="#0072b2")
-        axes.set(xlabel=name.replace("_", " ").removesuffix(" nm") + (f" ({unit})" if unit else ""), ylabel="plants")
+        words = "Ms" if name == "peak_s" else f"{name.replace('_', ' ').removesuffix(' nm')} ({unit})"
+        axes.set(xlabel=words, ylabel="plants")
     held = [r for r in results if r.rms_error_nm is not None]
     drawn = [study.tolerances.draw(r.seed) for r in held]
     errors = [r.rms_error_nm for r in held]

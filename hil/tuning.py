@@ -218,6 +218,7 @@ def _history(axes: Any, study: optuna.Study, finished: list[Any], maximise: bool
         axes.step(numbers, (np.maximum if maximise else np.minimum).accumulate(values), where="post", color="#0072b2",
                   label="best so far")  # fmt: skip
         low, high = np.percentile(values, [0, 90] if not maximise else [10, 100])
+        low, high = min(low, values[0]), max(high, values[0])  # where it began stays in sight
         axes.set_ylim(low - 0.1 * (high - low) - 1e-9, high + 0.1 * (high - low) + 1e-9)
     missed = [t.number for t in study.get_trials(deepcopy=False) if t.state == _STATE.PRUNED]
     if missed:
