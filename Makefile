@@ -45,6 +45,7 @@ wheel: .venv/.ready
 	@echo "Building the environment in .venv (a minute or two) ..."
 	$(PYTHON) -m venv .venv
 	$(BIN)/python -m pip install --quiet --disable-pip-version-check --constraint constraints.txt --editable ".[test]"
+	$(BIN)/python -m compileall -q pkxyz_ctrl hil sim
 	@touch $@
 
 clean:
