@@ -21,7 +21,8 @@ from can.broadcastmanager import (
 from hil.clock import Lockstep
 from hil.endpoint import ErrorState
 from hil.frame_time import FrameFormatError
-from hil.wire import Wire, find_wire
+from hil.published_wires import find_wire, publish
+from hil.wire import Wire
 from pkxyz_ctrl.can.frame import Frame
 from pkxyz_ctrl.io.can_port import to_frame
 
@@ -229,7 +230,7 @@ def _existing_or_new_wire(channel: str, fd: bool | None, bitrate: int | None, da
             wire = Wire(Lockstep(), bitrate or 1_000_000, fast)
         except ValueError as error:
             raise can.CanInitializationError(f"channel {channel!r}: {error}") from error
-        wire.publish(channel)
+        publish(wire, channel)
         return wire
     for name, wanted, actual in (
         ("fd", fd, wire.data_bitrate is not None),

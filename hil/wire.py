@@ -10,7 +10,6 @@ from collections.abc import Callable
 from functools import partial
 from heapq import heapify, heappop
 from typing import NamedTuple
-from weakref import WeakValueDictionary
 
 from hil.clock import Lockstep
 from hil.disturbance import Disturbance
@@ -28,8 +27,6 @@ RECESSIVE_RUN_BITS = 11  # also what ends every frame and error frame: delimiter
 ERROR_ACK, ERROR_PROTOCOL, ERROR_BUS_OFF, ERROR_BUS, ERROR_RESTARTED = 0x020, 0x008, 0x040, 0x080, 0x100
 
 _duration_ns = direct(duration_ns_kernel, 0, 0, 0, b"", 0)
-
-_channels: "WeakValueDictionary[str, Wire]" = WeakValueDictionary()
 
 
 class WireStatistics(NamedTuple):
@@ -128,12 +125,6 @@ class Wire:
         endpoint._unplug()
         if self._end_us >= 0 and not self._has_started():
             self._arbitrate()
-
-    def publish(self, channel: str) -> None:
-        """Let ``can.Bus(interface="pkxyz-sim", channel=channel)`` find this wire for as long as it lives."""
-        if _channels.get(channel, self) is not self:
-            raise ValueError(f"channel {channel!r} is another wire's")
-        _channels[channel] = self
 
     # -- statistics --------------------------------------------------------------------------------------------------
 
@@ -402,8 +393,3 @@ class Wire:
 
     def _has_started(self) -> bool:
         return self._end_us >= 0 and self.clock.now_us * 1000 > self._start_ns
-
-
-def find_wire(channel: str) -> Wire | None:
-    """The living wire published as ``channel``."""
-    return _channels.get(channel)

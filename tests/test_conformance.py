@@ -12,6 +12,7 @@ from hil.conformance.simulated import EDS, simulated_talker
 from hil.conformance.talker import Talker
 from hil.conformance.verdict import Line, Verdict
 from hil.node import AmplifierNode
+from hil.published_wires import publish
 from hil.wire import Wire
 from pkxyz_ctrl.bus_config import BusConfig
 from pkxyz_ctrl.can.codec import ProcessCodec
@@ -151,7 +152,7 @@ class PythonCanPort:
 def test_over_a_python_can_bus_the_lines_are_the_same() -> None:
     clock = Lockstep()
     wire = Wire(clock, 1_000_000, 5_000_000)
-    wire.publish("conformance")
+    publish(wire, "conformance")
     amplifier = wire.attach("amplifier")
     node = AmplifierNode(10, clock, amplifier.send, StillPlant(), EDS, turnaround_us=2, fd=True, protection=True)
     amplifier.on_frame = node.on_frame

@@ -10,6 +10,7 @@ import cantools.database
 import pytest
 
 from hil.clock import Lockstep
+from hil.published_wires import publish
 from hil.sim_bus import SimBus, to_frame, to_message
 from hil.wire import Wire
 from pkxyz_ctrl.can.frame import Frame
@@ -47,7 +48,7 @@ def test_python_can_finds_it_by_name(channel: str) -> None:
 
 def test_it_attaches_to_a_published_wire_or_makes_one_and_refuses_other_rates(channel: str) -> None:
     wire = Wire(Lockstep(), 250_000)
-    wire.publish(channel)
+    publish(wire, channel)
     with SimBus(channel, bitrate=250_000, fd=False) as bus:
         assert bus.wire is wire
         assert bus.protocol == can.CanProtocol.CAN_20

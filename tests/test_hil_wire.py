@@ -11,7 +11,8 @@ from hypothesis import strategies as st
 
 from hil.clock import Lockstep
 from hil.frame_time import FrameFormatError, frame_duration_ns
-from hil.wire import Wire, find_wire
+from hil.published_wires import find_wire, publish
+from hil.wire import Wire
 from pkxyz_ctrl.can.frame import Frame
 
 NOMINAL, FAST = 1_000_000, 5_000_000
@@ -274,11 +275,11 @@ def test_flush_leaves_the_frame_on_the_wire_alone() -> None:
 
 def test_published_wires_are_found_while_they_live() -> None:
     wire = Wire(Lockstep(), NOMINAL)
-    wire.publish("test-wire")
-    wire.publish("test-wire")
+    publish(wire, "test-wire")
+    publish(wire, "test-wire")
     assert find_wire("test-wire") is wire
     with pytest.raises(ValueError, match="another wire"):
-        Wire(Lockstep(), NOMINAL).publish("test-wire")
+        publish(Wire(Lockstep(), NOMINAL), "test-wire")
     del wire
     gc.collect()  # a wire and what hangs on it know each other
     assert find_wire("test-wire") is None

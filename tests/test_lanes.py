@@ -12,6 +12,7 @@ import hil.blocks
 from hil import lanes
 from hil.blocks import Blocks
 from hil.lockstep import LockstepRig
+from hil.published_wires import publish
 from hil.sim_bus import to_frame, to_message
 from pkxyz_ctrl.can.frame import Frame
 from pkxyz_ctrl.config import ConfigError
@@ -134,7 +135,7 @@ def test_over_a_python_can_bus_the_bits_are_the_same(bus_name):
     rows = []
     rig = LockstepRig(short)
     channel = f"lanes {bus_name}"
-    rig.wire.publish(channel)
+    publish(rig.wire, channel)
     with can.Bus(interface="pkxyz-sim", channel=channel, receive_error_frames=False) as python_can:
         port = PythonCanPort(python_can, rig)
         rig.port, rig.controller._send = port, port.send
