@@ -2,11 +2,13 @@
 
     python docs/figures/faults.py [SOAK.JSON]
 
-The soak's line is written only where the result of ``pkxyz soak --out`` is given: it takes ten minutes.
+The soak's line and picture are taken over only where the result of ``pkxyz soak --out`` is given: that takes ten
+minutes.
 """
 
 import json
 import re
+import shutil
 import sys
 from pathlib import Path
 
@@ -61,7 +63,7 @@ def soaked(path: Path) -> str:
         f"time, {s['recorded_ticks']} of them read back; {s['faults']} faults, {s['decisions']} decisions, "
         f"{s['returns']} times back to tracking; memory {s['memory_mb'][1]:.0f} MB after two minutes and "
         f"{s['memory_mb'][-1]:.0f} MB at the end; damaged: {'yes' if s['damaged'] else 'no'}. The most frequent "
-        f"reasons: {reasons}."
+        f"reasons: {reasons}.\n\n![memory, faults, decisions and returns, minute by minute](figures/soak.png)"
     )
 
 
@@ -80,6 +82,7 @@ def main() -> None:
     page = filled_in(page, "matrix", matrix([o for o in found if o.law == "lqg"]))
     if len(sys.argv) > 1:
         page = filled_in(page, "soak", soaked(Path(sys.argv[1])))
+        shutil.copy(Path(sys.argv[1]).with_name("soak.png"), HERE / "soak.png")
     PAGE.write_text(page, encoding="utf-8")
     for outcome in found:
         if not outcome.ok:
