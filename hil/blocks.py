@@ -4,6 +4,7 @@ Where the run learns, a block ends when a window of it does, so that what was se
 """
 
 from collections.abc import Callable
+from functools import lru_cache
 
 import numpy as np
 from numpy.typing import NDArray
@@ -19,6 +20,12 @@ BLOCK_TICKS = 4096
 PREVIEW_ROWS = 25
 """Rows of the reference that the law may look at past its own: two periods of delay, the longest horizon of a plan, and
 the intervals after them."""
+
+
+@lru_cache(maxsize=4)
+def _sampled(trajectory: Trajectory, first: int, count: int, period_us: int) -> NDArray[np.float64]:
+    """Rows that nobody writes to: a study runs one scan again and again."""
+    return trajectory.sample(first, count, period_us)
 
 
 class Handout:
@@ -49,7 +56,7 @@ class Handout:
         """
         first, count = int(memory["reference_tick"][0]), ticks + PREVIEW_ROWS
         memory["input"]["reference_base"] = first
-        rows = self._trajectory.sample(first, count, self._period_us)
+        rows = _sampled(self._trajectory, first, count, self._period_us)
         if self._excitation is None and self._learner is None:
             return rows
         added = np.zeros((count, 3)) if self._excitation is None else self._excitation.sample(first, count)

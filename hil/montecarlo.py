@@ -7,7 +7,6 @@ import json
 import math
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, replace
-from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -17,7 +16,7 @@ from hil import lanes
 from hil.loop_margins import Loop
 from hil.metrics import Metrics
 from hil.scenario import Scenario, resolve
-from hil.workers import as_done, hands
+from hil.workers import as_done, given, hands
 from pkxyz_ctrl import config
 from pkxyz_ctrl.config import ConfigError
 from pkxyz_ctrl.design.loop_plant import Perturbation
@@ -158,7 +157,7 @@ def run_study(
 
 
 def _all_done(pool: Any, width: int, study: Study, seeds: list[int]) -> Iterator[tuple[int, Result]]:
-    return as_done(pool, width, partial(run_one, study), seeds)
+    return as_done(pool, width, given(run_one, study), seeds)
 
 
 def summary(results: Sequence[Result]) -> dict[str, Any]:

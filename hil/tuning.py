@@ -16,7 +16,7 @@ import optuna
 import tomlkit
 
 from hil.search import Problem, Worth, evaluate, put
-from hil.workers import as_done, hands
+from hil.workers import as_done, given, hands
 from pkxyz_ctrl.config import ConfigError
 
 _DIGITS = 4
@@ -91,7 +91,7 @@ def search(
 
     try:
         with hands(workers, scheduler) as (pool, width):
-            valued = as_done(pool, width, partial(_valued, problem), choices())
+            valued = as_done(pool, width, given(_valued, problem), choices())
             for done, ((number, _), worth) in enumerate(valued, start=1):
                 _tell(study, asked.pop(number), worth)
                 on_progress(done, trials)

@@ -6,9 +6,11 @@ thread, so that as many processes as cores don't get into each other's way.
 
 import multiprocessing
 import os
+import pickle
 from collections.abc import Callable, Iterable, Iterator
 from concurrent.futures import FIRST_COMPLETED, Executor, Future, ProcessPoolExecutor, wait
 from contextlib import contextmanager
+from functools import lru_cache, partial
 from typing import Any, TypeVar, cast
 
 from pkxyz_ctrl.config import ConfigError
@@ -52,6 +54,22 @@ def hands(workers: int, scheduler: str | None = None) -> Iterator[tuple[Executor
         if threads == 0:
             raise ConfigError(f"--dask: the scheduler at {scheduler} has no workers; start some with 'dask worker'")
         yield client.get_executor(pure=False), threads
+
+
+def given(function: Callable[[Any, Item], Result], constant: object) -> Callable[[Item], Result]:
+    """``function`` with its first argument, for ``as_done``: each process unpacks it once and keeps it, with all that
+    it has worked out about it.
+    """
+    return partial(_with_constant, function, pickle.dumps(constant))
+
+
+def _with_constant(function: Callable[[Any, Item], Result], packed: bytes, item: Item) -> Result:
+    return function(_unpacked(packed), item)
+
+
+@lru_cache(maxsize=4)
+def _unpacked(packed: bytes) -> object:
+    return pickle.loads(packed)
 
 
 def as_done(

@@ -5,13 +5,12 @@ montecarlo` and `pkxyz tune` use them.
 import gc
 import statistics
 import time
-from functools import partial
 
 from hil.bench.figure import Figure
 from hil.montecarlo import Study, run_one
 from hil.scenario import load_scenario
 from hil.search import evaluate, load_problem
-from hil.workers import as_done, hands
+from hil.workers import as_done, given, hands
 from pkxyz_ctrl.config import load
 from pkxyz_ctrl.design.tolerances import Tolerances
 
@@ -31,12 +30,12 @@ def study() -> list[Figure]:
     stage_s = plants.scenario.config.duration_s
     walls, busy = [], []
     with hands(WORKERS) as (pool, width):
-        list(as_done(pool, width, partial(_timed, plants), range(4 * WORKERS)))
+        list(as_done(pool, width, given(_timed, plants), range(4 * WORKERS)))
         for n in range(ROUNDS):
             gc.collect()
             begin = time.perf_counter()
             seeds = range(1000 * (n + 1), 1000 * (n + 1) + PLANTS)
-            busy.append(sum(cpu_s for _, cpu_s in as_done(pool, width, partial(_timed, plants), seeds)))
+            busy.append(sum(cpu_s for _, cpu_s in as_done(pool, width, given(_timed, plants), seeds)))
             walls.append(time.perf_counter() - begin)
         list(as_done(pool, width, _trial, range(2 * WORKERS)))
         trial_s = [cpu_s for _, cpu_s in as_done(pool, width, _trial, range(2 * WORKERS, TRIALS))]
