@@ -6,7 +6,8 @@ Circles all the while, over Unix sockets, with the garbage collector off, as eve
 resident memory of controller, plant and the recording's writer; blocks that Python has allocated; bytes that
 tracemalloc counts, which slows the loop a little. Writes JSON and, beside it, a picture; exit code 1 if something grew.
 Monitors of punctuality are off, and the node is patient; where a busy machine loses frames all the same, the fault is
-cleared a second later, since a loop in FAULT would show nothing.
+cleared a second later, since a loop in FAULT would show nothing. What a fault and its clear leave behind, a sentence,
+the emergencies, the garbage of a start-up, is counted apart.
 """
 
 import argparse
@@ -26,6 +27,7 @@ import matplotlib
 matplotlib.use("Agg")
 import matplotlib.pyplot as plt
 import numpy as np
+from numpy.typing import NDArray
 
 from hil.bench.suite import describe_machine
 from hil.ending import Ended, Ending
@@ -38,12 +40,15 @@ from pkxyz_ctrl.io.realtime import go_real_time, leave_real_time, settle_memory
 from pkxyz_ctrl.row import ROW
 from pkxyz_ctrl.safety.modes import LOOP_CLOSED, Mode
 
+Array = NDArray[np.float64]
+
 OUT = Path(__file__).parents[1] / "docs" / "figures" / "endurance.json"
 PUNCTUALITY = ("stale", "sequence", "innovation", "residual", "unexplained_force", "saturation", "overrun")
 WARM_UP_SHARE, WARM_UP_MAX_S = 0.3, 60.0
 GROWTH_MAX_KB, GROWTH_MAX_BLOCKS, GROWTH_MAX_TRACED_KB = 256, 100, 16
 """A byte kept of each of 1.2 million ticks would be 1200 kB."""
 CIRCLE_HZ = 20.0
+RESTART_S = 3
 WHO = ("controller", "plant", "writer")
 SCENARIO = """
 name = "endurance"
@@ -85,7 +90,8 @@ class Witness(WallRecorder):
         self._rig: WallRig | None = None
         self.clears = 0
         self.closed_ticks = self.skipped_ticks = self.ticks = self.count = 0
-        self.notes = np.zeros((ticks // self._every + 1, 5), np.int64)  # three resident kB, blocks, traced bytes
+        self.notes = np.zeros((ticks // self._every + 1, 6), np.int64)
+        """three resident kB, blocks, traced bytes, clears"""
 
     def watch(self, plant_pid: int, rig: WallRig) -> None:
         """Whose memory to look at, besides that of the two processes that are known here; whose faults to clear."""
@@ -108,6 +114,7 @@ class Witness(WallRecorder):
             if self._rig is not None and self._rig.controller.mode in (Mode.FAULT, Mode.BOOT):
                 self._rig.controller.clear()
                 self.clears += 1
+                note[5] = 1
 
 
 def scenario_of(folder: Path, minutes: float, bus: str) -> Scenario:
@@ -161,6 +168,7 @@ def run(minutes: float, bus: str) -> dict[str, Any]:
         "skipped_ticks": recorder.skipped_ticks,
         "faults": rig.controller.faults,
         "clears": recorder.clears,
+        "cleared_s": np.flatnonzero(notes[:, 5]).tolist(),
         "machine": machine,
         "resident_kb": {name: notes[:, place].tolist() for place, name in enumerate(WHO)},
         "allocated_blocks": notes[:, 3].tolist(),
@@ -189,12 +197,15 @@ def _controlled(recorder: Witness, setup: Any, plant_pid: int) -> WallRig:
 
 
 def judged(result: dict[str, Any]) -> dict[str, Any]:
-    """By how much each has grown since the warm-up, its second half against its first, and whether that is nothing."""
+    """By how much each has grown since the warm-up, its second half against its first, and whether that is nothing;
+    what came with a fault and its clear is left out, and told by itself.
+    """
     seconds = len(result["allocated_blocks"])
     begin = int(min(WARM_UP_MAX_S, WARM_UP_SHARE * seconds))
+    cleared = [s for s in result["cleared_s"] if s >= begin]
 
     def grown(values: list[int]) -> float:
-        kept = values[begin:]
+        kept = loop_alone(values, result["cleared_s"])[begin:]
         half = len(kept) // 2
         return float(np.median(kept[half:]) - np.median(kept[:half])) if half else float("nan")
 
@@ -203,7 +214,21 @@ def judged(result: dict[str, Any]) -> dict[str, Any]:
     limits = dict.fromkeys((f"{name}_kb" for name in WHO), GROWTH_MAX_KB)
     limits |= {"blocks": GROWTH_MAX_BLOCKS, "traced_kb": GROWTH_MAX_TRACED_KB}
     ok = all(abs(growth[name]) <= limit for name, limit in limits.items()) and result["closed_share"] > 0.9
-    return {"warm_up_s": begin, "growth": growth, "growth_max": limits, "ok": ok}
+    traced = np.array(result["traced_bytes"][begin:])
+    alone = loop_alone(result["traced_bytes"], result["cleared_s"])[begin:]
+    of_faults = (traced[-1] - traced[0]) - (alone[-1] - alone[0])
+    return {
+        "warm_up_s": begin, "growth": growth, "growth_max": limits, "ok": ok,
+        "traced_kb_per_clear": float(of_faults) / 1000 / len(cleared) if cleared else None,
+    }  # fmt: skip
+
+
+def loop_alone(values: list[int], cleared_s: list[int]) -> Array:
+    """The series without its steps in seconds in which a fault was decided, cleared, and the node started anew."""
+    steps = np.diff(np.array(values, dtype=np.float64), prepend=values[0])
+    for second in cleared_s:
+        steps[second : second + RESTART_S] = 0.0
+    return values[0] + np.cumsum(steps)
 
 
 def draw(result: dict[str, Any], path: Path) -> None:
@@ -216,9 +241,12 @@ def draw(result: dict[str, Any], path: Path) -> None:
     above.legend(frameon=False, fontsize=8, ncols=3)
     below.plot(t_min, np.array(result["traced_bytes"]) / 1000, color="#1f5f8b", label="tracemalloc, kB")
     blocks = np.array(result["allocated_blocks"])
-    below.plot(
-        t_min, blocks - blocks[result["warm_up_s"]], color="#c0392b", label="allocated blocks, since the warm-up"
-    )
+    alone = loop_alone(result["allocated_blocks"], result["cleared_s"])
+    for kept, style, name in ((blocks, ":", "with what faults leave"), (alone, "-", "of the loop alone")):
+        label = f"blocks since the warm-up, {name}"
+        below.plot(t_min, kept - kept[result["warm_up_s"]], style, color="#c0392b", label=label)
+    for n, second in enumerate(result["cleared_s"]):
+        below.axvline(second / 60.0, color="#d8b365", lw=0.8, zorder=0, label="a fault" if n == 0 else None)
     below.set_xlabel("minutes")
     below.legend(frameon=False, fontsize=8, ncols=2)
     for axes in (above, below):
