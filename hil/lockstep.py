@@ -157,10 +157,10 @@ class _Recorder:
 
     def __call__(self, tick: int) -> None:
         rows, at = self._rows, self._at
-        truth_at = at + _TRUTH_AT
-        self._at = end = at + _ROW_BYTES
+        truth_at, end = at + _TRUTH_AT, at + _ROW_BYTES
         rows[at:truth_at] = self._row
         rows[truth_at:end] = self._truth
+        self._at = end  # last: a row counts once it is whole
 
     def finish(self) -> None:
         """Hand on the rows that wait."""

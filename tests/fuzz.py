@@ -20,7 +20,7 @@ from pkxyz_ctrl.can.codec import ProcessCodec
 from pkxyz_ctrl.can.driver import AmplifierDriver, DriverState
 from pkxyz_ctrl.can.driver_config import DriverConfig
 from pkxyz_ctrl.can.emergency import decode_emergency
-from pkxyz_ctrl.can.frame import UNUSUAL, Frame
+from pkxyz_ctrl.can.frame import ERROR, EXTENDED, FD_FAST, REMOTE, UNUSUAL, Frame
 from pkxyz_ctrl.can.sdo import parse_reply
 from pkxyz_ctrl.can.startup import configuration_steps, identity_steps
 from pkxyz_ctrl.safety.gate import GateConfig, TransmitGate
@@ -93,7 +93,7 @@ class Traffic:
 
     def _bent(self, frame: Frame) -> Frame:
         rng = self._rng
-        can_id, data, is_fd, switch, remote, extended, error = frame
+        can_id, data, flags = frame
         match rng.randrange(6):
             case 0 | 1:
                 changed = bytearray(data)
@@ -108,8 +108,8 @@ class Traffic:
             case 4:
                 can_id = rng.randrange(0x800) if rng.random() < 0.8 else rng.randrange(1 << 29)
             case 5:
-                remote, extended, error = (rng.random() < 0.4 for _ in range(3))
-        return Frame(can_id, data, is_fd, switch, remote, extended, error)
+                flags = flags & FD_FAST | sum(flag for flag in (REMOTE, EXTENDED, ERROR) if rng.random() < 0.4)
+        return Frame._make((can_id, data, flags))
 
 
 class ViolationError(AssertionError):

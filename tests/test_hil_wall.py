@@ -127,11 +127,13 @@ def until_driven(bus):
         driven += message is not None and message.arbitration_id == 0x30A and any(message.data[:6])
 
 
-def truth_of(folder, rows):
-    """The true positions (n, 3) that belong to rows of a recording, NaN where the sense frame did not come."""
+def truth_of(folder, rows, since):
+    """The true positions (n, 3) that belong to rows of a recording, NaN where the sense frame did not come. ``since``:
+    how many samples of the truth are older than the run.
+    """
     truth = np.fromfile(folder / "truth.bin", TRUTH)
     place = {}
-    for index, counts in enumerate(truth["sense_count"].tolist()):
+    for index, counts in enumerate(truth["sense_count"][since:].tolist(), start=since):
         place.setdefault(tuple(counts), []).append(index)
     positions, last = np.full((len(rows), 3), np.nan), -1
     for row, (counts, status) in enumerate(rows):
@@ -142,42 +144,54 @@ def truth_of(folder, rows):
     return positions
 
 
+def undisturbed(bench, out_name):
+    """Trajectory ticks (n,) and true positions (n, 3) of a run, from 30 periods after any tick that was missed."""
+    since = (bench / "truth.bin").stat().st_size // TRUTH.itemsize
+    with controller(bench, "on_slow.toml", "--bus", "slow.toml", "--out", out_name, "--json") as run:
+        out, err = run.communicate(timeout=120)
+        assert run.returncode == 0, err
+    summary = json.loads(out)
+    assert summary["faults"] == []
+    assert "real time: " in err
+    recording = Recording.open(bench / out_name / "recording.parquet")
+    status, overrun = recording["sense_status"], recording["overrun"]
+    assert summary["missed_ticks"] == overrun.sum() + (status & 1).sum()
+    assert recording.ticks == 1800
+    position = truth_of(bench, list(zip(recording.vector("sense_count").tolist(), status, strict=True)), since)
+    disturbed = np.convolve((overrun > 0) | (status != 0), np.ones(30))[: recording.ticks] > 0
+    tick = recording["reference_tick"]
+    usable = (tick >= 0) & ~disturbed & ~np.isnan(position[:, 0])
+    return tick[usable], position[usable]
+
+
 def test_trajectories_agree_with_lockstep_within_the_noise(bench, changes):
-    """Ticks 30 periods after any that was missed are compared: the stage's swing has died away by then.
+    """Ticks 30 periods after any that was missed are compared: the stage's swing has died away by then. A machine that
+    stands still may leave too few of them, and then it runs again.
 
     Same plant, same seed. The samples' noise is drawn in order, so it is the same only until the first missed tick:
     two independent draws differ by sqrt(2) times the noise of one, and a millisecond's jitter of 5 us at 20 um/s is
     0.1 nm.
     """
     changes("pre-operational", False)
-    with controller(bench, "on_slow.toml", "--bus", "slow.toml", "--out", "agree", "--json") as run:
-        out, err = run.communicate(timeout=120)
-        assert run.returncode == 0, err
-    summary = json.loads(out)
-    assert summary["faults"] == []
-    assert "real time: " in err
-    recording = Recording.open(bench / "agree" / "recording.parquet")
-    status, overrun = recording["sense_status"], recording["overrun"]
-    position = truth_of(bench, list(zip(recording.vector("sense_count").tolist(), status, strict=True)))
-    assert summary["missed_ticks"] == overrun.sum() + (status & 1).sum()
-    assert recording.ticks == 1800
-
     blocks = []
     setup = load_scenario(bench / "on_slow.toml").setup()
     lanes.run(setup, "lockstep", on_block=lambda block: blocks.append(block.copy()))
     exact = np.concatenate(blocks)
     exact = exact[exact["mode"] == Mode.TRACKING]
+    for attempt in range(3):
+        tick, position = undisturbed(bench, f"agree{attempt}")
+        tick, position = tick[tick < len(exact)], position[tick < len(exact)]
+        if len(tick) > 300 and np.ptp(position, axis=0).max() > 15e-6:
+            break
+        changes("pre-operational", False)
+    else:
+        pytest.fail("in three runs the machine left too little to compare")
 
-    disturbed = np.convolve((overrun > 0) | (status != 0), np.ones(30))[: recording.ticks] > 0
-    tick = recording["reference_tick"]
-    usable = (tick >= 0) & (tick < len(exact)) & ~disturbed & ~np.isnan(position[:, 0])
-    assert usable.sum() > 300
-    difference_nm = 1e9 * (position[usable] - exact["position_m"][tick[usable]])
-    moving = tick[usable] > 500
+    difference_nm = 1e9 * (position - exact["position_m"][tick])
+    moving = tick > 500
     noise_nm = 1e9 * (exact["position_m"] - exact["reference_m"])[-300:].std(axis=0)
     assert (np.median(np.abs(difference_nm[moving]), axis=0) < 2 * noise_nm + 0.5).all()
     assert (np.abs(difference_nm.mean(axis=0)) < 3 * noise_nm).all()
-    assert np.ptp(position[usable], axis=0).max() > 15e-6
 
 
 def test_killed_controller_leaves_0_v_within_the_heartbeat_time(bench, changes):
