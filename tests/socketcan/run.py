@@ -25,7 +25,7 @@ ROOT = Path(__file__).parent.parent.parent
 SCRATCH = ROOT / ".uml"
 PACKAGES = {"user-mode-linux": "usr/bin/linux.uml", "busybox-static": "bin/busybox"}
 MODULES = ("drivers/net/can/dev/can-dev", "drivers/net/can/vcan", "net/can/can", "net/can/can-raw")
-LONGEST_S = 900
+LONGEST_S = 590
 MEMORY = "2G"  # of which a guest takes what it uses
 
 INIT = """#!{busybox} sh
