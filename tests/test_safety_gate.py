@@ -10,7 +10,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from pkxyz_ctrl.can.driver_config import DriverConfig
-from pkxyz_ctrl.can.frame import FD, Frame
+from pkxyz_ctrl.can.frame import FD, REMOTE, Frame
 from pkxyz_ctrl.can.sdo import request
 from pkxyz_ctrl.can.startup import configuration_steps, identity_steps
 from pkxyz_ctrl.safety.gate import GateConfig, TransmitGate
@@ -175,7 +175,8 @@ def test_clear_keeps_the_slew_limit() -> None:
 
 def test_fd_frames_only_where_the_bus_carries_them() -> None:
     classic = GateConfig(count_max=100, count_slew_max=10, period_us=T, fd=False)
-    assert not passes(TransmitGate(classic), sync())
+    assert "format that this bus does not carry" in str(TransmitGate(classic).check(sync(), Mode.TRACKING, T))
+    assert "not a plain data frame" in str(TransmitGate(classic).check(sync()._replace(flags=REMOTE), Mode.TRACKING, T))
     assert passes(TransmitGate(classic), sync()._replace(flags=0))
     assert passes(TransmitGate(CONFIG), sync()._replace(flags=0))
     assert passes(TransmitGate(CONFIG), sync()._replace(flags=FD))
