@@ -10,7 +10,8 @@ import typer
 from rich.console import Console
 from rich.markup import escape
 
-from pkxyz_ctrl.config import CONFIG_DIR, ConfigError, load
+from hil.outputs import folder_to_write, writing
+from pkxyz_ctrl.config import CONFIG_DIR, load
 
 if TYPE_CHECKING:
     from hil.conformance.talker import Talker
@@ -38,7 +39,7 @@ def check_amplifier(
     config = load("buses", bus, BusConfig)
     path = eds if eds is not None else CONFIG_DIR / "comb_amplifier.eds"
     if out is not None:
-        _require_folder(out)
+        folder_to_write(out)
     with _talker(config, path, allow_voltage) as talker:
         lines = run_all(talker, (lambda line: None) if as_json else _show)
         result = report.as_json(talker, path.name, lines)
@@ -83,17 +84,6 @@ def _show(line: "Line") -> None:
         _screen.print(f"{'':10} {'expected':45} {escape(line.expected)}", soft_wrap=True)
 
 
-def _require_folder(out: Path) -> None:
-    try:
-        out.mkdir(parents=True, exist_ok=True)
-    except OSError as error:
-        raise ConfigError(f"{out}: cannot be made a folder: {error.strerror}; give another with --out") from None
-
-
 def _save(out: Path, name: str, text: str) -> None:
-    try:
+    with writing(out):
         (out / name).write_text(text, encoding="utf-8")
-    except OSError as error:
-        raise ConfigError(
-            f"{out / name}: cannot be written: {error.strerror}; give another folder with --out"
-        ) from None

@@ -3,8 +3,10 @@
 import itertools
 import json
 import os
+import signal
 import sys
 import tomllib
+from collections.abc import Callable
 from pathlib import Path
 from typing import Annotated, Any, NoReturn
 
@@ -28,6 +30,8 @@ from hil import (
     tune_cli,
 )
 from hil.choices import Lane
+from hil.first_run import say_if_compiling
+from hil.outputs import what_to_do
 from pkxyz_ctrl.config import CONFIG_DIR, ConfigError, names
 
 app = typer.Typer(
@@ -47,18 +51,36 @@ KINDS = ("scenarios", "stages", "plants", "controllers", "buses", "tolerances", 
 def main() -> NoReturn:
     """Entry point: runs the command line and turns what can go wrong into one line each and an exit code."""
     os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")  # small matrices: threads would only wait for each other
+    code = 0
     try:
-        code = app(standalone_mode=False)  # what typer.Exit said, or the command's None
+        command = typer.main.get_command(app)
+        with command.make_context("pkxyz", sys.argv[1:] or ["--help"]) as context:
+            command.invoke(context)
+        sys.stdout.flush()
+    except typer.Exit as done:
+        code = done.exit_code
     except ConfigError as error:
         _fail(str(error))
-    except KeyboardInterrupt:
-        _notes.print("interrupted")
-        sys.exit(130)
-    except Exception as error:
+    except BrokenPipeError:  # whoever read our output has seen enough
+        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
+        code = 128 + signal.SIGPIPE
+    except BaseException as error:
+        if _was_interrupted(error):
+            _notes.print("interrupted")
+            sys.exit(130)
+        if isinstance(error, OSError) and (line := what_to_do(error)) is not None:
+            _fail(line)
         if (message := getattr(error, "format_message", None)) is None:
             raise
         _fail(f"{message().replace('Value error, ', '')} (see --help)")  # wrong usage, in the words of the parser
     sys.exit(code)
+
+
+def _was_interrupted(error: BaseException | None) -> bool:
+    """Ctrl-C, also where a library that was being imported made another error of it."""
+    while error is not None and not isinstance(error, KeyboardInterrupt):
+        error = error.__cause__ or error.__context__
+    return error is not None
 
 
 def _fail(message: str) -> NoReturn:
@@ -107,7 +129,7 @@ def sil(
     """Close the loop on a scenario; exit code 0 if its checks hold, 1 if not, 2 for bad input or a full disk, 130 if
     interrupted.
     """
-    _say_if_compiling(quiet=as_json)
+    say_if_compiling(quiet=as_json)
     from hil.faults.fault import parse
     from hil.scenario import load_scenario
 
@@ -153,25 +175,29 @@ def configs(as_json: Annotated[bool, typer.Option("--json", help="Print JSON.")]
     _screen.print(table)
 
 
-app.command("sil")(sil)
-app.command("configs")(configs)
-app.command("run")(run_cli.run)
-app.command("plant")(run_cli.plant)
-app.command("replay")(replay_cli.replay)
-app.command("latency")(latency_cli.latency)
-app.command("margins")(margins_cli.margins)
-app.command("montecarlo")(montecarlo_cli.montecarlo)
-app.command("tune")(tune_cli.tune)
-app.command("compare")(compare_cli.compare)
-app.command("identify")(identify_cli.identify)
-app.command("paper")(mechanics_cli.paper)
-app.command("workspace")(mechanics_cli.workspace)
-app.command("design")(mechanics_cli.design)
-app.command("linearisation")(mechanics_cli.linearisation)
-app.command("check-amplifier")(check_amplifier_cli.check_amplifier)
-app.command("bench")(bench_cli.bench)
-app.command("faults")(faults_cli.faults)
-app.command("soak")(soak_cli.soak)
+_COMMANDS: tuple[tuple[str, Callable[..., None], str], ...] = (
+    ("sil", sil, "Close the loop on a scenario, in one process."),
+    ("compare", compare_cli.compare, "All laws on one scenario and plant."),
+    ("margins", margins_cli.margins, "How far a law is from instability."),
+    ("identify", identify_cli.identify, "Measure the stage in its running loop."),
+    ("tune", tune_cli.tune, "Better numbers for a controller file."),
+    ("montecarlo", montecarlo_cli.montecarlo, "A law against many drawn plants."),
+    ("faults", faults_cli.faults, "Break everything once, under each law."),
+    ("soak", soak_cli.soak, "Half an hour under random faults."),
+    ("replay", replay_cli.replay, "A recording once more through the tick."),
+    ("run", run_cli.run, "Control an amplifier at rate."),
+    ("plant", run_cli.plant, "Serve amplifier and plant for run."),
+    ("check-amplifier", check_amplifier_cli.check_amplifier, "May this amplifier be enabled?"),
+    ("latency", latency_cli.latency, "How late this machine wakes up."),
+    ("paper", mechanics_cli.paper, "The paper's numbers beside ours."),
+    ("workspace", mechanics_cli.workspace, "What the platform reaches and can hold."),
+    ("design", mechanics_cli.design, "Dimensions from requirements."),
+    ("linearisation", mechanics_cli.linearisation, "What one constant Jacobian costs."),
+    ("configs", configs, "What is shipped."),
+    ("bench", bench_cli.bench, "What is promised, measured."),
+)
+for _name, _command, _words in _COMMANDS:
+    app.command(_name, short_help=_words)(_command)
 
 
 def _run_with_progress(folder: Any, scenario: Any, lane: str, *, quiet: bool) -> dict[str, Any]:
@@ -190,15 +216,6 @@ def _run_with_progress(folder: Any, scenario: Any, lane: str, *, quiet: bool) ->
     with Progress(*columns, console=_notes, transient=True) as progress:
         task = progress.add_task(f"{scenario.config.name}, {lane} lane", total=None)
         return run_into(folder, scenario, lane, lambda done, total: progress.update(task, completed=done, total=total))
-
-
-def _say_if_compiling(*, quiet: bool) -> None:
-    """The first run compiles for a minute or so; nobody should think that it hangs."""
-    from pkxyz_ctrl.cycle import cycle
-
-    cache = getattr(cycle, "_cache", None)  # absent when the compiler is switched off
-    if not quiet and cache is not None and not any(Path(cache.cache_path).glob("cycle.cycle-*.nbi")):
-        _notes.print("First run here: compiling the kernels, which takes a minute or two. The next run starts at once.")
 
 
 def _show(summary: dict[str, Any], folder: Path) -> None:

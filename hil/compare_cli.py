@@ -9,6 +9,8 @@ from rich.console import Console
 from rich.table import Table
 
 from hil.choices import Lane
+from hil.first_run import say_if_compiling
+from hil.outputs import picture_to_write
 from hil.progress import progress_bar
 
 if TYPE_CHECKING:
@@ -36,6 +38,8 @@ def compare(
     from hil.compare import compare as run_all
     from hil.compare_figure import draw
 
+    picture_to_write(out, "--out")
+    say_if_compiling(quiet=as_json)
     names = tuple(name.strip() for name in controllers.split(",") if name.strip()) or DEFAULT
     with progress_bar("laws", quiet=as_json) as tell:
         runs = run_all(scenario, names, stage=stage, plant=plant, seed=seed, lane=lane.value, on_progress=tell)

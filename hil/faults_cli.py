@@ -2,8 +2,7 @@
 
 import json
 from collections.abc import Callable
-from concurrent.futures import ProcessPoolExecutor, as_completed
-from multiprocessing import get_context
+from concurrent.futures import as_completed
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
@@ -11,6 +10,9 @@ import typer
 from rich.console import Console
 from rich.table import Table
 
+from hil.first_run import say_if_compiling
+from hil.outputs import folder_to_write, writing
+from hil.processes import processes
 from pkxyz_ctrl.config import ConfigError, names
 
 if TYPE_CHECKING:
@@ -19,6 +21,8 @@ if TYPE_CHECKING:
 
 _screen = Console(highlight=False)
 _notes = Console(stderr=True, highlight=False)
+INTERRUPTED = "interrupted"
+"""Why a law is not among the results."""
 _CHUNKS = 3  # of the matrix for each law, so that the last process does not run alone for long
 
 
@@ -37,7 +41,7 @@ def faults(
 ) -> None:
     """Break everything once under each law: who notices, after how many ticks, and what the combs did meanwhile.
 
-    Exit code 0 if every bound held, 1 if not, 2 for bad input.
+    Exit code 0 if every bound held, 1 if not, 2 for bad input, 130 if interrupted (laws that are through are kept).
     """
     from hil.faults.matrix import CASES
     from hil.faults.outcome import as_json as plain
@@ -49,36 +53,39 @@ def faults(
             f"--only: no fault holds {' or '.join(only or [])}; there are {', '.join(c.text for c in CASES)}"
         )
     if out is not None:
-        _require_folder(out)
+        folder_to_write(out)
+    say_if_compiling(quiet=as_json)
     outcomes, refused = run_matrix(laws, cases, workers, quiet=as_json)
-    if law and refused:
+    interrupted = INTERRUPTED in refused.values()
+    if interrupted and not outcomes:
+        raise KeyboardInterrupt
+    if law and refused and not interrupted:
         raise ConfigError("\n".join(refused.values()))
     laws = [name for name in laws if name not in refused]
     result = {
-        "ok": all(o.ok for o in outcomes), "laws": laws, "refused": refused, "outcomes": [plain(o) for o in outcomes],
+        "ok": all(o.ok for o in outcomes), "laws": laws, "refused": refused, "interrupted": interrupted,
+        "outcomes": [plain(o) for o in outcomes],
     }  # fmt: skip
     if out is not None:
         from hil.faults.picture import draw
 
-        try:
+        with writing(out):
             (out / "faults.json").write_text(json.dumps(result, indent=1) + "\n", encoding="utf-8")
             draw(outcomes, cases, out / "faults.png")
-        except OSError as error:
-            raise ConfigError(f"--out: {out}: {(error.strerror or str(error)).lower()}; give another folder") from None
     if as_json:
         print(json.dumps(result))
     else:
         _show(outcomes, cases, laws)
         for name, reason in refused.items():
             _screen.print(f"[dim]not run under {name}: {reason}[/]", soft_wrap=True)
-    raise typer.Exit(0 if result["ok"] else 1)
+    raise typer.Exit(130 if interrupted else 0 if result["ok"] else 1)
 
 
 def run_matrix(
     laws: list[str], cases: "list[Case]", workers: int, *, quiet: bool
 ) -> "tuple[list[Outcome], dict[str, str]]":
     """Every case under every law, over processes, in the order of laws and cases; and the laws that can't be run here,
-    with the reason.
+    with the reason; interrupted, those that are not through.
     """
     from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn
 
@@ -97,11 +104,16 @@ def run_matrix(
                 found[law, first] = outcomes
             progress.update(task, advance=size, description=law)
 
-        if workers == 1:
-            for law, first, some in chunks:
-                done(law, first, _run_chunk(law, some))
-        else:
-            _over_processes(chunks, workers, done)
+        try:
+            if workers == 1:
+                for law, first, some in chunks:
+                    done(law, first, _run_chunk(law, some))
+            else:
+                _over_processes(chunks, workers, done)
+        except KeyboardInterrupt:
+            for law, first, _ in chunks:
+                if (law, first) not in found:
+                    refused.setdefault(law, INTERRUPTED)
     keys = [(law, first) for law, first, _ in chunks if law not in refused]
     return [outcome for key in keys for outcome in found[key]], refused
 
@@ -109,7 +121,7 @@ def run_matrix(
 def _over_processes(
     chunks: "list[tuple[str, int, list[Case]]]", workers: int, done: "Callable[[str, int, list[Outcome] | str], None]"
 ) -> None:
-    with ProcessPoolExecutor(workers or None, mp_context=get_context("spawn")) as pool:
+    with processes(workers or None) as pool:
         waiting = {pool.submit(_run_chunk, law, some): (law, first) for law, first, some in chunks}
         for future in as_completed(waiting):
             done(*waiting[future], future.result())
@@ -152,10 +164,3 @@ def _show(outcomes: "list[Outcome]", cases: "list[Case]", laws: list[str]) -> No
 
 def _or_dash(value: float | None, form: str) -> str:
     return "-" if value is None else format(value, form)
-
-
-def _require_folder(out: Path) -> None:
-    try:
-        out.mkdir(parents=True, exist_ok=True)
-    except OSError as error:
-        raise ConfigError(f"--out: {out}: {(error.strerror or str(error)).lower()}; give another folder") from None

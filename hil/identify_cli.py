@@ -8,8 +8,10 @@ import typer
 from rich.console import Console
 from rich.table import Table
 
-from hil.choices import Lane, Tones
+from hil.choices import Lane, Tones, operating_strokes
+from hil.first_run import say_if_compiling
 from hil.one_line_errors import one_line_errors
+from hil.outputs import folder_to_write, writing
 from hil.progress import progress_bar
 from pkxyz_ctrl.config import ConfigError, find, load
 
@@ -62,8 +64,6 @@ def identify(
     """
     from dataclasses import replace
 
-    import numpy as np
-
     from hil.identification import as_data
     from hil.identification import identify as identified
     from hil.outside_scale import outside_scale, read_points
@@ -75,7 +75,15 @@ def identify(
     on_bus, config = load("buses", bus, BusConfig), load("controllers", controller, ControllerConfig)
     if lane is Lane.LOCKSTEP and on_bus.can is None:
         raise ConfigError(f"bus {on_bus.name!r} has no [can] and carries no frames; use --lane fast")
-    strokes = np.full(3, 12.5e-6) if at_um is None else np.array(at_um) * 1e-6
+    if config.law == "open_loop":
+        raise ConfigError(
+            f"controller {config.name!r} only feeds forward: what is added to the measurement never reaches its combs; "
+            "choose another --controller"
+        )
+    if out is not None:
+        folder_to_write(out)
+    strokes = operating_strokes(Stage.load(stage), at_um)
+    say_if_compiling(quiet=as_json)
     outside = None if reference is None else outside_scale(Stage.load(stage), *read_points(reference))
     amplitude = AMPLITUDE_NM[tones.value] if amplitude_nm is None else amplitude_nm
     with one_line_errors(), progress_bar("exciting the loop", quiet=as_json) as tell:
@@ -100,16 +108,13 @@ def _write(out: Path | None, found: "Identification", data: dict[str, Any], stag
     from hil.identify_figures import draw_response
     from hil.run_folder import next_free
 
-    folder = out or next_free(Path("runs"), f"identify_{found.setup.plant.name}", found.lane)
-    try:
-        folder.mkdir(parents=True, exist_ok=True)
+    folder = folder_to_write(out or next_free(Path("runs"), f"identify_{found.setup.plant.name}", found.lane))
+    with writing(folder):
         text = json.dumps(data, indent=2, allow_nan=False) + "\n"
         (folder / "identification.json").write_text(text, encoding="utf-8")
         (folder / "response.csv").write_text(response_csv(found), encoding="utf-8")
         draw_response(found, folder / "response.png")
         (folder / STAGE).unlink(missing_ok=True)
-    except OSError as error:
-        raise ConfigError(f"--out: {folder}: {(error.strerror or str(error)).lower()}; give another folder") from None
     if found.modes.noise_alone:
         write_calibrated_stage(stage, found, folder.name, folder / STAGE)
     return folder

@@ -6,6 +6,8 @@ from typing import Annotated, Any
 
 import typer
 
+from hil.outputs import picture_to_write
+
 
 def latency(
     period_us: Annotated[int, typer.Option(help="Period of the loop in microseconds.")] = 200,
@@ -17,6 +19,8 @@ def latency(
     """Run the controller at rate without a bus and show its lateness, beside cyclictest's if that is installed."""
     from hil.latency import measure
 
+    if out is not None:
+        picture_to_write(out, "--out")
     measured = measure(period_us, seconds, cyclictest)
     figures = measured.figures()
     if out is not None:
@@ -56,7 +60,6 @@ def _draw(measured: Any, out: Path) -> None:
     from matplotlib.figure import Figure
 
     from hil.wall_figure import draw_lateness
-    from pkxyz_ctrl.config import ConfigError
 
     figure = Figure(figsize=(11, 5), dpi=120, facecolor="white", layout="constrained")
     FigureCanvasAgg(figure)
@@ -67,7 +70,4 @@ def _draw(measured: Any, out: Path) -> None:
     draw_lateness(plot, histograms)
     plot.set_xlabel("1 + time  (µs)")
     plot.set_title(f"{measured.ticks} ticks of {measured.period_us} µs, {measured.missed_ticks} missed")
-    try:
-        figure.savefig(out)
-    except (OSError, ValueError) as error:
-        raise ConfigError(f"--out: {out}: {error}") from None
+    figure.savefig(out)

@@ -9,8 +9,10 @@ import typer
 from rich.console import Console
 from rich.table import Table
 
-from hil.choices import Lane, Tones
+from hil.choices import Lane, Tones, operating_strokes
+from hil.first_run import say_if_compiling
 from hil.one_line_errors import one_line_errors
+from hil.outputs import folder_to_write, writing
 from hil.progress import progress_bar
 from pkxyz_ctrl.config import ConfigError, load
 
@@ -51,8 +53,6 @@ def margins(
     Exit code 0 if every loop is stable and, on the nominal plant, what was measured agrees with what was computed; 1 if
     not; 2 for bad input.
     """
-    import numpy as np
-
     from hil.loop_margins import Loop, agreement, as_data, over_changed_plants
     from pkxyz_ctrl.bus_config import BusConfig
     from pkxyz_ctrl.controller_config import ControllerConfig
@@ -63,7 +63,11 @@ def margins(
     device, on_bus = Stage.load(stage), load("buses", bus, BusConfig)
     config = load("controllers", controller, ControllerConfig)
     wide = load("tolerances", tolerances, Tolerances)
-    strokes = np.full(3, 12.5e-6) if at_um is None else np.array(at_um) * 1e-6
+    strokes = operating_strokes(device, at_um)
+    if out is not None:
+        folder_to_write(out)
+    if measured:
+        say_if_compiling(quiet=as_json)
     with one_line_errors():
         loop = Loop(device, on_bus, design_law(device, config, on_bus, autostart=True))
         computed = loop.margins(strokes)
@@ -140,11 +144,8 @@ def _write(
 
     from hil.margins_figures import draw_bode, draw_nyquist
 
-    try:
-        out.mkdir(parents=True, exist_ok=True)
+    with writing(out):
         (out / "margins.json").write_text(json.dumps(data, indent=2, allow_nan=False) + "\n", encoding="utf-8")
-    except OSError as error:
-        raise ConfigError(f"--out: {out}: {(error.strerror or str(error)).lower()}; give another folder") from None
     f = np.unique(np.r_[np.geomspace(5.0, 0.4999 / loop.bus.period_s, 700), np.linspace(450.0, 950.0, 500)])
     f = f[f < 0.5 / loop.bus.period_s]
     # those at the point itself: at the others they look alike

@@ -16,6 +16,7 @@ from rich.console import Console
 from rich.markup import escape
 from rich.table import Table
 
+from hil.outputs import folder_to_write, picture_to_write
 from pkxyz_ctrl.config import ConfigError, load, require_finite
 
 if TYPE_CHECKING:
@@ -43,14 +44,6 @@ def _one_line_errors() -> Iterator[None]:
         raise ConfigError(str(error)) from None
 
 
-def _folder(out: Path) -> Path:
-    try:
-        out.mkdir(parents=True, exist_ok=True)
-    except OSError as error:
-        raise ConfigError(f"{out}: cannot be made a folder: {error.strerror}; give another with --out") from None
-    return out
-
-
 def paper(as_json: AsJson = False, out: OutFolder = None) -> None:
     """Every number that the paper prints, beside what its two designs give; with --out also its figures."""
     from pkxyz_ctrl.mechanics.published import entries
@@ -63,7 +56,7 @@ def paper(as_json: AsJson = False, out: OutFolder = None) -> None:
         from hil.mechanics_figures import draw_design_space, draw_modes
         from hil.workspace_figures import draw_edge_path, draw_workspace
 
-        folder, stage = _folder(out), stages["reconstructed"]
+        folder, stage = folder_to_write(out), stages["reconstructed"]
         draw_design_space(stages, folder / "figure_4_design_space.png")
         draw_workspace(stage, 130.0, folder / "figure_7_workspace.png")
         draw_modes(stage, folder / "figure_8_modes.png")
@@ -149,7 +142,7 @@ def workspace(
         if out is not None:
             from hil.workspace_figures import draw_workspace
 
-            draw_workspace(device, limit, _folder(out) / "workspace.png")
+            draw_workspace(device, limit, folder_to_write(out) / "workspace.png")
     if as_json:
         print(json.dumps(data, allow_nan=False))
         return
@@ -237,6 +230,8 @@ def design(
         raise ConfigError(f"--chains must be 1 (Eq. 19 as printed) or 3 (as the text describes it), got {chains}")
     if out.suffix != ".toml":
         raise ConfigError(f"{out}: --out must be a .toml file, so that --stage finds it")
+    if picture is not None:
+        picture_to_write(picture, "--picture")
     layer = _layers_m(layers)
     if force is not None:
         comb = template.drive_comb.model_copy(update={"finger_height_m": layer[0]})
@@ -333,7 +328,7 @@ def linearisation(
     if out is not None:
         from hil.mechanics_figures import draw_linearisation
 
-        draw_linearisation(study, device.config.name, _folder(out) / "linearisation.png")
+        draw_linearisation(study, device.config.name, folder_to_write(out) / "linearisation.png")
     if as_json:
         print(json.dumps({"stage": device.config.name, "move_um": move, "worst_nm": worst}, allow_nan=False))
         return

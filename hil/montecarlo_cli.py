@@ -9,8 +9,9 @@ import typer
 from rich.console import Console
 from rich.table import Table
 
+from hil.first_run import say_if_compiling
+from hil.outputs import folder_to_write
 from hil.progress import progress_bar
-from pkxyz_ctrl.config import ConfigError
 
 _screen = Console(highlight=False)
 
@@ -50,10 +51,8 @@ def montecarlo(
     study = Study(loaded, load("tolerances", tolerances, Tolerances))
     if replay is not None:
         _replay(study, replay, out, as_json=as_json)
-    try:
-        out.mkdir(parents=True, exist_ok=True)
-    except OSError as error:
-        raise ConfigError(f"--out: {out}: {(error.strerror or str(error)).lower()}; give another folder") from None
+    folder_to_write(out)
+    say_if_compiling(quiet=as_json)
     results = Results(out / "results.jsonl", study)
     seeds, interrupted = range(seed, seed + plants), False
     with progress_bar("plants", quiet=as_json) as tell:
@@ -63,7 +62,7 @@ def montecarlo(
             interrupted = True
     found = [results.found[n] for n in seeds if n in results.found]
     if not found:
-        raise typer.Exit(130)
+        raise KeyboardInterrupt
     data = summary(found) | {
         "controller": loaded.controller.name, "scenario": loaded.config.name, "tolerances": tolerances,
         "digest": study.digest(), "first_seed": seed, "interrupted": interrupted, "folder": str(out),

@@ -7,6 +7,7 @@ from typing import Annotated, Any
 
 import typer
 
+from hil.first_run import say_if_compiling
 from pkxyz_ctrl.config import ConfigError
 
 Scenario = Annotated[str, typer.Argument(help="A shipped scenario's name or a TOML file.")]
@@ -53,6 +54,7 @@ def run(
     learning = learning_of(learn, replay, refresh)
     loaded = _load(scenario, duration_s, stage=stage, controller=controller, bus=bus, learning=learning)
     require_real_bus(loaded.bus)
+    say_if_compiling(quiet=as_json)
     folder = RunFolder(out if out is not None else next_free(Path("runs"), loaded.config.name, LANE))
     try:
         summary, result = run_into(folder, loaded, _tell)

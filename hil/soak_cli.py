@@ -9,6 +9,8 @@ from typing import Annotated
 import typer
 from rich.console import Console
 
+from hil.first_run import say_if_compiling
+from hil.outputs import folder_to_write
 from hil.progress import progress_bar
 from pkxyz_ctrl.config import ConfigError
 
@@ -35,6 +37,7 @@ def soak(
     if keep and out is None:
         raise ConfigError("--keep: needs --out, the folder to keep the recordings in")
     folder = _folder(out)
+    say_if_compiling(quiet=as_json)
     try:
         with progress_bar("soak", quiet=as_json) as tell:
             soaked = soaking.soak(60.0 * minutes, seed, law, folder, keep=keep, on_progress=tell)
@@ -77,8 +80,4 @@ def soak(
 def _folder(out: Path | None) -> Path:
     if out is None:
         return Path(tempfile.mkdtemp(prefix="pkxyz-soak-"))
-    try:
-        out.mkdir(parents=True, exist_ok=True)
-    except OSError as error:
-        raise ConfigError(f"--out: {out}: {(error.strerror or str(error)).lower()}; give another folder") from None
-    return out
+    return folder_to_write(out)

@@ -8,8 +8,9 @@ import typer
 from rich.console import Console
 from rich.table import Table
 
+from hil.first_run import say_if_compiling
+from hil.outputs import folder_to_write
 from hil.progress import progress_bar
-from pkxyz_ctrl.config import ConfigError
 
 _screen = Console(highlight=False)
 
@@ -34,15 +35,13 @@ def tune(
     130 if interrupted (what is done is kept).
     """
     from hil.search import load_problem
-    from hil.tuning import best, draw, nearest, open_study, write_controller
+    from hil.tuning import best, draw, judged, nearest, open_study, write_controller
     from hil.tuning import search as run_search
     from hil.workers import cores
 
     problem = load_problem(search)
-    try:
-        out.mkdir(parents=True, exist_ok=True)
-    except OSError as error:
-        raise ConfigError(f"--out: {out}: {(error.strerror or str(error)).lower()}; give another folder") from None
+    folder_to_write(out)
+    say_if_compiling(quiet=as_json)
     study = open_study(problem, storage or f"sqlite:///{(out / 'study.db').absolute()}", seed)
     interrupted = False
     if trials:
@@ -52,12 +51,13 @@ def tune(
         except KeyboardInterrupt:
             interrupted = True
     found = best(study, problem)
-    importance = draw(study, problem, out) if study.trials else {}
+    tried = judged(study)
+    importance = draw(study, problem, out) if tried else {}
     path = out / f"{problem.search.name}_tuned.toml"
     if found is not None:
         write_controller(problem, found, path)
     data = {
-        "search": problem.search.name, "digest": problem.digest(), "seed": seed, "trials": len(study.trials),
+        "search": problem.search.name, "digest": problem.digest(), "seed": seed, "trials": len(tried),
         "best": None if found is None else vars(found) | {"controller": str(path)},
         "missed": {} if found is not None else nearest(study), "importance": importance, "interrupted": interrupted,
     }  # fmt: skip
@@ -71,6 +71,8 @@ def tune(
 def _show(data: dict, objective: str) -> None:  # type: ignore[type-arg]
     found = data["best"]
     _screen.print(f"{data['search']}: {data['trials']} trials in the study")
+    if not data["trials"]:
+        return
     if found is None:
         missed = ", ".join(f"{name} by {beyond:.0%}" for name, beyond in data["missed"].items())
         _screen.print(f"none keeps every constraint; the nearest one misses {missed or 'nothing, but did not run'}")

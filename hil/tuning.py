@@ -97,6 +97,8 @@ def search(
     finally:
         for trial in asked.values():
             study.tell(trial, state=_STATE.FAIL)
+            if trial.params:
+                study.enqueue_trial(trial.params)  # the next run begins with what was not finished
 
 
 def _valued(problem: Problem, item: tuple[int, dict[str, float]]) -> Worth:
@@ -140,6 +142,11 @@ def best(study: optuna.Study, problem: Problem) -> Best | None:
 
 def _keeps(trial: Any) -> bool:
     return all(beyond <= 0.0 for beyond in trial.constraints.values())
+
+
+def judged(study: optuna.Study) -> list[optuna.trial.FrozenTrial]:
+    """Trials that came to a verdict: neither failed nor waiting."""
+    return [t for t in study.get_trials(deepcopy=False) if t.state in (_STATE.COMPLETE, _STATE.PRUNED)]
 
 
 def nearest(study: optuna.Study) -> dict[str, float]:
@@ -195,7 +202,7 @@ def draw(study: optuna.Study, problem: Problem, folder: Path) -> dict[str, float
     axes.set(
         xlabel="trial",
         ylabel=_WORDS[problem.search.objective],
-        title=f"{problem.search.name}: {len(study.trials)} trials, {len(finished)} of them keep every goal",
+        title=f"{problem.search.name}: {len(judged(study))} trials, {len(finished)} of them keep every goal",
     )
     figure.savefig(folder / "history.png")
     if importance:

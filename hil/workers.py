@@ -4,15 +4,15 @@ The pieces are calls of one function with plain arguments; results come as they 
 thread, so that as many processes as cores don't get into each other's way.
 """
 
-import multiprocessing
 import os
 import pickle
 from collections.abc import Callable, Iterable, Iterator
-from concurrent.futures import FIRST_COMPLETED, Executor, Future, ProcessPoolExecutor, wait
+from concurrent.futures import FIRST_COMPLETED, Executor, Future, wait
 from contextlib import contextmanager
 from functools import lru_cache, partial
 from typing import Any, TypeVar, cast
 
+from hil.processes import processes
 from pkxyz_ctrl.config import ConfigError
 
 Item = TypeVar("Item")
@@ -35,7 +35,7 @@ def hands(workers: int, scheduler: str | None = None) -> Iterator[tuple[Executor
         before = {name: os.environ.get(name) for name in _THREADS}
         os.environ.update(dict.fromkeys(_THREADS, "1"))  # read by the libraries when a process starts
         try:
-            with ProcessPoolExecutor(workers, multiprocessing.get_context("spawn")) as pool:
+            with processes(workers) as pool:
                 yield pool, workers
         finally:
             for name, value in before.items():

@@ -130,7 +130,7 @@ def test_bad_input_is_one_line(
 
 def test_unwritable_places_are_one_line(tmp_path: Path) -> None:
     (tmp_path / "file").write_text("")
-    assert "cannot be made a folder" in refusal("paper", "--out", str(tmp_path / "file"))
+    assert "file exists; give another folder" in refusal("paper", "--out", str(tmp_path / "file"))
     assert "cannot be written" in refusal("design", "--out", str(tmp_path / "none" / "x.toml"))
 
 

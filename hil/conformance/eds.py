@@ -55,10 +55,10 @@ class Variable:
 
 def read_eds(path: Path, node_id: int) -> tuple[Variable, ...]:
     """All variables, sub-index 0 of arrays and records included. Raises ConfigError."""
+    if not path.is_file():
+        raise ConfigError(f"{path}: no such file; give the amplifier's EDS with --eds")
     try:
         dictionary = canopen.import_od(str(path), node_id)
-    except FileNotFoundError:
-        raise ConfigError(f"{path}: no such file; give the amplifier's EDS with --eds") from None
     except Exception as error:  # canopen raises whatever its parser meets
         raise ConfigError(f"{path}: not an EDS that can be read ({type(error).__name__}: {error})") from None
     found = []

@@ -1,0 +1,146 @@
+"""What a user gets wrong: one line that says what to do, an exit code, and nothing lost; Ctrl-C included."""
+
+import errno
+import json
+import os
+import signal
+import subprocess
+import sys
+import time
+from pathlib import Path
+
+import pytest
+
+from hil import cli
+from hil.outputs import what_to_do
+
+ROOT = Path(__file__).parent.parent
+
+
+def refused(capsys, monkeypatch, *words):
+    """The line that ``pkxyz`` answers with, in this process."""
+    monkeypatch.setattr(sys, "argv", ["pkxyz", *map(str, words)])
+    with pytest.raises(SystemExit) as ended:
+        cli.main()
+    shown = capsys.readouterr()
+    lines = [line for line in shown.err.splitlines() if not line.startswith("First run here")]
+    assert ended.value.code == 2, shown
+    assert shown.out == ""
+    assert len(lines) == 1, shown.err
+    assert lines[0].startswith("pkxyz: ")
+    return lines[0]
+
+
+@pytest.mark.parametrize(
+    ("words", "says"),
+    [
+        (("compare", "--out", "no/such.png"), "--out: no: no such folder; make it"),
+        (("compare", "--out", "picture.foo"), "end its name in .png"),
+        (("compare", "--out", "."), "end its name in .png"),
+        (("latency", "--out", "no/such.png"), "--out: no: no such folder; make it"),
+        (("design", "--picture", "no/such.png"), "--picture: no: no such folder; make it"),
+        (("identify", "--controller", "open_loop"), "only feeds forward"),
+        (("identify", "--at", "30", "30", "30"), "--at 30 30 30: strokes go from 0 to 25 um"),
+        (("margins", "--at", "99", "99", "99"), "--at 99 99 99: strokes go from 0 to 25 um"),
+        (("margins", "--at", "-5", "0", "0"), "--at -5 0 0: strokes go from 0 to 25 um"),
+        (("margins", "--at", "nan", "1", "1"), "--at nan 1 1: strokes go from 0 to 25 um"),
+        (("margins", "--at", "0", "0", "0"), "a comb at 0 V closes no loop"),
+        (("margins", "--controller", "open_loop"), "there is no loop"),
+        (("margins", "--out", "file"), "--out: file: file exists"),
+        (("identify", "--out", "file"), "--out: file: file exists"),
+        (("tune", "--out", "file"), "--out: file: file exists"),
+        (("montecarlo", "--out", "file"), "--out: file: file exists"),
+        (("faults", "--out", "file"), "--out: file: file exists"),
+        (("soak", "--out", "file"), "--out: file: file exists"),
+        (("check-amplifier", "--out", "file"), "--out: file: file exists"),
+        (("check-amplifier", "--eds", "nope.eds"), "nope.eds: no such file; give the amplifier's EDS"),
+        (("check-amplifier", "--eds", "nope"), "nope: no such file; give the amplifier's EDS"),
+    ],
+)
+def test_refused_in_one_line_before_anything_is_done(words, says, capsys, monkeypatch, tmp_path):
+    monkeypatch.chdir(tmp_path)
+    (tmp_path / "file").write_text("mine")
+    assert says in refused(capsys, monkeypatch, *words)
+    assert [path.name for path in tmp_path.iterdir()] == ["file"]
+    assert (tmp_path / "file").read_text() == "mine"
+
+
+@pytest.mark.skipif(os.getuid() == 0, reason="root may write everywhere")
+def test_a_folder_without_permission_is_refused_beforehand(capsys, monkeypatch, tmp_path):
+    tmp_path.chmod(0o500)
+    assert "permission denied" in refused(capsys, monkeypatch, "margins", "--out", tmp_path)
+
+
+def test_without_a_command_there_is_help_and_nothing_else(capsys, monkeypatch):
+    monkeypatch.setattr(sys, "argv", ["pkxyz"])
+    with pytest.raises(SystemExit) as ended:
+        cli.main()
+    shown = capsys.readouterr()
+    assert ended.value.code == 0
+    assert shown.err == ""
+    assert shown.out.startswith("Usage: pkxyz")
+    assert "..." not in shown.out.partition("Commands:")[2]  # what a command is for fits in its line
+
+
+def test_a_disk_that_refuses_is_one_line_and_other_errors_of_the_system_are_not_hidden():
+    assert what_to_do(OSError(errno.ENOSPC, "No space left on device", "a/b")) == (
+        "a/b: no space left on device; make room, or give another place to write; what was written before is kept"
+    )
+    assert what_to_do(OSError(errno.ECONNRESET, "Connection reset by peer")) is None
+
+
+def test_ctrl_c_is_ctrl_c_whatever_an_import_makes_of_it():
+    interrupted = ImportError("numba._devicearray failed to import")
+    interrupted.__context__ = KeyboardInterrupt()
+    assert cli._was_interrupted(interrupted)
+    assert not cli._was_interrupted(ImportError("no module named numba"))
+
+
+def ctrl_c(tmp_path, ready, *words):
+    """Exit code and both streams of a command that gets Ctrl-C, as a terminal sends it to all its processes."""
+    process = subprocess.Popen(
+        [sys.executable, "-m", "hil.cli", *words],
+        cwd=tmp_path,
+        env={**os.environ, "PYTHONPATH": str(ROOT)},
+        stdout=subprocess.PIPE,
+        stderr=subprocess.PIPE,
+        text=True,
+        start_new_session=True,
+        preexec_fn=lambda: signal.signal(signal.SIGINT, signal.default_int_handler),
+    )
+    try:
+        for _ in range(1200):
+            if ready():
+                break
+            assert process.poll() is None, process.communicate()
+            time.sleep(0.05)
+        os.killpg(process.pid, signal.SIGINT)
+        stdout, stderr = process.communicate(timeout=60)
+    finally:
+        process.kill()
+    return process.returncode, stdout, stderr
+
+
+@pytest.mark.slow
+def test_ctrl_c_in_a_study_says_one_word_and_keeps_what_is_done(tmp_path):
+    results = tmp_path / "montecarlo" / "results.jsonl"
+    words = ("montecarlo", "--plants", "4000", "--workers", "2")
+    begun = ctrl_c(tmp_path, results.is_file, *words)  # its processes are just being started
+    assert begun[0] == 130
+    assert begun[2].splitlines()[-1] == "interrupted"
+    assert "Traceback" not in begun[2]
+    code, stdout, stderr = ctrl_c(tmp_path, lambda: len(results.read_text().splitlines()) > 3, *words, "--json")
+    assert (code, stderr) == (130, "")
+    done = json.loads(stdout)
+    assert done["interrupted"] is True
+    assert done["plants"] == len(results.read_text().splitlines()) - 1
+
+
+def test_output_that_nobody_reads_on_is_no_error(tmp_path):
+    shown = subprocess.run(
+        f"{sys.executable} -m hil.cli configs --json | head -c 5",
+        shell=True, cwd=tmp_path, env={**os.environ, "PYTHONPATH": str(ROOT)}, capture_output=True, text=True,
+        check=False, timeout=60,
+    )  # fmt: skip
+    assert shown.stderr == ""
+    assert len(shown.stdout) == 5
