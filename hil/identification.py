@@ -200,6 +200,7 @@ def as_data(found: Identification) -> dict[str, Any]:
         "fit": {
             "chi_square": modes.chi_square,
             "noise_alone": modes.noise_alone,
+            "pole_pairs": int(modes.apart.sum()),
             "tones": len(response.frequency_hz),
             "lowest_hz": modes.used_hz[0],
             "highest_hz": modes.used_hz[1],

@@ -121,6 +121,8 @@ def _write(out: Path | None, found: "Identification", data: dict[str, Any], stag
 
 
 def _show(found: "Identification", data: dict[str, Any], folder: Path) -> None:
+    import numpy as np
+
     modes, zero = found.modes, found.response.zero
     strokes = " / ".join(f"{q:.2f}" for q in data["strokes_um"])
     _screen.print(
@@ -133,6 +135,9 @@ def _show(found: "Identification", data: dict[str, Any], folder: Path) -> None:
             _pm(mode["damping"], mode["damping_error"]), f"{mode['quality_factor']:.1f}",
         )  # fmt: skip
     _screen.print(table)
+    if not modes.apart.all():
+        n = int(np.argmin(modes.apart))
+        _screen.print(f"modes {n} and {n + 1} coincide: one pair of poles tells them as well as two")
     table = _table("chain", "own comb (counts/V^2)", "comb 1", "comb 2", "comb 3", "sense zero (fF)", "counts")
     for i in range(3):
         entries = [f"{v:.3f}" for v in modes.static_gain[i]]

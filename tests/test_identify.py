@@ -72,6 +72,17 @@ def test_standard_errors_are_those_of_the_errors():
     assert (modes.frequency_deviation_hz < 1e-3 * modes.frequency_hz).all()
 
 
+def test_modes_that_coincide_are_one_pair_of_poles():
+    """As drawn, x and y are alike at mid-workspace: three pairs of poles would leave one to the noise, of any Q."""
+    modes, is_ = found("nominal").modes, truth("nominal")
+    assert modes.apart.tolist() == [True, False, True]
+    assert (np.abs(modes.frequency_hz - is_.frequency_hz) < 4.5 * modes.frequency_deviation_hz).all()
+    assert (np.abs(modes.damping - is_.damping) < 4.5 * modes.damping_deviation).all()
+    assert modes.static_gain[CHAINS, CHAINS] == pytest.approx(is_.static_gain[CHAINS, CHAINS], rel=0.01)
+    assert 0.9 < modes.chi_square < 1.1
+    assert found().modes.apart.all()  # 31 Hz apart they are three
+
+
 def test_the_stage_file_alone_would_not_do():
     """So the harsh plant is a test: two resonances and every gain are beyond the bounds to begin with."""
     drawn = modes_hz(bench(), MIDDLE)

@@ -98,7 +98,7 @@ def calibrate(
         comb_error = sense.error / sense.gain
     numbers = _numbers(unknown[:UNKNOWNS], sense.gain)
     springs = np.sqrt(np.diag(_SPRINGS @ covariance[:UNKNOWNS, :UNKNOWNS] @ _SPRINGS.T))
-    damping, damping_error = combined(modes.damping, np.diag(modes.damping_deviation**2))
+    damping, damping_error = combined(modes.damping[modes.apart], np.diag(modes.damping_deviation[modes.apart] ** 2))
     amplifier_s = 0.5 / (math.pi * config.amplifier.bandwidth_hz)
     errors = StandardErrors(
         comb_gain=_triple(np.hypot(np.sqrt(np.diag(covariance)[:3]), comb_error) * np.array(numbers.comb_gain)),

@@ -7,6 +7,10 @@ n = d + 1: what is asked for at a sample acts d periods later and is seen at the
 stage's own modes is in them, and nothing needs to be assumed of it. The fit is of y to P u, output by output, each tone
 with the weight of the noise there; for given poles it is linear, so only frequencies and dampings are searched for
 (variable projection).
+
+Two modes may coincide, as x and y of a stage as drawn do at mid-workspace: they move the chains in two patterns with
+one pair of poles, and a third pair would only fit noise. So two pairs are tried as well, and taken where a third
+explains nothing.
 """
 
 import math
@@ -16,6 +20,7 @@ from dataclasses import dataclass
 import numpy as np
 import scipy.linalg
 import scipy.optimize
+import scipy.stats
 from numpy.typing import NDArray
 
 Array = NDArray[np.float64]
@@ -29,6 +34,9 @@ STARTS = ((0.97, 1.03, 1.0), (0.9, 1.1, 1.05), (0.97, 1.0, 0.95), (1.1, 1.2, 1.1
 NOISE_ALONE = 1.5
 """Mean square of the weighted residual up to which noise explains it."""
 
+CONFIDENCE = 0.999
+"""With which two modes that coincide are found as one pair of poles."""
+
 
 class FitError(ValueError):
     """A response that doesn't tell the modes; the message says what to change."""
@@ -39,7 +47,7 @@ class ModalFit:
     """Natural frequencies |s| / 2 pi in ascending order, damping ratios, and the response at frequency 0."""
 
     frequency_hz: Array
-    """(3,)"""
+    """(3,) two alike where modes coincide as far as noise tells: they share a pair of poles"""
     damping: Array
     """(3,) -Re(s) / |s| = 1 / 2Q"""
     static_gain: Array
@@ -71,9 +79,15 @@ class ModalFit:
         """Whether the fit leaves nothing but noise."""
         return self.chi_square < NOISE_ALONE
 
+    @property
+    def apart(self) -> NDArray[np.bool_]:
+        """(3,) one for each pair of poles: False for a mode that shares those of the one before."""
+        return np.asarray(np.diff(self.frequency_hz, prepend=0.0) > 0.0)
+
     def response(self, frequency_hz: Array) -> Complex:
         """P (k, 3, 3) in counts per V^2 at frequencies (k,)."""
-        basis = _basis(frequency_hz, self.frequency_hz, self.damping, self._period_s, self._delay_periods)
+        hz, damping = self.frequency_hz[self.apart], self.damping[self.apart]
+        basis = _basis(frequency_hz, hz, damping, self._period_s, self._delay_periods)
         return np.asarray(np.einsum("kb,bij->kij", basis, self._coefficients))
 
 
@@ -103,8 +117,8 @@ def fit_modes(
 
     def columns(modes: Array) -> Array:
         """(2 k 3, unknowns): real and imaginary parts of basis times U, per tone and passage."""
-        basis = _basis(f, np.exp(modes[:MODES]), np.exp(modes[MODES:]), period_s, delay_periods)
-        regressors = np.einsum("kb,kjp->kpbj", basis, u).reshape(3 * len(f), unknowns)
+        basis = _basis(f, *_halves(np.exp(modes)), period_s, delay_periods)
+        regressors = np.einsum("kb,kjp->kpbj", basis, u).reshape(3 * len(f), -1)
         return np.concatenate([regressors.real, regressors.imag])
 
     weight = np.repeat(1.0 / sigma, 3, axis=0)  # (k passages, chains)
@@ -117,23 +131,29 @@ def fit_modes(
         theta = np.stack([_least_squares(matrix * w[:, None], seen[:, i] * w) for i, w in enumerate(weight.T)], axis=1)
         return theta, (seen - matrix @ theta) * weight
 
-    def searched(split: tuple[float, float, float]) -> "scipy.optimize.OptimizeResult":
+    def searched(hz: Array) -> "scipy.optimize.OptimizeResult":
         return scipy.optimize.least_squares(
             lambda modes: solved(modes)[1].ravel(),
-            np.log(np.concatenate([np.array(split) * start_hz, np.full(MODES, start_damping)])),
+            np.log(np.concatenate([hz, np.full(len(hz), start_damping)])),
             x_scale=0.01,
             bounds=(math.log(1e-5), math.log(0.5 / period_s)),
         )
 
-    best = searched(STARTS[0])
+    best = searched(np.array(STARTS[0]) * start_hz)
     for split in STARTS[1:]:
         if 2.0 * float(best.cost) < NOISE_ALONE * seen.size:
             break
-        best = min(best, searched(split), key=lambda found: float(found.cost))
-    order = np.argsort(best.x[:MODES])
-    modes = np.concatenate([best.x[:MODES][order], best.x[MODES:][order]])
+        best = min(best, searched(np.array(split) * start_hz), key=lambda found: float(found.cost))
+    modes, shared = _ascending(best.x), np.arange(MODES)
+    near = int(np.argmin(np.diff(modes[:MODES])))
+    merged = searched(np.exp(np.delete(modes[:MODES], near)))
+    gone = 2 + 3 * 2 * 3  # a frequency, a damping, B and C
+    if 2.0 * float(merged.cost - best.cost) < scipy.stats.chi2.ppf(CONFIDENCE, gone) * max(
+        1.0, 2.0 * float(best.cost) / seen.size
+    ):
+        modes, shared = _ascending(merged.x), np.repeat([0, 1], [2, 1] if near == 0 else [1, 2])
     theta, residual = solved(modes)
-    spare = residual.size - 3 * unknowns - 2 * MODES
+    spare = residual.size - theta.size - len(modes)
     chi_square = float((residual**2).sum() / spare)
     covariance = _covariance(modes, theta, columns, weight) * max(1.0, chi_square)
     values, values_covariance = _propagated(modes, theta, covariance, period_s, delay_periods)
@@ -141,8 +161,8 @@ def fit_modes(
     gains_covariance = values_covariance[:18, :18]
     lag_s, lag_deviation_s = combined(values[18:], values_covariance[18:, 18:])
     static_deviation, acceleration_deviation = np.sqrt(np.diag(gains_covariance)).reshape(2, 3, 3)
-    deviation = np.sqrt(np.diag(covariance))
-    hz, ratio = np.exp(modes[:MODES]), np.exp(modes[MODES:])
+    hz, ratio = (half[shared] for half in _halves(np.exp(modes)))
+    of_hz, of_ratio = (half[shared] for half in _halves(np.sqrt(np.diag(covariance))[: len(modes)]))
     if not (hz.min() > low and hz.max() < high):
         raise FitError(
             f"modes were found at {hz.min():.0f} to {hz.max():.0f} Hz, the tones lie from {low:.0f} to {high:.0f} Hz; "
@@ -153,8 +173,8 @@ def fit_modes(
         damping=ratio,
         static_gain=static,
         acceleration_gain=acceleration,
-        frequency_deviation_hz=hz * deviation[:MODES],
-        damping_deviation=ratio * deviation[MODES : 2 * MODES],
+        frequency_deviation_hz=hz * of_hz,
+        damping_deviation=ratio * of_ratio,
         static_gain_deviation=static_deviation,
         acceleration_gain_deviation=acceleration_deviation,
         lag_s=lag_s,
@@ -166,6 +186,17 @@ def fit_modes(
         _period_s=period_s,
         _delay_periods=delay_periods,
     )
+
+
+def _halves(modes: Array) -> tuple[Array, Array]:
+    """Of frequencies and of dampings, (n,) each, from (2 n,)."""
+    return modes[: len(modes) // 2], modes[len(modes) // 2 :]
+
+
+def _ascending(modes: Array) -> Array:
+    hz, damping = _halves(modes)
+    order = np.argsort(hz)
+    return np.concatenate([hz[order], damping[order]])
 
 
 def _least_squares(matrix: Array, right: Array) -> Array:
@@ -193,7 +224,7 @@ def _per_input(theta: Array) -> Array:
 
 def _static_gain(modes: Array, theta: Array, period_s: float, delay_periods: int) -> Array:
     """P(z = 1), (3, 3)."""
-    basis = _basis(np.zeros(1), np.exp(modes[:MODES]), np.exp(modes[MODES:]), period_s, delay_periods)[0].real
+    basis = _basis(np.zeros(1), *_halves(np.exp(modes)), period_s, delay_periods)[0].real
     return np.asarray(np.einsum("b,bij->ij", basis, _per_input(theta)))
 
 
@@ -205,11 +236,12 @@ def combined(values: Array, covariance: Array) -> tuple[float, float]:
 
 def _sudden(modes: Array, theta: Array, period_s: float, delay_periods: int) -> tuple[Array, Array]:
     """Sum of the modes' numerators, (3, 3), from their residues, and the lag of amplifier and sense chain within a
-    period in s as each mode (3,) shows it: it turns a mode's numerators by a common angle, which is taken back.
+    period in s as each pair of poles (n,) shows it: it turns a mode's numerators by a common angle, which is taken
+    back.
     """
-    coefficients, total, lags_s = _per_input(theta), np.zeros((3, 3)), np.zeros(MODES)
-    for i in range(MODES):
-        w, d = 2.0 * math.pi * math.exp(modes[i]), math.exp(modes[MODES + i])
+    coefficients, total, lags_s = _per_input(theta), np.zeros((3, 3)), np.zeros(len(modes) // 2)
+    for i, (hz, d) in enumerate(zip(*_halves(np.exp(modes)), strict=True)):
+        w = 2.0 * math.pi * hz
         s = w * complex(-d, math.sqrt(1.0 - d * d))
         p = np.exp(s * period_s)
         residue = p ** (1 - delay_periods) * (coefficients[2 * i] + coefficients[2 * i + 1] / p) / (p - p.conjugate())
@@ -220,7 +252,7 @@ def _sudden(modes: Array, theta: Array, period_s: float, delay_periods: int) -> 
 
 
 def _values(modes: Array, theta: Array, period_s: float, delay_periods: int) -> Array:
-    """(21,): static and acceleration gain, row by row, and the modes' lags."""
+    """(18 + n,): static and acceleration gain, row by row, and the lags that n pairs of poles show."""
     acceleration, lags_s = _sudden(modes, theta, period_s, delay_periods)
     static = _static_gain(modes, theta, period_s, delay_periods)
     return np.concatenate([static.ravel(), acceleration.ravel(), lags_s])
@@ -230,15 +262,16 @@ def _propagated(
     modes: Array, theta: Array, covariance: Array, period_s: float, delay_periods: int
 ) -> tuple[Array, Array]:
     """``_values`` and their covariance, by central differences."""
-    slopes = np.zeros((18 + MODES, len(covariance)))
+    nonlinear = len(modes)
+    slopes = np.zeros((18 + nonlinear // 2, len(covariance)))
     for n in range(len(covariance)):
         step = np.zeros(len(covariance))
-        linear = n - 2 * MODES
+        linear = n - nonlinear
         step[n] = 1e-6 if linear < 0 else 1e-6 * max(1.0, float(np.abs(theta).max()))
         pair = [
             _values(
-                modes + sign * step[: 2 * MODES],
-                theta + sign * step[2 * MODES :].reshape(3, -1).T,
+                modes + sign * step[:nonlinear],
+                theta + sign * step[nonlinear:].reshape(3, -1).T,
                 period_s,
                 delay_periods,
             )
@@ -250,17 +283,17 @@ def _propagated(
 
 def _covariance(modes: Array, theta: Array, columns: Callable[[Array], Array], weight: Array) -> Array:
     """Of log frequencies, log dampings and the linear unknowns of output 1, 2, 3, for unit weights."""
-    here, unknowns = columns(modes), len(theta)
-    jacobian = np.zeros((3 * len(here), 2 * MODES + 3 * unknowns))
+    here, unknowns, nonlinear = columns(modes), len(theta), len(modes)
+    jacobian = np.zeros((3 * len(here), nonlinear + 3 * unknowns))
     slopes = []
-    for n in range(2 * MODES):
-        step = np.zeros(2 * MODES)
+    for n in range(nonlinear):
+        step = np.zeros(nonlinear)
         step[n] = 1e-6
         slopes.append((columns(modes + step) - columns(modes - step)) / 2e-6 @ theta)
     for i in range(3):
         rows = slice(i * len(here), (i + 1) * len(here))
-        jacobian[rows, : 2 * MODES] = np.stack([slope[:, i] for slope in slopes], axis=1) * weight[:, [i]]
-        jacobian[rows, 2 * MODES + i * unknowns : 2 * MODES + (i + 1) * unknowns] = here * weight[:, [i]]
+        jacobian[rows, :nonlinear] = np.stack([slope[:, i] for slope in slopes], axis=1) * weight[:, [i]]
+        jacobian[rows, nonlinear + i * unknowns : nonlinear + (i + 1) * unknowns] = here * weight[:, [i]]
     scale = np.linalg.norm(jacobian, axis=0)
     inverse = np.linalg.pinv(jacobian / scale)
     return np.asarray(inverse @ inverse.T / np.outer(scale, scale))
