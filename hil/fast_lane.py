@@ -31,7 +31,7 @@ def runner_of(law: Records) -> RunBlock:
     return partial(run_block_in_steps, period_of(law, np.zeros((1, 9))))
 
 
-@njit(cache=True)
+@njit(cache=True, error_model="numpy")
 def run_block(
     law: np.void,
     memory: np.void,

@@ -6,7 +6,7 @@ from numba import njit
 from sim.geometry import strokes
 
 
-@njit(cache=True)
+@njit(cache=True, error_model="numpy")
 def observe(plant: np.void, state: np.void, out: np.void) -> None:
     """Write ``position_m``, ``stroke_m`` and ``comb_voltage_v`` (3,) of a plant's records to those fields of the
     record ``out``.

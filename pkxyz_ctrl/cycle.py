@@ -104,7 +104,7 @@ def new_memory(mode: Mode = Mode.BOOT) -> NDArray[np.void]:
     return memory
 
 
-@njit(cache=True)
+@njit(cache=True, error_model="numpy")
 def cycle(law_array: Records, memory_array: Records, reference: Array) -> None:
     """One period. ``law_array`` (1,) of ``LAW``, ``memory_array`` (1,) of ``MEMORY``, ``reference`` (n, 9) rows of
     the trajectory, or (n, 12) with an excitation, or (n, 15) where the rows are shifted: last the position asked for.
@@ -117,7 +117,7 @@ def cycle(law_array: Records, memory_array: Records, reference: Array) -> None:
     respond(law_array, memory_array)
 
 
-@njit(cache=True)
+@njit(cache=True, error_model="numpy")
 def observe(law_array: Records, memory_array: Records, reference: Array) -> None:
     """First part of the period: event and mode, measurement, estimate, the rows of the reference that count."""
     law, memory = law_array[0], memory_array[0]
@@ -146,7 +146,7 @@ def observe(law_array: Records, memory_array: Records, reference: Array) -> None
     reference_row(law, memory, reference, delay + 2, memory["later"])
 
 
-@njit(cache=True)
+@njit(cache=True, error_model="numpy")
 def respond(law_array: Records, memory_array: Records) -> None:
     """Second part: law and voltages, monitors, record. A plan made between the two stands in ``memory["tick"]``."""
     law, memory = law_array[0], memory_array[0]
@@ -170,7 +170,7 @@ def respond(law_array: Records, memory_array: Records) -> None:
     state["plan_known"] = state["solver_iterations"] = 0
 
 
-@njit(cache=True)
+@njit(cache=True, error_model="numpy")
 def cycle_on(
     law_array: Records,
     memory_array: Records,
@@ -196,7 +196,7 @@ def cycle_on(
     return memory_array[0]["mode"], drive[0], drive[1], drive[2]
 
 
-@njit(cache=True)
+@njit(cache=True, error_model="numpy")
 def _asked(law: np.void, memory: np.void) -> int:
     """The event of this tick: what came in, else the next step of the automatic start. Nobody enables before homing."""
     event = memory["input"]["event"]
@@ -212,7 +212,7 @@ def _asked(law: np.void, memory: np.void) -> int:
     return clear_event(settled) if event == _CLEAR else event
 
 
-@njit(cache=True)
+@njit(cache=True, error_model="numpy")
 def _handle(law: np.void, memory: np.void, event: int) -> None:
     """Let an event act on the mode, and prepare what the mode that is entered needs."""
     mode = memory["mode"]
@@ -244,7 +244,7 @@ def _handle(law: np.void, memory: np.void, event: int) -> None:
         memory["held"] = 0
 
 
-@njit(cache=True)
+@njit(cache=True, error_model="numpy")
 def _turn_pace(law: np.void, memory: np.void, direction: int) -> None:
     """Begin to stop on the path, or to go on along it; in the middle of the other, from the speed that there is."""
     at = memory["reference_tick"] + memory["phase"]
@@ -259,7 +259,7 @@ def _turn_pace(law: np.void, memory: np.void, direction: int) -> None:
     memory["pace_phase"] = at - gone
 
 
-@njit(cache=True)
+@njit(cache=True, error_model="numpy")
 def _change_pace(law: np.void, memory: np.void) -> None:
     """A tick of slowing down or starting has passed; at its end the path stands, or goes on at its own speed."""
     memory["pace_age"] += 1
@@ -273,7 +273,7 @@ def _change_pace(law: np.void, memory: np.void) -> None:
     memory["phase"] = at - math.floor(at)
 
 
-@njit(cache=True)
+@njit(cache=True, error_model="numpy")
 def _suspects(law: np.void, memory: np.void) -> int:
     """Combs whose strokes are not to be believed, one bit each, and what the innovation would be; none in open loop."""
     if LOOP_CLOSED[memory["mode"]] == 0:
@@ -286,7 +286,7 @@ def _suspects(law: np.void, memory: np.void) -> int:
     return combs
 
 
-@njit(cache=True)
+@njit(cache=True, error_model="numpy")
 def _average(law: np.void, memory: np.void) -> None:
     """Add this sample to the average at rest; once there are enough, that is where zero is."""
     for i in range(3):
@@ -303,7 +303,7 @@ def _average(law: np.void, memory: np.void) -> None:
     _handle(law, memory, _HOMED)
 
 
-@njit(cache=True)
+@njit(cache=True, error_model="numpy")
 def _excite(memory: np.void, reference: Array) -> None:
     """Add the excitation of this sample to the measurement; outside the rows handed in there is none."""
     index = memory["reference_tick"] - memory["input"]["reference_base"]
@@ -312,7 +312,7 @@ def _excite(memory: np.void, reference: Array) -> None:
             memory["tick"]["measurement_m"][i] += reference[index, _ROW_LENGTH + i]
 
 
-@njit(cache=True)
+@njit(cache=True, error_model="numpy")
 def reference_row(law: np.void, memory: np.void, reference: Array, ahead: int, out: Array) -> None:
     """Write the row (9,) of the set-point ``ahead`` ticks from this one to ``out``."""
     base = memory["input"]["reference_base"]
@@ -329,14 +329,16 @@ def reference_row(law: np.void, memory: np.void, reference: Array, ahead: int, o
         for i in range(_ROW_LENGTH):
             out[i] = reference[index, i]
     else:
-        out[:] = memory["setpoint"]
+        for i in range(_ROW_LENGTH):
+            out[i] = memory["setpoint"][i]
 
 
-@njit(cache=True)
+@njit(cache=True, error_model="numpy")
 def _asked_for(memory: np.void, reference: Array) -> None:
     """Note the position asked for at this sample, for the record; while the path stops or starts, with its shift."""
     asked = memory["asked_m"]
-    asked[:] = memory["here"][0:3]
+    for i in range(3):
+        asked[i] = memory["here"][i]
     on_time = memory["pace"] == pace.STEADY and memory["phase"] == 0.0
     if reference.shape[1] > _ASKED and memory["mode"] == _TRACKING and on_time:
         index = min(max(memory["reference_tick"] - memory["input"]["reference_base"], 0), len(reference) - 1)
@@ -344,7 +346,7 @@ def _asked_for(memory: np.void, reference: Array) -> None:
             asked[i] = reference[index, _ASKED + i]
 
 
-@njit(cache=True)
+@njit(cache=True, error_model="numpy")
 def _monitor(law: np.void, memory: np.void, saturated: int) -> int:
     """Let the monitors look at this tick; a trip takes the voltages of this very tick to 0."""
     seen, state, obs = memory["input"], memory["tick"], memory["observation"]
@@ -370,7 +372,7 @@ def _monitor(law: np.void, memory: np.void, saturated: int) -> int:
     return trips
 
 
-@njit(cache=True)
+@njit(cache=True, error_model="numpy")
 def _write_row(law: np.void, memory: np.void, trips: int, saturated: int) -> None:
     row, seen, state = memory["row"], memory["input"], memory["tick"]
     estimate, drive, origin = state["estimate"], law["tick"]["drive"], law["tick"]["estimator"]["operating_point_m"]

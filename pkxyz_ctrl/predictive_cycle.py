@@ -116,7 +116,7 @@ def _solver(problem: Problem, numbers: np.void) -> Any:
     return solver._solver
 
 
-@njit(cache=True)
+@njit(cache=True, error_model="numpy")
 def plan(law_array: Records, memory_array: Records, reference: Array, fixed: Any, tried: Any, vectors: Any) -> int:
     """The plan without limits, which is adopted if it keeps them, else the vectors of the problem of this tick:
     ``predictive.FREE`` or ``LIMITED``, or ``NO_PLAN`` with an open loop or where the links do not reach.
@@ -153,7 +153,7 @@ def plan(law_array: Records, memory_array: Records, reference: Array, fixed: Any
     return predictive.LIMITED
 
 
-@njit(cache=True)
+@njit(cache=True, error_model="numpy")
 def _pose(
     law: np.void, count: Array, error: Array, jump: Array, comb: Array, stroke: Array, low: Array, high: Array,
     e: Array, nu: Array, fixed: Any, vectors: Any,
@@ -184,7 +184,7 @@ def _pose(
         upper[i] /= FORCE_UNIT_N
 
 
-@njit(cache=True)
+@njit(cache=True, error_model="numpy")
 def adopt(law_array: Records, memory_array: Records, fixed: Any, tried: Any, v: Array, iterations: int) -> None:
     """Make a solution v (3n,) this tick's plan."""
     tick, state = law_array[0]["tick"], memory_array[0]["tick"]
@@ -198,7 +198,7 @@ def adopt(law_array: Records, memory_array: Records, fixed: Any, tried: Any, v: 
     _hand_over(tick, state, rows, comb, iterations)
 
 
-@njit(cache=True)
+@njit(cache=True, error_model="numpy")
 def _hand_over(law: np.void, state: np.void, rows: Array, comb_n: Array, iterations: int) -> None:
     """Give the law what comb forces (3,) add to its feed-forward at the platform."""
     row, ahead_n, at_row = np.empty(9), np.empty(3), np.empty((3, 3))

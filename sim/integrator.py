@@ -1,13 +1,18 @@
-"""One step of the table's motion: Dormand and Prince's method of order 8, the amplifier's transient taken out first.
+"""One step of the table's motion: Dormand, El-Mikkawy and Prince's method of order 8 for x'' = f(t, x), after two exact
+changes of variables.
 
-Between two switches of a channel V_i - V_c = b + s t + e E with E = exp(-t / tau), so the comb forces hold terms in E
-and E^2 that die within a few microseconds, far below a sensible step. Their response
-xi(t) = xi_1 E + xi_2 E^2 is known in closed form to leading orders in tau, from xi'' + D xi' + K/m xi = A E:
+The amplifier's transient. Between two switches of a channel V_i - V_c = b + s t + e E with E = exp(-t / tau), so the
+comb forces hold terms A_1 E + A_2 E^2 (per mass) that die within a few microseconds, far below a sensible step. With
+x = y + xi, xi = R_1 A_1 E + R_2 A_2 E^2, whatever the matrices R,
 
-    xi_1 = tau^2 (A + tau D A - tau^2 K A / m),   xi_2 likewise with tau / 2.
+    y'' + D y' = a(y + xi, t) - (xi'' + D xi'),
 
-Substituting x = y + xi is exact, whatever xi is; y'' = a(y + xi, y' + xi', t) - xi'' is smooth, and y is what is
-integrated. What stays rough is the turn of the Jacobian while a transient lasts."""
+and with those of ``sim.parameters.transient_response``, which answer xi'' + D xi' + K xi / m = A E to leading orders in
+tau, y is smooth. What stays rough is the turn of the Jacobian while a transient lasts.
+
+Damping. From the start of a step, y = y_0 + exp(-D t / 2) u takes the velocity out of the right-hand side:
+
+    u'' = exp(D t / 2) (a - (xi'' + D xi')) + D^2 u / 4,   u(0) = 0,   u'(0) = y'(0)."""
 
 import math
 
@@ -15,116 +20,142 @@ import numpy as np
 from numba import njit
 
 from sim.amplifier import pass_time
-from sim.dop853 import A, B, C
-from sim.mechanics import acceleration, comb_acceleration, stiffness
+from sim.mechanics import comb_acceleration, undamped_acceleration
+from sim.nystrom import B_RATE, STAGES, A, B, C
 
 LONGEST_S = 205e-6
 """Longest step: a sixth of the fastest rigid mode's period, at which the order-8 method is exact to 1e-14 m in a
 scan."""
-CONTACT_S = 4e-6
+CONTACT_S = 2.5e-6
 """Step while a stop or a snapped comb touches."""
+LAST = STAGES - 1
+"""Stage at the end of the step."""
 
 
 @njit(cache=True, error_model="numpy")
-def _tabulate_decay(p: np.void, s: np.void, h: float) -> None:
-    """E at the stages and at the end of a step of h s, kept until h changes."""
-    if s["decay_h_s"] == h:
+def _tabulate(p: np.void, s: np.void, h: float) -> None:
+    """E, exp(-D t / 2) and exp(D t / 2) at the stages of a step of h s, the last of which lies at its end. Kept until
+    h changes."""
+    if s["tabulated_h_s"] == h:
         return
-    s["decay_h_s"] = h
+    s["tabulated_h_s"] = h
     tau = p["amplifier_s"]
-    for i in range(12):
-        s["decay"][i] = math.exp(-C[i] * h / tau) if tau > 0.0 else 0.0
-    s["decay"][12] = math.exp(-h / tau) if tau > 0.0 else 0.0
+    for i in range(STAGES):
+        t = C[i] * h
+        s["decay"][i] = math.exp(-t / tau) if tau > 0.0 else 0.0
+        _exponential(p["damping_per_s"], -0.5 * t, s["shrink"][i])
+        _exponential(p["damping_per_s"], 0.5 * t, s["swell"][i])
 
 
 @njit(cache=True, error_model="numpy")
-def _fast_response(p: np.void, s: np.void) -> None:
-    """Set xi_1 and xi_2, s["fast_1"] and s["fast_2"], m, at the pose where the step starts; zero if no channel is in
-    transient."""
-    one, two, volt2 = s["fast_1"], s["fast_2"], s["volt2"]
-    if s["error_v"][0] == 0.0 and s["error_v"][1] == 0.0 and s["error_v"][2] == 0.0:
+def _exponential(d: np.ndarray, t: float, out: np.ndarray) -> None:
+    """exp(d t) of a (3, 3) for |d t| well below 1, by its series, column by column."""
+    for j in range(3):
+        a, b, c = (1.0 if j == 0 else 0.0), (1.0 if j == 1 else 0.0), (1.0 if j == 2 else 0.0)
+        out[0, j], out[1, j], out[2, j] = a, b, c
+        n = 1
+        while max(abs(a), abs(b), abs(c)) > 1e-18:
+            f = t / n
+            a, b, c = (
+                f * (d[0, 0] * a + d[0, 1] * b + d[0, 2] * c),
+                f * (d[1, 0] * a + d[1, 1] * b + d[1, 2] * c),
+                f * (d[2, 0] * a + d[2, 1] * b + d[2, 2] * c),
+            )
+            out[0, j] += a
+            out[1, j] += b
+            out[2, j] += c
+            n += 1
+
+
+@njit(cache=True, error_model="numpy")
+def _times(m: np.ndarray, x: float, y: float, z: float) -> tuple[float, float, float]:
+    """m (3, 3) times a vector."""
+    return (
+        m[0, 0] * x + m[0, 1] * y + m[0, 2] * z,
+        m[1, 0] * x + m[1, 1] * y + m[1, 2] * z,
+        m[2, 0] * x + m[2, 1] * y + m[2, 2] * z,
+    )
+
+
+@njit(cache=True, error_model="numpy")
+def _transient(p: np.void, s: np.void) -> None:
+    """Amplitudes (3,) of a transient at the pose where the step starts: of xi, s["fast_1_m"] and s["fast_2_m"], and of
+    -(xi'' + D xi'), s["fast_1_m_per_s2"] and s["fast_2_m_per_s2"]. Zero if no channel is in one."""
+    one, two = s["fast_1_m"], s["fast_2_m"]
+    one_push, two_push = s["fast_1_m_per_s2"], s["fast_2_m_per_s2"]
+    error = s["error_v"]
+    if error[0] == 0.0 and error[1] == 0.0 and error[2] == 0.0:
         for j in range(3):
-            one[j], two[j] = 0.0, 0.0
+            one[j], two[j], one_push[j], two_push[j] = 0.0, 0.0, 0.0, 0.0
         return
+    for i in range(3):
+        s["volt2"][i] = 2.0 * (s["base_v"][i] - s["charge_v"][i]) * error[i]
+        s["error_volt2"][i] = error[i] * error[i]
     x, y, z = s["motion"][0], s["motion"][1], s["motion"][2]
-    k = stiffness(p, x, y, z)
-    tau = p["amplifier_s"]
-    for i in range(3):
-        volt2[i] = 2.0 * (s["base_v"][i] - s["charge_v"][i]) * s["error_v"][i]
-    _respond(p, k, tau, comb_acceleration(p, volt2, x, y, z), one)
-    for i in range(3):
-        volt2[i] = s["error_v"][i] ** 2
-    _respond(p, k, 0.5 * tau, comb_acceleration(p, volt2, x, y, z), two)
+    ax, ay, az = comb_acceleration(p, s["volt2"], x, y, z)
+    one[0], one[1], one[2] = _times(p["response_1_s2"], ax, ay, az)
+    one_push[0], one_push[1], one_push[2] = _times(p["response_1"], ax, ay, az)
+    ax, ay, az = comb_acceleration(p, s["error_volt2"], x, y, z)
+    two[0], two[1], two[2] = _times(p["response_2_s2"], ax, ay, az)
+    two_push[0], two_push[1], two_push[2] = _times(p["response_2"], ax, ay, az)
 
 
 @njit(cache=True, error_model="numpy")
-def _respond(
-    p: np.void, k: tuple[float, ...], tau: float, amplitude: tuple[float, float, float], out: np.ndarray
-) -> None:
-    """Displacement amplitude ``out`` (3,), m, under an acceleration ``amplitude`` (3 floats, m/s^2) times exp(-t /
-    tau)."""
-    ax, ay, az = amplitude
-    d = p["damping_per_s"]
-    stiff = tau * tau / p["mass_kg"]
-    t2 = tau * tau
-    damped_x = d[0, 0] * ax + d[0, 1] * ay + d[0, 2] * az
-    damped_y = d[1, 0] * ax + d[1, 1] * ay + d[1, 2] * az
-    damped_z = d[2, 0] * ax + d[2, 1] * ay + d[2, 2] * az
-    out[0] = t2 * (ax + tau * damped_x - stiff * (k[0] * ax + k[1] * ay + k[2] * az))
-    out[1] = t2 * (ay + tau * damped_y - stiff * (k[1] * ax + k[3] * ay + k[4] * az))
-    out[2] = t2 * (az + tau * damped_z - stiff * (k[2] * ax + k[4] * ay + k[5] * az))
-
-
-@njit(cache=True, error_model="numpy")
-def _weighted(slope: np.ndarray, weights: np.ndarray, n: int) -> tuple[float, float, float, float, float, float]:
-    """Sum of the first n rows of ``slope`` (12, 6), each times its weight."""
-    d0, d1, d2, d3, d4, d5 = 0.0, 0.0, 0.0, 0.0, 0.0, 0.0
+def _weighted(given: np.ndarray, weights: np.ndarray, n: int) -> tuple[float, float, float]:
+    """Sum of the first n rows of ``given`` (8, 3), each times its weight."""
+    x, y, z = 0.0, 0.0, 0.0
     for r in range(n):
         w = weights[r]
-        d0 += w * slope[r, 0]
-        d1 += w * slope[r, 1]
-        d2 += w * slope[r, 2]
-        d3 += w * slope[r, 3]
-        d4 += w * slope[r, 4]
-        d5 += w * slope[r, 5]
-    return d0, d1, d2, d3, d4, d5
+        x += w * given[r, 0]
+        y += w * given[r, 1]
+        z += w * given[r, 2]
+    return x, y, z
 
 
 @njit(cache=True, error_model="numpy")
 def _step(p: np.void, s: np.void, h: float) -> None:
     """Integrate motion and voltages over h s, without a look at stops."""
-    _tabulate_decay(p, s, h)
-    _fast_response(p, s)
-    motion, slope, volt2, decay = s["motion"], s["slope"], s["volt2"], s["decay"]
-    k = 1.0 / p["amplifier_s"] if p["amplifier_s"] > 0.0 else 0.0
-    x1, y1, z1 = s["fast_1"][0], s["fast_1"][1], s["fast_1"][2]
-    x2, y2, z2 = s["fast_2"][0], s["fast_2"][1], s["fast_2"][2]
+    _tabulate(p, s, h)
+    _transient(p, s)
+    motion, given, volt2, decay = s["motion"], s["given"], s["volt2"], s["decay"]
+    k, h2 = 1.0 / p["amplifier_s"] if p["amplifier_s"] > 0.0 else 0.0, h * h
+    x1, y1, z1 = s["fast_1_m"][0], s["fast_1_m"][1], s["fast_1_m"][2]
+    x2, y2, z2 = s["fast_2_m"][0], s["fast_2_m"][1], s["fast_2_m"][2]
+    one, two = s["fast_1_m_per_s2"], s["fast_2_m_per_s2"]
     x, y, z = motion[0] - x1 - x2, motion[1] - y1 - y2, motion[2] - z1 - z2
     vx, vy, vz = motion[3] + k * (x1 + 2.0 * x2), motion[4] + k * (y1 + 2.0 * y2), motion[5] + k * (z1 + 2.0 * z2)
-    for i in range(12):
-        d0, d1, d2, d3, d4, d5 = _weighted(slope, A[i], i)
-        d3, d4, d5 = vx + h * d3, vy + h * d4, vz + h * d5
-        slope[i, 0], slope[i, 1], slope[i, 2] = d3, d4, d5
+    for i in range(STAGES):
         t, e1 = C[i] * h, decay[i]
+        e2 = e1 * e1
+        gx, gy, gz = _weighted(given, A[i], i)
+        ux, uy, uz = t * vx + h2 * gx, t * vy + h2 * gy, t * vz + h2 * gz
+        px, py, pz = _times(s["shrink"][i], ux, uy, uz)
         for c in range(3):
             volt = s["base_v"][c] - s["charge_v"][c] + s["slope_v_per_s"][c] * t + s["error_v"][c] * e1
             volt2[c] = volt * volt
-        e2 = e1 * e1
+        mean = 2.0 * h2 / t if i > 0 else 0.0  # of the velocity's change: stops alone ask for it, in short steps
         g1, g2 = k * e1, 2.0 * k * e2
-        ax, ay, az = acceleration(
+        ax, ay, az = undamped_acceleration(
             p, s, volt2,
-            x + h * d0 + x1 * e1 + x2 * e2, y + h * d1 + y1 * e1 + y2 * e2, z + h * d2 + z1 * e1 + z2 * e2,
-            d3 - x1 * g1 - x2 * g2, d4 - y1 * g1 - y2 * g2, d5 - z1 * g1 - z2 * g2,
+            x + px + x1 * e1 + x2 * e2, y + py + y1 * e1 + y2 * e2, z + pz + z1 * e1 + z2 * e2,
+            vx + mean * gx - x1 * g1 - x2 * g2, vy + mean * gy - y1 * g1 - y2 * g2, vz + mean * gz - z1 * g1 - z2 * g2,
         )  # fmt: skip
-        g1, g2 = k * g1, 2.0 * k * g2
-        slope[i, 3], slope[i, 4], slope[i, 5] = ax - x1 * g1 - x2 * g2, ay - y1 * g1 - y2 * g2, az - z1 * g1 - z2 * g2
-    d0, d1, d2, d3, d4, d5 = _weighted(slope, B, 12)
-    e1 = decay[12]
+        ax, ay, az = ax + one[0] * e1 + two[0] * e2, ay + one[1] * e1 + two[1] * e2, az + one[2] * e1 + two[2] * e2
+        ax, ay, az = _times(s["swell"][i], ax, ay, az)
+        gx, gy, gz = _times(p["damping2_per_s2"], ux, uy, uz)
+        given[i, 0], given[i, 1], given[i, 2] = ax + gx, ay + gy, az + gz
+    gx, gy, gz = _weighted(given, B, STAGES)
+    ux, uy, uz = h * vx + h2 * gx, h * vy + h2 * gy, h * vz + h2 * gz
+    gx, gy, gz = _weighted(given, B_RATE, STAGES)
+    dx, dy, dz = _times(p["damping_per_s"], ux, uy, uz)
+    px, py, pz = _times(s["shrink"][LAST], ux, uy, uz)
+    vx, vy, vz = _times(s["shrink"][LAST], vx + h * gx - 0.5 * dx, vy + h * gy - 0.5 * dy, vz + h * gz - 0.5 * dz)
+    e1 = decay[LAST]
     e2 = e1 * e1
     g1, g2 = k * e1, 2.0 * k * e2
-    motion[0], motion[3] = x + h * d0 + x1 * e1 + x2 * e2, vx + h * d3 - x1 * g1 - x2 * g2
-    motion[1], motion[4] = y + h * d1 + y1 * e1 + y2 * e2, vy + h * d4 - y1 * g1 - y2 * g2
-    motion[2], motion[5] = z + h * d2 + z1 * e1 + z2 * e2, vz + h * d5 - z1 * g1 - z2 * g2
+    motion[0], motion[3] = x + px + x1 * e1 + x2 * e2, vx - x1 * g1 - x2 * g2
+    motion[1], motion[4] = y + py + y1 * e1 + y2 * e2, vy - y1 * g1 - y2 * g2
+    motion[2], motion[5] = z + pz + z1 * e1 + z2 * e2, vz - z1 * g1 - z2 * g2
     pass_time(s, h, e1)
 
 

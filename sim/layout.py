@@ -5,6 +5,8 @@ no kernel allocates."""
 
 import numpy as np
 
+from sim.nystrom import STAGES
+
 KNOTS = 16
 """Remembered ends of steps, for the sense chain's delay."""
 EVENTS = 64
@@ -25,7 +27,8 @@ PARAMS = np.dtype(
         ("crank_m", "f8"), ("link_m", "f8"), ("projection_rest_m", "f8"), ("height_rest_m", "f8"),
         ("leaf_n_per_m", "f8", 3), ("crank_hinge_nm", "f8", 3), ("link_hinge_nm", "f8"),
         ("mass_kg", "f8"), ("per_kg", "f8"), ("per_crank", "f8"), ("per_link2", "f8"),
-        ("damping_per_s", "f8", (3, 3)), ("weight_n", "f8", 3),
+        ("damping_per_s", "f8", (3, 3)), ("damping2_per_s2", "f8", (3, 3)),  # D, and D^2 / 4
+        ("weight_n", "f8", 3),
         # stops
         ("stop_low_m", "f8"), ("stop_high_m", "f8"), ("stop_n_per_m", "f8"), ("stop_damping_s_per_m", "f8"),
         # drive combs
@@ -34,6 +37,8 @@ PARAMS = np.dtype(
         ("charging_on", "i8"), ("charging_fraction", "f8"), ("charging_s", "f8"),
         # amplifier
         ("amplifier_s", "f8"), ("slew_v_per_s", "f8"), ("current_a", "f8"), ("stray_f", "f8"),
+        ("response_1_s2", "f8", (3, 3)), ("response_2_s2", "f8", (3, 3)),  # of the table to a transient
+        ("response_1", "f8", (3, 3)), ("response_2", "f8", (3, 3)),  # ... what of its acceleration that answers
         ("volt_per_count", "f8", 3), ("amplifier_offset_v", "f8", 3), ("dac_step", "i8"),
         # parasitic mode
         ("parasitic_on", "i8"), ("parasitic_rad_per_s", "f8"), ("parasitic_damping_per_s", "f8"), ("parasitic_per_kg",
@@ -64,9 +69,10 @@ STATE = np.dtype(
         # scratch of one step
         ("force_n", "f8", 3),
         ("base_v", "f8", 3), ("slope_v_per_s", "f8", 3), ("error_v", "f8", 3), ("volt2", "f8", 3),
-        ("fast_1", "f8", 3), ("fast_2", "f8", 3),
-        ("slope", "f8", (12, 6)), ("start", "f8", 6),
-        ("decay_h_s", "f8"), ("decay", "f8", 13), ("contact", "i8"), ("touched", "i8", 3),
+        ("error_volt2", "f8", 3), ("fast_1_m", "f8", 3), ("fast_2_m", "f8", 3), ("fast_1_m_per_s2", "f8", 3),
+        ("fast_2_m_per_s2", "f8", 3), ("given", "f8", (STAGES, 3)), ("start", "f8", 6),
+        ("tabulated_h_s", "f8"), ("decay", "f8", STAGES), ("shrink", "f8", (STAGES, 3, 3)), ("swell", "f8", (STAGES, 3,
+        3)), ("contact", "i8"), ("touched", "i8", 3),
         ("before_m", "f8", 3), ("before_m_per_s", "f8", 3), ("strokes_m", "f8", 3), ("rates_m_per_s", "f8", 3),
     ],
     align=True,

@@ -50,9 +50,22 @@ def energy(p: np.void, motion: np.ndarray) -> float:
 def acceleration(
     p: np.void, s: np.void, volt2: np.ndarray, x: float, y: float, z: float, vx: float, vy: float, vz: float
 ) -> tuple[float, float, float]:
-    """Acceleration (ax, ay, az) in m/s^2 at a pose and velocity, with squared comb voltages ``volt2`` (3,) in V^2 and
-    the constant force s["force_n"]. Sets s["contact"] and s["touched"] where a slider meets a stop or is held by
-    snapped fingers."""
+    """Acceleration (ax, ay, az) in m/s^2: ``undamped_acceleration`` less the damping's."""
+    ax, ay, az = undamped_acceleration(p, s, volt2, x, y, z, vx, vy, vz)
+    d = p["damping_per_s"]
+    ax -= d[0, 0] * vx + d[0, 1] * vy + d[0, 2] * vz
+    ay -= d[1, 0] * vx + d[1, 1] * vy + d[1, 2] * vz
+    az -= d[2, 0] * vx + d[2, 1] * vy + d[2, 2] * vz
+    return ax, ay, az
+
+
+@njit(cache=True, error_model="numpy")
+def undamped_acceleration(
+    p: np.void, s: np.void, volt2: np.ndarray, x: float, y: float, z: float, vx: float, vy: float, vz: float
+) -> tuple[float, float, float]:
+    """Acceleration (ax, ay, az) in m/s^2 at a pose, with squared comb voltages ``volt2`` (3,) in V^2 and the constant
+    force s["force_n"], without damping: the velocity counts on stops alone. Sets s["contact"] and s["touched"] where a
+    slider meets a stop or is held by snapped fingers."""
     height_m, projection_m, drawn_m = lift(p, z)
     crank_m = p["crank_m"]
     fringe = p["fringe_per_m"]
@@ -83,16 +96,12 @@ def acceleration(
     hinge = p["link_hinge_nm"] * elevation_change(p, height_m, projection_m) * per_projection
     fz = s["force_n"][2] + pulls * steep - hinge + p["levitation"] * combs
     per_kg = p["per_kg"]
-    d = p["damping_per_s"]
-    ax = fx * per_kg - (d[0, 0] * vx + d[0, 1] * vy + d[0, 2] * vz)
-    ay = fy * per_kg - (d[1, 0] * vx + d[1, 1] * vy + d[1, 2] * vz)
-    az = fz * per_kg - (d[2, 0] * vx + d[2, 1] * vy + d[2, 2] * vz)
-    return ax, ay, az
+    return fx * per_kg, fy * per_kg, fz * per_kg
 
 
 @njit(cache=True, error_model="numpy")
 def comb_acceleration(p: np.void, volt2: np.ndarray, x: float, y: float, z: float) -> tuple[float, float, float]:
-    """The combs' own part of ``acceleration``, which is linear in ``volt2``."""
+    """The combs' own part of ``undamped_acceleration``, which is linear in ``volt2``."""
     height_m, projection_m, drawn_m = lift(p, z)
     fx, fy, combs = 0.0, 0.0, 0.0
     for i in range(3):

@@ -32,6 +32,7 @@ def build_parameters(
     _mechanism(p, config, device)
     _drive_combs(p, config, device)
     _amplifier(p, config, drive_v_per_count)
+    _transient_response(p)
     _modes_and_forces(p, config)
     _sense_chain(p, config, device, period_us, sense_f_per_count, sense_zero_f)
     return params
@@ -64,6 +65,7 @@ def _mechanism(p: np.void, config: PlantConfig, device: Device) -> None:
     p["mass_kg"] = device.dynamics.mass_kg * (1 + (config.mass_error.relative if config.mass_error.on else 0.0))
     p["per_kg"], p["per_crank"], p["per_link2"] = 1 / p["mass_kg"], 1 / p["crank_m"], 1 / p["link_m"] ** 2
     p["damping_per_s"] = _damping(p, config, device)
+    p["damping2_per_s2"] = 0.25 * p["damping_per_s"] @ p["damping_per_s"]
     p["weight_n"] = _weight(config, float(p["mass_kg"]))
     stops = config.stops
     far_m = 1.0  # no stop
@@ -140,6 +142,21 @@ def _amplifier(p: np.void, config: PlantConfig, v_per_count: float) -> None:
     p["volt_per_count"] = v_per_count * (1 + np.array(config.amplifier_gain.relative) * config.amplifier_gain.on)
     p["amplifier_offset_v"] = np.array(config.amplifier_offset.offset_v) * config.amplifier_offset.on
     p["dac_step"] = config.dac.step_counts if config.dac.on else 1
+
+
+def _transient_response(p: np.void) -> None:
+    """R, where xi = R A exp(-k t) solves xi'' + D xi' + K xi / m = A exp(-k t) to leading orders in 1 / k, and what R A
+    stands before in -(xi'' + D xi'); for k = 1 / tau and twice that. K is that of the rest pose: of R, a part in 2000
+    hangs on it.
+    """
+    unit, d = np.eye(3), p["damping_per_s"]
+    stiff = rest_stiffness(p, np.zeros(3)) / p["mass_kg"]
+    for n in (1, 2):
+        tau = p["amplifier_s"] / n
+        response = tau**2 * (unit + tau * d - tau**2 * stiff)
+        p[f"response_{n}_s2"] = response
+        if tau > 0.0:
+            p[f"response_{n}"] = (d / tau - unit / tau**2) @ response
 
 
 def _modes_and_forces(p: np.void, config: PlantConfig) -> None:

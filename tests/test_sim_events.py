@@ -44,7 +44,7 @@ def test_stops_hold_against_full_force():
 
 
 def test_stops_steps_agree_with_fine_ones():
-    """Contact is integrated in steps of 4 us; over several bounces that parts by tens of nanometres from 1 us steps."""
+    """Contact is integrated in steps of 2.5 us; over several bounces that parts from 1 us steps by tens of nm."""
     coarse, fine = plant(config(stops={})), plant(config(stops={}))
     for p in (coarse, fine):
         p.state["motion"][0, :3] = [0.0, 0.0, 25e-6]

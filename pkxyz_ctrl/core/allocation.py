@@ -16,7 +16,7 @@ Array = NDArray[np.float64]
 _FREE, _LOWER, _UPPER = 0, 1, 2
 
 
-@njit(cache=True)
+@njit(cache=True, error_model="numpy")
 def allocate(jacobian: Array, inverse: Array, demand_n: Array, lower_n: Array, upper_n: Array, force_n: Array) -> int:
     """Write the optimal comb forces (3,) to ``force_n``; returns how many active sets were tried (1: no limit was met).
 
@@ -31,7 +31,7 @@ def allocate(jacobian: Array, inverse: Array, demand_n: Array, lower_n: Array, u
     return _search(jacobian, demand_n, lower_n, upper_n, force_n)
 
 
-@njit(cache=True)
+@njit(cache=True, error_model="numpy")
 def _search(jacobian: Array, demand_n: Array, lower_n: Array, upper_n: Array, best: Array) -> int:
     hessian, linear, trial = np.empty((3, 3)), np.empty(3), np.empty(3)
     scale = 0.0
@@ -58,7 +58,7 @@ def _search(jacobian: Array, demand_n: Array, lower_n: Array, upper_n: Array, be
     return 27
 
 
-@njit(cache=True)
+@njit(cache=True, error_model="numpy")
 def _solve_fixed(
     hessian: Array, linear: Array, lower: Array, upper: Array, state: NDArray[np.int64], out: Array
 ) -> None:
@@ -82,7 +82,7 @@ def _solve_fixed(
         out[k] = (hessian[i, i] * rk - hessian[k, i] * ri) / determinant
 
 
-@njit(cache=True)
+@njit(cache=True, error_model="numpy")
 def _residual(hessian: Array, linear: Array, state: NDArray[np.int64], fixed: Array, row: int) -> float:
     """Right-hand side of a free row after the fixed components went over to it."""
     total = linear[row]
@@ -92,7 +92,7 @@ def _residual(hessian: Array, linear: Array, state: NDArray[np.int64], fixed: Ar
     return total
 
 
-@njit(cache=True)
+@njit(cache=True, error_model="numpy")
 def kkt_violation(
     hessian: Array, linear: Array, lower: Array, upper: Array, state: NDArray[np.int64], force: Array
 ) -> float:

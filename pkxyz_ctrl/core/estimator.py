@@ -45,7 +45,7 @@ ESTIMATE = np.dtype(
 )
 
 
-@njit(cache=True)
+@njit(cache=True, error_model="numpy")
 def update(estimator: np.void, estimate: np.void, measured_m: Array, has_measurement: bool) -> None:
     """Measurement update at a sample: filtered = predicted + gain (y - h(predicted)). Without a measurement the
     prediction stands.
@@ -60,7 +60,7 @@ def update(estimator: np.void, estimate: np.void, measured_m: Array, has_measure
         )
 
 
-@njit(cache=True)
+@njit(cache=True, error_model="numpy")
 def midway(estimator: np.void, s: Array, position_m: Array) -> None:
     """Position (3,) half a period after the state ``s`` (9,), where ``net_input`` is to be evaluated: at the start of
     the period
@@ -69,7 +69,7 @@ def midway(estimator: np.void, s: Array, position_m: Array) -> None:
         position_m[i] = estimator["operating_point_m"][i] + s[i] + estimator["half_period_s"] * s[3 + i]
 
 
-@njit(cache=True)
+@njit(cache=True, error_model="numpy")
 def net_input(
     geometry: np.void,
     elasticity: np.void,
@@ -98,7 +98,7 @@ def net_input(
         w_change[i] += acted[i]
 
 
-@njit(cache=True)
+@njit(cache=True, error_model="numpy")
 def predict(estimator: np.void, s: Array, w: Array, w_change: Array, out: Array) -> None:
     """Time update over one period: write the state (9,) that follows from ``s`` and the input of ``net_input`` to
     ``out``, another array.
@@ -118,7 +118,7 @@ def predict(estimator: np.void, s: Array, w: Array, w_change: Array, out: Array)
 _FAR_M = 1e-6
 
 
-@njit(cache=True)
+@njit(cache=True, error_model="numpy")
 def goes_far(estimator: np.void, s: Array, after: Array) -> bool:
     """Whether from a state (9,) to the one a period later the way, or what it differs by from the first half to the
     second, is so long that the input in mid-period no longer stands for all of it: at 10 um that errs by 80 nm. Up to
@@ -130,7 +130,7 @@ def goes_far(estimator: np.void, s: Array, after: Array) -> bool:
     return far
 
 
-@njit(cache=True)
+@njit(cache=True, error_model="numpy")
 def predict_far(
     geometry: np.void, elasticity: np.void, estimator: np.void, s: Array, force_n: Array, force_old_n: Array, out: Array
 ) -> None:

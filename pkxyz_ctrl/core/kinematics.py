@@ -52,7 +52,7 @@ def geometry_record(config: GeometryConfig) -> NDArray[np.void]:
     return record
 
 
-@njit(cache=True)
+@njit(cache=True, error_model="numpy")
 def in_domain(geometry: np.void, position_m: Array) -> int:
     """0 if the links can reach ``position_m`` (3,); 1, 2, 3 if the crank of that chain can't; 4 if the links can't
     (|z_0 + z| >= L2).
@@ -66,7 +66,7 @@ def in_domain(geometry: np.void, position_m: Array) -> int:
     return 0
 
 
-@njit(cache=True)
+@njit(cache=True, error_model="numpy")
 def link(geometry: np.void, dz: float) -> tuple[float, float, float]:
     """The out-of-plane links at height ``dz`` above rest: height z, projection delta, and delta_0 - delta, all in m."""
     reach, z0 = geometry["link_m"], geometry["height_rest_m"]
@@ -75,7 +75,7 @@ def link(geometry: np.void, dz: float) -> tuple[float, float, float]:
     return z, delta, dz * (z + z0) / (delta + geometry["projection_rest_m"])
 
 
-@njit(cache=True)
+@njit(cache=True, error_model="numpy")
 def crank(geometry: np.void, i: int, x: float, y: float) -> tuple[float, float]:
     """Chain i's crank at (x, y): s = L1 sin(theta), across its direction of action, and c = L1 cos(theta), in m."""
     n, length = geometry["n"], geometry["crank_m"]
@@ -83,14 +83,14 @@ def crank(geometry: np.void, i: int, x: float, y: float) -> tuple[float, float]:
     return s, math.sqrt((length - s) * (length + s))
 
 
-@njit(cache=True)
+@njit(cache=True, error_model="numpy")
 def stroke(geometry: np.void, i: int, x: float, y: float, s: float, c: float, drop: float) -> float:
     """q_i in m from what ``crank`` and ``link`` say."""
     e = geometry["e"]
     return e[i, 0] * x + e[i, 1] * y + drop + s * s / (geometry["crank_m"] + c)
 
 
-@njit(cache=True)
+@njit(cache=True, error_model="numpy")
 def strokes(geometry: np.void, position_m: Array, out: Array) -> None:
     """Inverse kinematics (Eq. 8): strokes q (3,) in m relative to rest. ``position_m`` must be ``in_domain``."""
     x, y = position_m[0], position_m[1]
@@ -100,7 +100,7 @@ def strokes(geometry: np.void, position_m: Array, out: Array) -> None:
         out[i] = stroke(geometry, i, x, y, s, c, drop)
 
 
-@njit(cache=True)
+@njit(cache=True, error_model="numpy")
 def jacobian(geometry: np.void, position_m: Array, out: Array) -> None:
     """dq/dx (3,3) at ``position_m``: rows [e_i + n_i tan(theta_i), tan(alpha)]. Eq. 12 is its value at rest."""
     e, n = geometry["e"], geometry["n"]
@@ -114,7 +114,7 @@ def jacobian(geometry: np.void, position_m: Array, out: Array) -> None:
         out[i, 2] = slope
 
 
-@njit(cache=True)
+@njit(cache=True, error_model="numpy")
 def pulls(geometry: np.void, position_m: Array, out: Array) -> None:
     """B (3,3) at ``position_m``: row i is the force at the platform by the pull of comb i, the gradient of its stroke
     and what lifts its fingers. Without lift the Jacobian.
@@ -124,7 +124,7 @@ def pulls(geometry: np.void, position_m: Array, out: Array) -> None:
         out[i, 2] += geometry["lift"]
 
 
-@njit(cache=True)
+@njit(cache=True, error_model="numpy")
 def platform_force(geometry: np.void, position_m: Array, comb_force_n: Array, out: Array) -> None:
     """What comb forces (3,) do to the platform at ``position_m``, (3,) in N: J^T F (Eq. 23), and their lift."""
     e, n = geometry["e"], geometry["n"]
@@ -141,21 +141,21 @@ def platform_force(geometry: np.void, position_m: Array, comb_force_n: Array, ou
     out[2] = pull * z / delta + geometry["lift"] * pull
 
 
-@njit(cache=True)
+@njit(cache=True, error_model="numpy")
 def crank_bend(geometry: np.void, c: float) -> float:
     """Curvature of a stroke across its direction in 1/m, L1^2 / c^3 with ``crank``'s c: along n_i n_i^T."""
     length: float = geometry["crank_m"]
     return length * length / c**3
 
 
-@njit(cache=True)
+@njit(cache=True, error_model="numpy")
 def link_bend(geometry: np.void, delta: float) -> float:
     """Curvature of every stroke along z in 1/m, L2^2 / delta^3 with ``link``'s delta."""
     reach: float = geometry["link_m"]
     return reach * reach / delta**3
 
 
-@njit(cache=True)
+@njit(cache=True, error_model="numpy")
 def curvature(geometry: np.void, position_m: Array, out: Array) -> None:
     """d2q_i/dx2 (3,3,3) in 1/m at ``position_m``, first axis the chain."""
     n = geometry["n"]
@@ -170,7 +170,7 @@ def curvature(geometry: np.void, position_m: Array, out: Array) -> None:
         out[i, 2, 2] = link_bend(geometry, delta)
 
 
-@njit(cache=True)
+@njit(cache=True, error_model="numpy")
 def newton_step(geometry: np.void, strokes_m: Array, position_m: Array) -> float:
     """Move ``position_m`` (3,) in place by one Newton step towards q(x) = ``strokes_m``; the size of the step in m.
 
@@ -204,7 +204,7 @@ def newton_step(geometry: np.void, strokes_m: Array, position_m: Array) -> float
     return max(abs(dx), abs(dy), abs(dz))
 
 
-@njit(cache=True)
+@njit(cache=True, error_model="numpy")
 def position_from_strokes(geometry: np.void, strokes_m: Array, position_m: Array) -> int:
     """Forward kinematics: Newton from the position handed in (rest is always a good start), in place, until it stands
     still.

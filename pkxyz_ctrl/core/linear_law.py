@@ -39,7 +39,7 @@ LINEAR_STATE = np.dtype(
 )
 
 
-@njit(cache=True)
+@njit(cache=True, error_model="numpy")
 def add_feedback(
     linear: np.void, state: np.void, seen_m: Array, reference: Array, sense_delay_s: float, share: float, out: Array
 ) -> None:
@@ -57,7 +57,7 @@ def add_feedback(
         out[i] -= share * total
 
 
-@njit(cache=True)
+@njit(cache=True, error_model="numpy")
 def advance(linear: np.void, state: np.void, slack_n: Array, share: float) -> None:
     """Time update with error and force of ``add_feedback``, and the slack (3,) and the authority of this tick."""
     order, x, following, w = linear["order"], state["x"], state["next"], state["w_n"]
@@ -74,7 +74,7 @@ def advance(linear: np.void, state: np.void, slack_n: Array, share: float) -> No
         x[i] = following[i]
 
 
-@njit(cache=True)
+@njit(cache=True, error_model="numpy")
 def clear(state: np.void) -> None:
     """Forget: the loop is open."""
     for i in range(ORDER_MAX):

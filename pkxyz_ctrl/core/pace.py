@@ -20,7 +20,7 @@ SLOWING, STEADY, STARTING = -1, 0, 1
 """What the path speed does: it falls to 0, stays, rises to 1."""
 
 
-@njit(cache=True)
+@njit(cache=True, error_model="numpy")
 def advance(direction: int, age: int, ramp_ticks: int) -> tuple[float, float, float]:
     """Ticks of the path since a change of speed began ``age`` ticks ago, the speed now, and its change per tick.
 
@@ -37,7 +37,7 @@ def advance(direction: int, age: int, ramp_ticks: int) -> tuple[float, float, fl
     return n * u**3 * (1.0 - 0.5 * u), u * u * (3.0 - 2.0 * u), slope
 
 
-@njit(cache=True)
+@njit(cache=True, error_model="numpy")
 def sample(rows: Array, phase: float, speed: float, change_per_tick: float, period_s: float, out: Array) -> None:
     """Row (9,) of a path at a phase between two of its rows (n, 9 or more), constant jerk between them, taken at a path
     speed.

@@ -49,7 +49,7 @@ NO_PLAN, FREE, LIMITED = 0, 1, 2
 _JUMP_M = 2e-9  # smooth references miss their own polynomial by 0.1 nm where the jerk switches
 
 
-@njit(cache=True)
+@njit(cache=True, error_model="numpy")
 def deviation(law: np.void, memory: np.void, rows: Array, error: Array) -> None:
     """e (6,) at the start of the first interval, as the state feedback sees it."""
     gains, row, target, force = law["feedback"], np.empty(9), np.empty(9), np.empty(3)
@@ -66,7 +66,7 @@ def deviation(law: np.void, memory: np.void, rows: Array, error: Array) -> None:
         error[3 + i] = ahead[3 + i] - target[3 + i]
 
 
-@njit(cache=True)
+@njit(cache=True, error_model="numpy")
 def jumps(period_s: float, rows: Array, jump_m: Array) -> bool:
     """c (n,3): where a row (n+1, 9) of the reference is not what the row before leads to; returns if anywhere."""
     found = False
@@ -79,7 +79,7 @@ def jumps(period_s: float, rows: Array, jump_m: Array) -> bool:
     return found
 
 
-@njit(cache=True)
+@njit(cache=True, error_model="numpy")
 def free_plan(law: np.void, error: Array, jump_m: Array, jumps: bool, e: Array, nu_n: Array) -> None:
     """The plan nu (n,3) that knows no limits, and where it leads from the deviation ``error`` (6,): e (n+1, 6).
 
@@ -109,7 +109,7 @@ def free_plan(law: np.void, error: Array, jump_m: Array, jumps: bool, e: Array, 
         _step(law["estimator"], e[k], nu_n[k], jump_m[k], e[k + 1])
 
 
-@njit(cache=True)
+@njit(cache=True, error_model="numpy")
 def predict(law: np.void, error: Array, jump_m: Array, nu_n: Array, e: Array) -> None:
     """Where a plan nu (n,3) leads from the deviation ``error`` (6,): e (n+1, 6)."""
     e[0] = error
@@ -117,7 +117,7 @@ def predict(law: np.void, error: Array, jump_m: Array, nu_n: Array, e: Array) ->
         _step(law["estimator"], e[k], nu_n[k], jump_m[k], e[k + 1])
 
 
-@njit(cache=True)
+@njit(cache=True, error_model="numpy")
 def _step(estimator: np.void, e: Array, nu_n: Array, jump_m: Array, out: Array) -> None:
     phi, gamma = estimator["transition"], estimator["input"]
     for i in range(6):
@@ -129,7 +129,7 @@ def _step(estimator: np.void, e: Array, nu_n: Array, jump_m: Array, out: Array) 
         out[i] = total
 
 
-@njit(cache=True)
+@njit(cache=True, error_model="numpy")
 def slope(law: np.void, pulls0: Array, e: Array, out: Array) -> None:
     """Half the derivative (3n,) of the cost by v at v = 0, from where that leads: e (n+1, 6). Backwards, as adjoints
     go.
@@ -154,7 +154,7 @@ def slope(law: np.void, pulls0: Array, e: Array, out: Array) -> None:
         adjoint[:] = before
 
 
-@njit(cache=True)
+@njit(cache=True, error_model="numpy")
 def comb_forces(
     law: np.void, now: Array, after: Array, e: Array, nu_n: Array, disturbance_n: Array, comb_n: Array
 ) -> bool:
@@ -183,7 +183,7 @@ def comb_forces(
     return True
 
 
-@njit(cache=True)
+@njit(cache=True, error_model="numpy")
 def forces_and_strokes(
     law: np.void, rows: Array, e: Array, nu_n: Array, disturbance_n: Array, comb_n: Array, stroke_m: Array
 ) -> bool:
@@ -202,7 +202,7 @@ def forces_and_strokes(
     return True
 
 
-@njit(cache=True)
+@njit(cache=True, error_model="numpy")
 def stroke_limits(law: np.void, rows: Array, lower_m: Array, upper_m: Array) -> None:
     """Limits (n, 3) of those strokes, where a reference that is beyond them has its own."""
     asked = np.empty(3)
@@ -214,7 +214,7 @@ def stroke_limits(law: np.void, rows: Array, lower_m: Array, upper_m: Array) -> 
             upper_m[m, i] = max(high, asked[i])
 
 
-@njit(cache=True)
+@njit(cache=True, error_model="numpy")
 def is_inside(drive: np.void, count: Array, comb_n: Array, stroke_m: Array, lower_m: Array, upper_m: Array) -> bool:
     """Whether comb forces (n,3) after the last counts (3,) keep voltage and slew, and strokes (n,3) their limits."""
     gain, most = drive["force_gain_n_per_v2"], drive["volt_per_count"] * drive["count_max"]
@@ -234,7 +234,7 @@ def is_inside(drive: np.void, count: Array, comb_n: Array, stroke_m: Array, lowe
     return True
 
 
-@njit(cache=True)
+@njit(cache=True, error_model="numpy")
 def comb_bounds(drive: np.void, count: Array, about_n: Array, lower: Array, upper: Array) -> None:
     """Bounds (3n,) of v from what the voltages can be after 1, 2, ... periods of slewing from the last counts (3,);
     ``about_n`` (n,3): comb forces less v, as a plan has them.
@@ -248,7 +248,7 @@ def comb_bounds(drive: np.void, count: Array, about_n: Array, lower: Array, uppe
             upper[3 * k + i] = gain[i] * high * high - about_n[k, i]
 
 
-@njit(cache=True)
+@njit(cache=True, error_model="numpy")
 def slew_bounds(drive: np.void, about_n: Array, comb_n: Array, lower: Array, upper: Array) -> None:
     """Bounds (3n-3,) of v_k - v_(k-1) from the slew limit, about comb forces (n,3) that were planned."""
     gain = drive["force_gain_n_per_v2"]

@@ -99,7 +99,7 @@ MEMORY = np.dtype(
 )
 
 
-@njit(cache=True)
+@njit(cache=True, error_model="numpy")
 def measure(law: np.void, memory: np.void, sense_count: NDArray[np.int32]) -> None:
     """Sense counts (3,) -> capacitances -> strokes -> ``measurement_m``, by one Newton step from the predicted
     position; ``residual_m`` is how far the strokes are from those expected there.
@@ -118,7 +118,7 @@ def measure(law: np.void, memory: np.void, sense_count: NDArray[np.int32]) -> No
     kinematics.newton_step(law["geometry"], stroke, position)
 
 
-@njit(cache=True)
+@njit(cache=True, error_model="numpy")
 def estimate(law: np.void, memory: np.void, has_measurement: bool) -> None:
     """Filter the measurement, then predict to the next sample and on to the instant from which this tick's force
     acts.
@@ -128,7 +128,8 @@ def estimate(law: np.void, memory: np.void, has_measurement: bool) -> None:
     position, w, w_change = scratch["position_m"], scratch["w_n"], scratch["w_change_n"]
     acting, acted, start = scratch["acting_n"], scratch["acted_n"], scratch["state"]
     ahead = state["ahead"]
-    start[:] = state["filtered"]
+    for i in range(9):
+        start[i] = state["filtered"][i]
     for i in range(3):
         estimated = estimator["operating_point_m"][i] + start[i]
         memory["seen_m"][i] = memory["measurement_m"][i] if has_measurement else estimated
@@ -142,12 +143,13 @@ def estimate(law: np.void, memory: np.void, has_measurement: bool) -> None:
         filtering.predict(estimator, start, w, w_change, ahead)
         if filtering.goes_far(estimator, start, ahead):
             filtering.predict_far(law["geometry"], law["elasticity"], estimator, start, acting, acted, ahead)
-        if step == 0:
-            state["predicted"][:] = ahead
-        start[:] = ahead
+        for i in range(9):  # an assignment of whole arrays costs ten times as much: numba looks whether they overlap
+            start[i] = ahead[i]
+            if step == 0:
+                state["predicted"][i] = ahead[i]
 
 
-@njit(cache=True)
+@njit(cache=True, error_model="numpy")
 def act(law: np.void, memory: np.void, here: Array, now: Array, after: Array, later: Array) -> bool:
     """Law, allocation and voltages for the reference rows (9,) at the sample, at the start and the end of the interval
     of action, and a period after that.
@@ -167,12 +169,12 @@ def act(law: np.void, memory: np.void, here: Array, now: Array, after: Array, la
     share = feedback.authority(gains, inverse, demand)
     feedback.add_motion(gains, row, demand)
     last, before = memory["feedforward_n"], scratch["w_n"]
-    if memory["feedforward_known"] == 0:
-        last[:] = demand
-        following[:] = demand
-    before[:] = last
+    known = memory["feedforward_known"] != 0
+    for i in range(3):
+        following[i] = following[i] if known else demand[i]
+        before[i] = last[i] if known else demand[i]
+        last[i] = demand[i]
     feedback.sampled_target(gains, now, demand, before, row)
-    last[:] = demand
     memory["feedforward_known"] = 1
     feedback.add_held_share(last, before, following, share, demand)
     kind, origin = law["kind"], law["estimator"]["operating_point_m"]
@@ -198,21 +200,21 @@ def act(law: np.void, memory: np.void, here: Array, now: Array, after: Array, la
     return memory["active_set_steps"] > 1
 
 
-@njit(cache=True)
+@njit(cache=True, error_model="numpy")
 def feedforward(law: np.void, row: Array, out: Array) -> None:
     """Force (3,) at the platform that moves the stage along a reference row (9,): grad V + C v + m a."""
     energy_gradient(law["geometry"], law["elasticity"], row[0:3], out)
     feedback.add_motion(law["feedback"], row, out)
 
 
-@njit(cache=True)
+@njit(cache=True, error_model="numpy")
 def rest(memory: np.void) -> None:
     """The open loop: 0 V on every comb at once, no demand. A release to 0 V is never delayed by the slew limit."""
     _push(memory)
     release(memory)
 
 
-@njit(cache=True)
+@njit(cache=True, error_model="numpy")
 def release(memory: np.void) -> None:
     """Take back what this tick decided: 0 V goes out instead."""
     for i in range(3):
@@ -226,7 +228,7 @@ def release(memory: np.void) -> None:
     linear_law.clear(memory["linear"])
 
 
-@njit(cache=True)
+@njit(cache=True, error_model="numpy")
 def _push(memory: np.void) -> None:
     """Make room for this tick's counts: the history moves on by one."""
     count = memory["count"]
@@ -235,7 +237,7 @@ def _push(memory: np.void) -> None:
             count[age, i] = count[age - 1, i]
 
 
-@njit(cache=True)
+@njit(cache=True, error_model="numpy")
 def set_position(law: np.void, memory: np.void, position_m: Array) -> None:
     """Start the filter at a position (3,) at rest, without disturbance: after homing, and wherever a state is known."""
     for i in range(9):
@@ -247,14 +249,14 @@ def set_position(law: np.void, memory: np.void, position_m: Array) -> None:
         memory["estimate"]["innovation_m"][i] = 0.0
 
 
-@njit(cache=True)
+@njit(cache=True, error_model="numpy")
 def is_discharged(memory: np.void) -> bool:
     """Whether the voltages of this tick are 0 V on every comb."""
     count = memory["count"]
     return bool(count[0, 0] == 0 and count[0, 1] == 0 and count[0, 2] == 0)
 
 
-@njit(cache=True)
+@njit(cache=True, error_model="numpy")
 def unexplained_force(law: np.void, memory: np.void, out_n: Array) -> None:
     """Comb forces (3,) that would explain what was seen: B^-T (d + K_0 e), with ``pulls`` of the last ``act``; d is
     the estimated disturbance, which takes its time, and K_0 e what holds the stage where it is instead of where it
@@ -271,13 +273,13 @@ def unexplained_force(law: np.void, memory: np.void, out_n: Array) -> None:
             out_n[i] += inverse[k, i] * (disturbance[6 + k] + held)
 
 
-@njit(cache=True)
+@njit(cache=True, error_model="numpy")
 def commanded_force(law: np.void, memory: np.void, out_n: Array) -> None:
     """Comb forces (3,) by the voltages that act from this sample on, at the end of a tick."""
     voltage.forces_of_counts(law["drive"], memory["count"][law["delay_periods"]], out_n)
 
 
-@njit(cache=True)
+@njit(cache=True, error_model="numpy")
 def is_finite(memory: np.void) -> bool:
     """Whether the estimate and the forces of this tick are numbers."""
     total = 0.0

@@ -26,7 +26,7 @@ DRIVE = np.dtype(
 )
 
 
-@njit(cache=True)
+@njit(cache=True, error_model="numpy")
 def force_limits(drive: np.void, count_last: Counts, lower_n: Array, upper_n: Array) -> None:
     """Comb forces (3,) reachable in one tick from the last counts (3,): slew limit, no push, voltage limit."""
     slew, most, scale, gain = (
@@ -42,7 +42,7 @@ def force_limits(drive: np.void, count_last: Counts, lower_n: Array, upper_n: Ar
         upper_n[i] = gain[i] * high * high
 
 
-@njit(cache=True)
+@njit(cache=True, error_model="numpy")
 def counts_for_forces(drive: np.void, force_n: Array, count_last: Counts, carry_v: Array, count: Counts) -> None:
     """Counts (3,) for forces (3,) >= 0; ``carry_v`` (3,) holds the error from tick to tick, at most one count of it.
 
@@ -61,7 +61,7 @@ def counts_for_forces(drive: np.void, force_n: Array, count_last: Counts, carry_
         carry_v[i] = min(max(wanted - scale * count[i], -scale), scale)
 
 
-@njit(cache=True)
+@njit(cache=True, error_model="numpy")
 def forces_of_counts(drive: np.void, count: Counts, force_n: Array) -> None:
     """Comb forces (3,) in N that counts (3,) give by the law."""
     gain = drive["force_gain_n_per_v2"]

@@ -198,31 +198,31 @@ _MODE_COUNT = len(Mode)
 _ENOUGH = 1 << 30  # counting further would only overflow
 
 
-@njit(cache=True)
+@njit(cache=True, error_model="numpy")
 def _consecutive(ticks: int, bad: bool) -> int:
     if not bad:
         return 0
     return ticks + 1 if ticks < _ENOUGH else ticks
 
 
-@njit(cache=True)
+@njit(cache=True, error_model="numpy")
 def _bucket(level: int, events: int, leak_ticks: int) -> int:
     if events > 0:
         return level + int(events) * int(leak_ticks) if level < _ENOUGH else level
     return level - 1 if level > 0 else 0
 
 
-@njit(cache=True)
+@njit(cache=True, error_model="numpy")
 def _reached(ticks: int, limit: int, trip: int) -> int:
     return trip if limit >= 0 and ticks >= limit else 0
 
 
-@njit(cache=True)
+@njit(cache=True, error_model="numpy")
 def _filled(level: int, limit: int, leak_ticks: int, trip: int) -> int:
     return trip if limit >= 0 and level >= int(limit) * int(leak_ticks) else 0
 
 
-@njit(cache=True)
+@njit(cache=True, error_model="numpy")
 def clear_memory(memory: np.void) -> None:
     """Forget all; ``memory`` is a record of MONITOR_MEMORY."""
     memory["sequence_level"] = 0
@@ -236,7 +236,7 @@ def clear_memory(memory: np.void) -> None:
     _clear_loop(memory)
 
 
-@njit(cache=True)
+@njit(cache=True, error_model="numpy")
 def _clear_loop(memory: np.void) -> None:
     memory["saturation"] = 0
     memory["slew"] = 0
@@ -249,7 +249,7 @@ def _clear_loop(memory: np.void) -> None:
         memory["commanded_trend_n"][i] = 0.0
 
 
-@njit(cache=True)
+@njit(cache=True, error_model="numpy")
 def implausible_combs(limits: np.void, residual_m: NDArray[np.float64]) -> int:
     """Combs whose measured stroke is further from the expected one than plausible, bit 0 for comb 1.
 
@@ -265,7 +265,7 @@ def implausible_combs(limits: np.void, residual_m: NDArray[np.float64]) -> int:
     return combs
 
 
-@njit(cache=True)
+@njit(cache=True, error_model="numpy")
 def _check_frames(limits: np.void, memory: np.void, obs: np.void) -> int:
     status = obs["sense_status"]
     leak = limits["frame_leak_ticks"]
@@ -283,7 +283,7 @@ def _check_frames(limits: np.void, memory: np.void, obs: np.void) -> int:
     return trips
 
 
-@njit(cache=True)
+@njit(cache=True, error_model="numpy")
 def _check_channels(limits: np.void, memory: np.void, obs: np.void) -> int:
     """Range and frozen, per comb; only a usable frame is evidence, for or against."""
     trips: int = 0
@@ -302,7 +302,7 @@ def _check_channels(limits: np.void, memory: np.void, obs: np.void) -> int:
     return trips
 
 
-@njit(cache=True)
+@njit(cache=True, error_model="numpy")
 def _check_residuals(limits: np.void, memory: np.void, obs: np.void) -> int:
     """Whose strokes have been implausible too often. One comb alone: something is wrong with that comb. Several: the
     stage has moved, along the axes that the innovation shows.
@@ -327,7 +327,7 @@ def _check_residuals(limits: np.void, memory: np.void, obs: np.void) -> int:
     return axes
 
 
-@njit(cache=True)
+@njit(cache=True, error_model="numpy")
 def _check_forces(limits: np.void, memory: np.void, obs: np.void) -> int:
     """Whose force is not that of its voltage: by too much altogether, or by too much of what has changed of late.
 
@@ -351,7 +351,7 @@ def _check_forces(limits: np.void, memory: np.void, obs: np.void) -> int:
     return trips
 
 
-@njit(cache=True)
+@njit(cache=True, error_model="numpy")
 def _check_loop(limits: np.void, memory: np.void, obs: np.void) -> int:
     """What has a meaning only while the loop is closed."""
     trips: int = 0
@@ -370,7 +370,7 @@ def _check_loop(limits: np.void, memory: np.void, obs: np.void) -> int:
     return trips | _check_forces(limits, memory, obs) | _check_residuals(limits, memory, obs)
 
 
-@njit(cache=True)
+@njit(cache=True, error_model="numpy")
 def check(limits: np.void, memory: np.void, obs: np.void) -> int:
     """Trip bits of this tick; 0 when all is well. Call once per tick, in every mode.
 
