@@ -157,7 +157,7 @@ def run_study(
 
 
 def _all_done(pool: Any, width: int, study: Study, seeds: list[int]) -> Iterator[tuple[int, Result]]:
-    return as_done(pool, width, given(run_one, study), seeds)
+    return as_done(pool, width, given(run_one, study), seeds, ahead=width)
 
 
 def summary(results: Sequence[Result]) -> dict[str, Any]:

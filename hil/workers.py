@@ -73,16 +73,19 @@ def _unpacked(packed: bytes) -> object:
 
 
 def as_done(
-    pool: Executor, width: int, function: Callable[[Item], Result], items: Iterable[Item]
+    pool: Executor, width: int, function: Callable[[Item], Result], items: Iterable[Item], *, ahead: int = 0
 ) -> Iterator[tuple[Item, Result]]:
     """(item, function(item)) in the order in which they are done. Items are taken from their iterator as hands get
     free, so an iterator may look at the results so far. What a call raises is raised here.
+
+    ``ahead``: how many items more are handed out than there are hands, so that none waits for this process; for
+    iterators that don't look.
     """
     waiting: dict[Future[Result], Item] = {}
     source, more = iter(items), True
     try:
         while waiting or more:
-            while more and len(waiting) < width:
+            while more and len(waiting) < width + ahead:
                 try:
                     item = next(source)
                 except StopIteration:

@@ -35,7 +35,7 @@ def study() -> list[Figure]:
             gc.collect()
             begin = time.perf_counter()
             seeds = range(1000 * (n + 1), 1000 * (n + 1) + PLANTS)
-            busy.append(sum(cpu_s for _, cpu_s in as_done(pool, width, given(_timed, plants), seeds)))
+            busy.append(sum(cpu_s for _, cpu_s in as_done(pool, width, given(_timed, plants), seeds, ahead=width)))
             walls.append(time.perf_counter() - begin)
         list(as_done(pool, width, _trial, range(2 * WORKERS)))
         trial_s = [cpu_s for _, cpu_s in as_done(pool, width, _trial, range(2 * WORKERS, TRIALS))]
