@@ -247,10 +247,10 @@ def draw(result: dict[str, Any], path: Path) -> None:
         below.plot(t_min, kept - kept[result["warm_up_s"]], style, color="#c0392b", label=label)
     for n, second in enumerate(result["cleared_s"]):
         below.axvline(second / 60.0, color="#d8b365", lw=0.8, zorder=0, label="a fault" if n == 0 else None)
-    below.set_xlabel("minutes")
-    below.legend(frameon=False, fontsize=8, ncols=2)
+    below.set(xlabel="minutes; dashed: end of the warm-up", ylabel="kB, or blocks of Python")
+    below.legend(fontsize=8, ncols=2, facecolor="white", edgecolor="none", framealpha=1.0, loc="upper left")
     for axes in (above, below):
-        axes.set_ylim(min(0.0, axes.get_ylim()[0]), 1.25 * axes.get_ylim()[1])
+        axes.set_ylim(min(0.0, axes.get_ylim()[0]), 1.35 * axes.get_ylim()[1])
         axes.axvline(result["warm_up_s"] / 60.0, color="0.7", lw=0.8, ls="--")
         axes.grid(alpha=0.25)
         axes.spines[["top", "right"]].set_visible(False)

@@ -12,6 +12,7 @@ from hil.choices import Lane
 from hil.first_run import say_if_compiling
 from hil.outputs import picture_to_write
 from hil.progress import progress_bar
+from hil.tables import print_whole
 
 if TYPE_CHECKING:
     from hil.compare import Compared
@@ -44,7 +45,8 @@ def compare(
     with progress_bar("laws", quiet=as_json) as tell:
         runs = run_all(scenario, names, stage=stage, plant=plant, seed=seed, lane=lane.value, on_progress=tell)
     title = f"{scenario}{f' on {plant}' if plant else ''}{f', {stage}' if stage else ''}"
-    draw(runs, title, out)
+    if drawn := any(run.figures.get("rms_error_nm") for run in runs):
+        draw(runs, title, out)
     if as_json:
         data = {
             "scenario": scenario,
@@ -52,15 +54,15 @@ def compare(
             "plant": plant,
             "seed": seed,
             "lane": lane.value,
-            "picture": str(out),
+            "picture": str(out) if drawn else None,
         }
         print(json.dumps(data | {"laws": [run.as_dict() for run in runs]}, allow_nan=False))
     else:
-        _show(runs, title, out)
+        _show(runs, title, out if drawn else None)
     raise typer.Exit(0 if all(run.problem is None for run in runs) else 1)
 
 
-def _show(runs: "list[Compared]", title: str, out: Path) -> None:
+def _show(runs: "list[Compared]", title: str, out: Path | None) -> None:
     table = Table(box=None, pad_edge=False, header_style="dim", title=title, title_justify="left")
     for heading in ("controller", "rms x / y / z (nm)", "largest (nm)", "hold (nm)", "at a limit", "gave up", ""):
         table.add_column(heading, justify="left" if heading in ("controller", "") else "right")
@@ -72,8 +74,8 @@ def _show(runs: "list[Compared]", title: str, out: Path) -> None:
         ticks = [str(found["saturated_ticks"]), str(run.gave_up)] if found else ["", ""]
         verdict = "" if run.problem is None else ("[bold red]fault[/]" if found else "[bold red]refused[/]")
         table.add_row(run.controller, rms, *cells, *ticks, verdict)
-    _screen.print(table)
+    print_whole(_screen, table)
     for run in runs:
         if run.problem is not None:
             _screen.print(f"[red]{run.controller}[/]: {run.problem}", soft_wrap=True)
-    _screen.print(f"picture: {out}", soft_wrap=True)
+    _screen.print("no law ran, so there is no picture" if out is None else f"picture: {out}", soft_wrap=True)

@@ -146,7 +146,7 @@ def _show(outcomes: "list[Outcome]", cases: "list[Case]", laws: list[str]) -> No
             (law, "left"), ("ticks", "right"), ("latched", "left"), ("peak V", "right"), ("V/tick", "right"),
             ("0 V ms", "right"), ("off um", "right"), ("", "left"),
         ):  # fmt: skip
-            table.add_column(heading, justify=side)  # type: ignore[arg-type]
+            table.add_column(heading, justify=side, overflow="fold")  # type: ignore[arg-type]
         for outcome, case in zip((o for o in outcomes if o.law == law), cases, strict=True):
             verdict = "[green]saved[/]" if outcome.ok else f"[bold red]{'; '.join(outcome.problems)}[/]"
             reason = ", ".join(outcome.reason) or f"[dim]nothing: {case.note}[/]"

@@ -13,6 +13,7 @@ from hil.first_run import say_if_compiling
 from hil.one_line_errors import one_line_errors
 from hil.outputs import folder_to_write, writing
 from hil.progress import progress_bar
+from hil.tables import print_whole
 from pkxyz_ctrl.config import ConfigError, find, load
 
 if TYPE_CHECKING:
@@ -134,7 +135,7 @@ def _show(found: "Identification", data: dict[str, Any], folder: Path) -> None:
             f"{n + 1}", _pm(mode["frequency_hz"], mode["frequency_error_hz"]), f"{mode['drawn_hz']:.1f}",
             _pm(mode["damping"], mode["damping_error"]), f"{mode['quality_factor']:.1f}",
         )  # fmt: skip
-    _screen.print(table)
+    print_whole(_screen, table)
     if not modes.apart.all():
         n = int(np.argmin(modes.apart))
         _screen.print(f"modes {n} and {n + 1} coincide: one pair of poles tells them as well as two")
@@ -145,7 +146,7 @@ def _show(found: "Identification", data: dict[str, Any], folder: Path) -> None:
             f"{i + 1}", _pm(modes.static_gain[i, i], modes.static_gain_deviation[i, i]), *entries,
             _pm(zero.offset_f[i] * 1e15, zero.deviation_f[i] * 1e15), f"{zero.offset_count[i]:.1f}",
         )  # fmt: skip
-    _screen.print(table)
+    print_whole(_screen, table)
     fit = data["fit"]
     verdict = (
         "noise alone is left" if modes.noise_alone else "[bold red]more than noise is left: the errors are no bounds[/]"
@@ -175,7 +176,7 @@ def _show_gains(found: "Identification") -> None:
         pull = "?" if comb is None else _pm(comb[0][i], comb[1][i])
         table.add_row(f"{i + 1}", _pm(product[i], deviation[i]), sense, pull)
     _screen.print("relative to the stage file, the combs if its mass is right:")
-    _screen.print(table)
+    print_whole(_screen, table)
     if outside is not None:
         _screen.print(f"reference: {outside.points} points, {outside.residual_m * 1e9:.2f} nm rms left")
 
@@ -194,7 +195,7 @@ def _show_calibration(found: "Identification") -> None:
             _pm(numbers.crank_stiffness[i], errors.crank_stiffness[i]),
         )  # fmt: skip
     _screen.print("calibration, relative to the drawing and its mass:")
-    _screen.print(table)
+    print_whole(_screen, table)
     assert numbers.quality_factor is not None
     assert numbers.sense_delay_s is not None
     _screen.print(

@@ -14,6 +14,7 @@ from hil.first_run import say_if_compiling
 from hil.one_line_errors import one_line_errors
 from hil.outputs import folder_to_write, writing
 from hil.progress import progress_bar
+from hil.tables import print_whole
 from pkxyz_ctrl.config import ConfigError, load
 
 if TYPE_CHECKING:
@@ -180,7 +181,7 @@ def _show(
     _rows(table, computed, "")
     if measured is not None:
         _rows(table, measured.margins(), ", measured")
-    _screen.print(table)
+    print_whole(_screen, table)
     if changed is not None:
         worst, peak = changed.worst
         unstable = sum(not math.isfinite(p) for p in changed.peak_s)

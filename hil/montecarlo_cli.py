@@ -12,6 +12,7 @@ from rich.table import Table
 from hil.first_run import say_if_compiling
 from hil.outputs import folder_to_write
 from hil.progress import progress_bar
+from hil.tables import print_whole
 
 _screen = Console(highlight=False)
 
@@ -105,7 +106,7 @@ def _show(data: dict[str, Any]) -> None:
     for name in ("rms_error_nm", "hold_noise_nm", "peak_s"):
         if (d := data[name]) is not None:
             table.add_row(name, *(f"{d[key]:.3g}" for key in ("median", "p95", "max")), str(d["max_seed"]))
-    _screen.print(table)
+    print_whole(_screen, table)
     if data["not_held"]:
         _screen.print(f"[bold red]{data['not_held']} did not hold[/]", markup=True)
     _screen.print(f"the worst one alone: pkxyz montecarlo ... --replay {data['worst_seed']}", soft_wrap=True)

@@ -277,3 +277,9 @@ def test_what_write_toml_writes_anyone_can_read(tmp_path):
     data = plain(load("controllers", "lqg", ControllerConfig))
     write_toml(data, tmp_path / "c.toml")
     assert tomlkit.parse((tmp_path / "c.toml").read_text()).unwrap() == data
+
+
+@pytest.mark.parametrize("name", names("controllers"))
+def test_every_shipped_law_is_watched_alike(name):
+    """A fault is decided after as many ticks whatever law runs: ``pkxyz faults`` holds them all to one bound."""
+    assert load("controllers", name, ControllerConfig).monitors == load("controllers", "lqg", ControllerConfig).monitors

@@ -1,6 +1,7 @@
 """What a user gets wrong: one line that says what to do, an exit code, and nothing lost; Ctrl-C included."""
 
 import errno
+import io
 import json
 import os
 import signal
@@ -10,9 +11,12 @@ import time
 from pathlib import Path
 
 import pytest
+from rich.console import Console
+from rich.table import Table
 
 from hil import cli
 from hil.outputs import what_to_do
+from hil.tables import print_whole
 
 ROOT = Path(__file__).parent.parent
 
@@ -109,7 +113,7 @@ def ctrl_c(tmp_path, ready, *words):
         preexec_fn=lambda: signal.signal(signal.SIGINT, signal.default_int_handler),
     )
     try:
-        for _ in range(1200):
+        for _ in range(12_000):  # kernels may have to be compiled
             if ready():
                 break
             assert process.poll() is None, process.communicate()
@@ -134,6 +138,25 @@ def test_ctrl_c_in_a_study_says_one_word_and_keeps_what_is_done(tmp_path):
     done = json.loads(stdout)
     assert done["interrupted"] is True
     assert done["plants"] == len(results.read_text().splitlines()) - 1
+
+
+def test_a_narrow_terminal_cuts_no_number():
+    table = Table("law", "Ms", box=None, pad_edge=False)
+    table.columns[1].no_wrap = True
+    table.add_row("lqg", "1.6234567890123456789")
+    screen = Console(width=12, file=io.StringIO())
+    print_whole(screen, table)
+    assert "lqg  1.6234567890123456789" in screen.file.getvalue()
+
+
+def test_where_no_law_ran_there_is_no_picture(tmp_path, monkeypatch, capsys):
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.setattr(sys, "argv", ["pkxyz", "compare", "--controllers", "robust_20k", "--json"])
+    with pytest.raises(SystemExit) as ended:
+        cli.main()
+    assert ended.value.code == 1
+    assert json.loads(capsys.readouterr().out)["picture"] is None
+    assert not list(tmp_path.iterdir())
 
 
 def test_output_that_nobody_reads_on_is_no_error(tmp_path):

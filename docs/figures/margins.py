@@ -84,17 +84,24 @@ def draw(all_loops: dict[str, Loop]) -> Figure:
         s = all_loops[name].response(MIDDLE, frequency).s[:, 0, 0]
         left.loglog(frequency, np.abs(s), color=COLOURS[name], label=name, lw=1.8 if name == "robust" else 1.2)
         right.plot((1 / s - 1).real, (1 / s - 1).imag, color=COLOURS[name], lw=1.8 if name == "robust" else 1.2)
-    left.axhline(2.0, color="#5b6770", lw=0.8, ls=":")
-    left.axhline(np.sqrt(0.5), color="#5b6770", lw=0.8, ls="--")
+    for level, style, words in ((2.0, ":", "2"), (np.sqrt(0.5), "--", "-3 dB")):
+        left.axhline(level, color="#5b6770", lw=0.8, ls=style)
+        left.text(10.4, level * 1.02, words, fontsize=8, color="#5b6770", va="bottom")
     left.axvline(200.0, color="#5b6770", lw=0.8, ls="--")
+    left.text(195.0, 0.032, "200 Hz", fontsize=8, color="#5b6770", ha="right", va="bottom")
     left.set(xlabel="frequency (Hz)", ylabel="|S|", title="Sensitivity in x", xlim=(10, 2500), ylim=(0.03, 4))
-    left.legend(frameon=False, fontsize=9, loc="lower right")
+    left.legend(frameon=False, fontsize=9, loc="lower right", bbox_to_anchor=(0.98, 0.0), labelspacing=0.3)
     turn = 0.3 * np.exp(1j * np.linspace(0, 2 * np.pi, 200))
     edge = -(1 + turn) / (1 - turn)  # of L that some factor of the disk takes to -1
     right.fill(edge.real, edge.imag, color="#f3d9d0", lw=0)
     right.plot(-1, 0, "+", color="black")
     right.set(
-        xlabel="Re L", ylabel="Im L", title="Loops in x; shaded: disk margin below 0.6", xlim=(-3, 1.5), ylim=(-2, 2)
+        xlabel="Re L",
+        ylabel="Im L",
+        title="Loops in x; shaded: disk margin below 0.6",
+        xlim=(-3, 1.5),
+        ylim=(-2, 2),
+        aspect="equal",
     )
     for axes in (left, right):
         axes.spines[["top", "right"]].set_visible(False)

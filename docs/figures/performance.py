@@ -96,10 +96,10 @@ def draw(figures: dict[str, Figure]) -> None:
         left = [a + b for a, b in zip(left, widths, strict=True)]
     target_us = 200.0 / (figures["lockstep.realtime"].target or 1.0)
     axes.axvline(target_us, color="0.4", lw=1, ls=":")
-    axes.annotate("8 times real time", (target_us, -0.47), ha="center", va="bottom", fontsize=8, annotation_clip=False)
+    axes.annotate("8 times real time ", (target_us, -0.47), ha="right", va="bottom", fontsize=8, annotation_clip=False)
     axes.invert_yaxis()
     axes.set(xlabel="us of processor time a tick of 200 us")
-    axes.legend(loc="lower right", fontsize=8, frameon=False)
+    axes.legend(loc="lower right", bbox_to_anchor=(0.9, 0.0), fontsize=8, frameon=False)
     for side in ("right", "top"):
         axes.spines[side].set_visible(False)
     picture.savefig(PICTURE, dpi=130)

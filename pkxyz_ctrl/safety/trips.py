@@ -131,8 +131,9 @@ EXPLANATIONS: Final[dict[Trip, tuple[str, str]]] = {
         "read the emergency code in the log: over-current means a short or dust in a comb, so do not just try again",
     ),
     Trip.GATE_BLOCKED: (
-        "a frame that must not be sent was held back at the last moment",
-        "the gate's reason names frame and rule; this is a defect of the program: keep the recording and report it",
+        "a frame that may not be sent was held back at the last moment",
+        "the gate's reason names frame and rule. Right after a clear, at 0 V, it means that the bus is still disturbed:"
+        " see to it and clear again. At any other time it is a defect of the program: keep the recording and report it",
     ),
     Trip.OPERATOR: (
         "stopped by hand",
