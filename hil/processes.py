@@ -1,7 +1,9 @@
 """Processes for independent work, which Ctrl-C ends at once and without a word of theirs: they hold nothing to save."""
 
 import multiprocessing
+import os
 import signal
+import threading
 from collections.abc import Iterator
 from concurrent.futures import ProcessPoolExecutor
 from contextlib import contextmanager
@@ -9,12 +11,14 @@ from contextlib import contextmanager
 
 @contextmanager
 def processes(workers: int | None) -> Iterator[ProcessPoolExecutor]:
-    """An executor over processes (None: one for each core). Left by an exception, nothing more is begun or finished."""
-    pool = ProcessPoolExecutor(workers, multiprocessing.get_context("spawn"))
+    """An executor over processes (None: one for each core). Left by an exception, nothing more is begun or finished;
+    nor is it if this process is killed.
+    """
+    pool = ProcessPoolExecutor(workers, multiprocessing.get_context("spawn"), initializer=_end_with_the_parent)
     before = multiprocessing.active_children()
-    with _ctrl_c_unheard():
-        pool.submit(int)  # the first call starts them all
     try:
+        with _ctrl_c_kept_back():
+            pool.submit(int)  # the first call starts them all
         yield pool
     except BaseException:
         pool.shutdown(wait=False, cancel_futures=True)
@@ -26,14 +30,22 @@ def processes(workers: int | None) -> Iterator[ProcessPoolExecutor]:
 
 
 @contextmanager
-def _ctrl_c_unheard() -> Iterator[None]:
-    """A process that is started inside never hears Ctrl-C, from its first instruction on."""
-    try:
-        handler = signal.signal(signal.SIGINT, signal.SIG_IGN)
-    except ValueError:  # not in the main thread, where nobody hears it either
-        yield
-        return
+def _ctrl_c_kept_back() -> Iterator[None]:
+    """A process that is started inside never hears Ctrl-C, from its first instruction on; this one hears it later."""
+    masked = signal.pthread_sigmask(signal.SIG_BLOCK, {signal.SIGINT})
     try:
         yield
     finally:
-        signal.signal(signal.SIGINT, handler)
+        signal.pthread_sigmask(signal.SIG_SETMASK, masked)
+
+
+def _end_with_the_parent() -> None:
+    """In a process of the executor: not to wait for ever for one that was killed."""
+    parent = multiprocessing.parent_process()
+    if parent is not None:
+        threading.Thread(target=_follow, args=(parent,), daemon=True).start()
+
+
+def _follow(parent: "multiprocessing.process.BaseProcess") -> None:
+    parent.join()
+    os._exit(1)

@@ -1,5 +1,6 @@
 """What a user gets wrong: one line that says what to do, an exit code, and nothing lost; Ctrl-C included."""
 
+import contextlib
 import errno
 import io
 import json
@@ -100,8 +101,10 @@ def test_ctrl_c_is_ctrl_c_whatever_an_import_makes_of_it():
     assert not cli._was_interrupted(ImportError("no module named numba"))
 
 
-def ctrl_c(tmp_path, ready, *words):
-    """Exit code and both streams of a command that gets Ctrl-C, as a terminal sends it to all its processes."""
+def ended(tmp_path, ready, *words, by=signal.SIGINT):
+    """Exit code and both streams of a command that gets a signal with all its processes, as Ctrl-C does; SIGKILL goes
+    to the first alone.
+    """
     process = subprocess.Popen(
         [sys.executable, "-m", "hil.cli", *words],
         cwd=tmp_path,
@@ -118,10 +121,11 @@ def ctrl_c(tmp_path, ready, *words):
                 break
             assert process.poll() is None, process.communicate()
             time.sleep(0.05)
-        os.killpg(process.pid, signal.SIGINT)
-        stdout, stderr = process.communicate(timeout=60)
+        (os.kill if by == signal.SIGKILL else os.killpg)(process.pid, by)
+        stdout, stderr = process.communicate(timeout=60)  # ends when nobody holds its streams any more
     finally:
-        process.kill()
+        with contextlib.suppress(ProcessLookupError):
+            os.killpg(process.pid, signal.SIGKILL)
     return process.returncode, stdout, stderr
 
 
@@ -129,15 +133,23 @@ def ctrl_c(tmp_path, ready, *words):
 def test_ctrl_c_in_a_study_says_one_word_and_keeps_what_is_done(tmp_path):
     results = tmp_path / "montecarlo" / "results.jsonl"
     words = ("montecarlo", "--plants", "4000", "--workers", "2")
-    begun = ctrl_c(tmp_path, results.is_file, *words)  # its processes are just being started
+    begun = ended(tmp_path, results.is_file, *words)  # its processes are just being started
     assert begun[0] == 130
     assert begun[2].splitlines()[-1] == "interrupted"
     assert "Traceback" not in begun[2]
-    code, stdout, stderr = ctrl_c(tmp_path, lambda: len(results.read_text().splitlines()) > 3, *words, "--json")
+    code, stdout, stderr = ended(tmp_path, lambda: len(results.read_text().splitlines()) > 3, *words, "--json")
     assert (code, stderr) == (130, "")
     done = json.loads(stdout)
     assert done["interrupted"] is True
     assert done["plants"] == len(results.read_text().splitlines()) - 1
+
+
+@pytest.mark.slow
+def test_a_study_that_is_killed_leaves_no_process_behind(tmp_path):
+    results = tmp_path / "montecarlo" / "results.jsonl"
+    lines = lambda: results.is_file() and len(results.read_text().splitlines())  # noqa: E731
+    words = ("montecarlo", "--plants", "4000", "--workers", "2")
+    assert ended(tmp_path, lambda: lines() > 2, *words, by=signal.SIGKILL)[0] == -signal.SIGKILL
 
 
 def test_a_narrow_terminal_cuts_no_number():
