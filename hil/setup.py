@@ -9,6 +9,7 @@ from numpy.typing import NDArray
 from hil.excitation import Excitation
 from hil.faults.fault import Fault
 from pkxyz_ctrl.bus_config import BusConfig
+from pkxyz_ctrl.can.driver_config import OUR_TIMEOUT_MAX_MS
 from pkxyz_ctrl.config import load
 from pkxyz_ctrl.controller_config import ControllerConfig
 from pkxyz_ctrl.drive_limits import count_max, slew_counts
@@ -71,6 +72,7 @@ class Setup:
             protection=driver.protection,
             fd=driver.fd,
             drive_timeout_syncs=driver.drive_timeout_syncs,
+            heartbeat_timeout_max_ms=OUR_TIMEOUT_MAX_MS,
         )
 
     def new_learner(self) -> Learner | None:

@@ -82,11 +82,13 @@ class Controller:
         """One step of the start-up: a frame that came, or None if none came for a while. True once the node is
         operational.
 
-        Raises ``StartUpError``.
+        Raises ``StartUpError``, also for a frame that our own gate blocks: nobody would ever answer it.
         """
         driver = self.driver
         for reply in driver.poll(t_us) if frame is None else driver.receive(frame, t_us):
             self.send(reply, t_us)
+        if self._blocked:
+            raise StartUpError(self.faults[-1])
         if driver.state is DriverState.FAILED:
             raise StartUpError(driver.failure)
         if driver.state is DriverState.CONFIGURING and self.mode == Mode.BOOT:

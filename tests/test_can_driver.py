@@ -487,6 +487,8 @@ def test_no_frame_whatsoever_upsets_the_driver(traffic, from_operational):
         ({"node_id": 127}, "different ids"),
         ({"node_heartbeat_timeout_ms": 20}, "must be longer than node_heartbeat_period_ms"),
         ({"controller_heartbeat_timeout_ms": 10}, "must be longer than controller_heartbeat_period_ms"),
+        ({"controller_heartbeat_timeout_ms": 1001}, "less than or equal to 1000"),
+        ({"drive_timeout_syncs": 0}, "greater than or equal to 2"),
         ({"sdo_timeout_us": 0}, "sdo_timeout_us"),
         ({"node_idd": 3}, "node_idd"),
     ],

@@ -69,7 +69,8 @@ def bench(tmp_path_factory):
     bus = (CONFIG_DIR / "buses" / "unix_1k.toml").read_text(encoding="utf-8")
     bus, found = re.subn(r'channel = "pkxyz"', f'channel = "{folder}/bus"', bus)
     assert found == 1
-    bus += "node_heartbeat_timeout_ms = 900\n"
+    bus += "node_heartbeat_timeout_ms = 900\nboot_timeout_us = 20_000_000\n"
+    bus += "start_timeout_us = 5_000_000\nsdo_timeout_us = 5_000_000\n"  # a machine that stands still is no silence
     (folder / "quick.toml").write_text(bus, encoding="utf-8")
     (folder / "slow.toml").write_text(bus + "controller_heartbeat_timeout_ms = 900\n", encoding="utf-8")
     for name in ("quick", "slow"):
@@ -118,13 +119,33 @@ def controller(folder, *words):
             process.communicate()
 
 
-def until_driven(bus):
-    """Wait until the observer on the bus has seen voltages for some ticks."""
+def is_driving(observer, run):
+    """Whether within a minute, and before the node complains, the observer on the bus sees voltages for some ticks of a
+    controller's process.
+    """
     end_s, driven = time.monotonic() + 60, 0
-    while driven < 200:
-        assert time.monotonic() < end_s, "no voltages came"
-        message = bus.recv(0.1)
+    while driven < 200 and run.poll() is None and time.monotonic() < end_s:
+        message = observer.recv(0.1)
+        if message is not None and message.arbitration_id == EMCY and any(message.data):
+            return False
         driven += message is not None and message.arbitration_id == 0x30A and any(message.data[:6])
+    return driven == 200
+
+
+@contextmanager
+def driving(folder, observer, *words):
+    """A controller in its process that drives the combs. A machine that stands still puts it in fault at 0 V instead,
+    so it may begin three times.
+    """
+    said = []
+    for _ in range(3):
+        with controller(folder, *words) as run:
+            if is_driving(observer, run):
+                yield run
+                return
+            run.terminate()
+            said.append(run.communicate(timeout=60))
+    pytest.fail(f"no voltages came: {said}")
 
 
 def truth_of(folder, rows, since):
@@ -151,8 +172,9 @@ def undisturbed(bench, out_name):
         out, err = run.communicate(timeout=120)
         assert run.returncode == 0, err
     summary = json.loads(out)
-    assert summary["faults"] == []
     assert "real time: " in err
+    if summary["faults"]:
+        return np.zeros(0, np.int64), np.zeros((0, 3))
     recording = Recording.open(bench / out_name / "recording.parquet")
     status, overrun = recording["sense_status"], recording["overrun"]
     assert summary["missed_ticks"] == overrun.sum() + (status & 1).sum()
@@ -166,7 +188,7 @@ def undisturbed(bench, out_name):
 
 def test_trajectories_agree_with_lockstep_within_the_noise(bench, changes):
     """Ticks 30 periods after any that was missed are compared: the stage's swing has died away by then. A machine that
-    stands still may leave too few of them, and then it runs again.
+    stands still may leave too few of them, or end in a fault, and then it runs again.
 
     Same plant, same seed. The samples' noise is drawn in order, so it is the same only until the first missed tick:
     two independent draws differ by sqrt(2) times the noise of one, and a millisecond's jitter of 5 us at 20 um/s is
@@ -197,8 +219,7 @@ def test_trajectories_agree_with_lockstep_within_the_noise(bench, changes):
 def test_killed_controller_leaves_0_v_within_the_heartbeat_time(bench, changes):
     changes("pre-operational", False)
     words = ("on_quick.toml", "--bus", "quick.toml", "--out", "killed", "--seconds", "60")
-    with controller(bench, *words) as run, UnixBus(f"{bench}/bus") as observer:
-        until_driven(observer)
+    with UnixBus(f"{bench}/bus") as observer, driving(bench, observer, *words) as run:
         os.kill(run.pid, signal.SIGKILL)
         killed_s = time.time()
         run.communicate(timeout=30)
@@ -238,13 +259,11 @@ def test_a_stopped_controller_goes_on_and_sigterm_ends_it_at_0_v(bench, changes)
     """Asleep for 40 ms: missed ticks are skipped whole and counted, and with its monitor off the run goes on."""
     changes("pre-operational", False)
     words = ("on_slow.toml", "--bus", "slow.toml", "--out", "ended", "--seconds", "60")
-    with controller(bench, *words) as run:
-        with UnixBus(f"{bench}/bus") as observer:
-            until_driven(observer)
-            os.kill(run.pid, signal.SIGSTOP)
-            time.sleep(0.04)
-            os.kill(run.pid, signal.SIGCONT)
-            until_driven(observer)
+    with UnixBus(f"{bench}/bus") as observer, driving(bench, observer, *words) as run:
+        os.kill(run.pid, signal.SIGSTOP)
+        time.sleep(0.04)
+        os.kill(run.pid, signal.SIGCONT)
+        assert is_driving(observer, run)
         run.send_signal(signal.SIGTERM)
         out, err = run.communicate(timeout=60)
         assert run.returncode == 128 + signal.SIGTERM, err
@@ -270,9 +289,7 @@ def test_a_stopped_controller_goes_on_and_sigterm_ends_it_at_0_v(bench, changes)
 def test_ctrl_c_ends_at_0_v(bench, changes):
     changes("pre-operational", False)
     words = ("on_slow.toml", "--bus", "slow.toml", "--out", "interrupted", "--seconds", "60", "--json")
-    with controller(bench, *words) as run:
-        with UnixBus(f"{bench}/bus") as observer:
-            until_driven(observer)
+    with UnixBus(f"{bench}/bus") as observer, driving(bench, observer, *words) as run:
         run.send_signal(signal.SIGINT)
         out, err = run.communicate(timeout=60)
     assert run.returncode == 128 + signal.SIGINT, err
@@ -295,21 +312,25 @@ def test_a_full_disk_ends_at_0_v_with_one_line_and_what_was_written_opens(bench,
 
     Every file of the run may hold 1.2 MB, which the journal exceeds after some thousand ticks.
     """
-    changes("pre-operational", False)
     words = ("on_slow.toml", "--bus", "slow.toml", "--out", "full", "--seconds", "60")
     limit = "import resource; resource.setrlimit(resource.RLIMIT_FSIZE, (1_200_000, 1_200_000))"
     script = f"import sys; {limit}; from hil.cli import main; sys.argv[0] = 'pkxyz'; main()"
-    run = subprocess.run(
-        [sys.executable, "-c", script, "run", *words], cwd=bench, text=True, check=False, capture_output=True,
-        env={**os.environ, "PYTHONPATH": str(ROOT)}, timeout=120,
-    )  # fmt: skip
+    for _ in range(3):  # a machine that stands still may put it in fault before it has driven anything
+        changes("pre-operational", False)
+        run = subprocess.run(
+            [sys.executable, "-c", script, "run", *words], cwd=bench, text=True, check=False, capture_output=True,
+            env={**os.environ, "PYTHONPATH": str(ROOT)}, timeout=120,
+        )  # fmt: skip
+        lines = changes("pre-operational", False)
+        if lines[-2]["driven"]:
+            break
     assert run.returncode == 2
     complaints = [line for line in run.stderr.splitlines() if line.startswith("pkxyz: ")]
     assert len(complaints) == 1, run.stderr
     assert "file too large" in complaints[0]
     assert "Traceback" not in run.stderr
-    lines = changes("pre-operational", False)
     assert lines[-2]["driven"]
+    print(lines)
     assert lines[-1]["t_s"] - lines[-2]["t_s"] < 30
     full = Recording.open(bench / "full" / "recording.parquet")
     assert full.ticks >= 2048

@@ -128,7 +128,8 @@ def test_after_warm_up_nothing_grows(tmp_path, folder):
     text = (CONFIG_DIR / "buses" / "unix_1k.toml").read_text(encoding="utf-8")
     text = text.replace('channel = "pkxyz"', f'channel = "{tmp_path}/bus"')
     bus = tmp_path / "bus.toml"
-    bus.write_text(text + "controller_heartbeat_timeout_ms = 900\nnode_heartbeat_timeout_ms = 900\n", encoding="utf-8")
+    patient = "controller_heartbeat_timeout_ms = 900\nnode_heartbeat_timeout_ms = 900\nsdo_timeout_us = 5_000_000\n"
+    bus.write_text(text + patient, encoding="utf-8")
     scenario = load_scenario("raster", bus=str(bus))
     scenario.config.__dict__["duration_s"] = 3.0
     setup = scenario.setup()

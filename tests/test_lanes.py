@@ -16,7 +16,9 @@ from hil.published_wires import publish
 from hil.sim_bus import to_frame, to_message
 from pkxyz_ctrl.can.frame import Frame
 from pkxyz_ctrl.config import ConfigError
+from pkxyz_ctrl.controller import StartUpError
 from pkxyz_ctrl.row import ROW
+from pkxyz_ctrl.safety.gate import TransmitGate
 from pkxyz_ctrl.safety.modes import Mode
 
 CASES = [("nominal", "fd_5k"), ("nominal", "classic_2k"), ("mild", "fd_5k"), ("harsh", "fd_5k"), ("mild", "classic_2k")]
@@ -152,6 +154,17 @@ def test_a_bus_without_frames_runs_in_the_fast_lane_only():
         rows_of(local, "lockstep")
     with pytest.raises(ValueError, match="no lane is called 'quick'; there are lockstep and fast"):
         rows_of(local, "quick")
+
+
+def test_a_frame_that_our_own_gate_blocks_ends_the_start_up_with_its_reason():
+    """Nobody would ever answer it: saying that the amplifier doesn't would send people to the wiring."""
+    short = shortened(setup(), 10)
+    rig = LockstepRig(short)
+    rig.controller.gate = TransmitGate(dataclasses.replace(short.gate, heartbeat_timeout_max_ms=40))
+    blocks = Blocks(short.trajectory, short.bus.period_us, 10, lambda _: None, lambda *_: None)
+    with pytest.raises(StartUpError, match=r"consumer of our heartbeat\): 0x7F0032 is not permitted"):
+        rig.run(blocks)
+    assert rig.controller.mode == Mode.PRE_OPERATIONAL
 
 
 def test_what_was_run_before_an_interruption_is_handed_on():

@@ -109,7 +109,7 @@ def _error_value(talker: Talker) -> str:
 
 
 def _drive_missing(talker: Talker) -> str:
-    if not talker.driver.protection or not talker.driver.drive_timeout_syncs:
+    if not talker.driver.protection:
         raise NotTestedError("the bus configuration asks for no time-out of the drive PDO")
     _energised(talker)
     limit = talker.driver.drive_timeout_syncs

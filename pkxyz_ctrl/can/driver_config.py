@@ -6,6 +6,8 @@ from pydantic import BaseModel, ConfigDict, Field, model_validator
 
 Unsigned32 = Annotated[int, Field(ge=0, le=0xFFFFFFFF)]
 HeartbeatMs = Annotated[int, Field(ge=1, le=0xFFFF)]  # 0x1016 and 0x1017 are UNSIGNED16 in milliseconds
+OUR_TIMEOUT_MAX_MS = 1000
+"""Longest that combs may keep their voltage after the controller fell silent; the gate lets no longer one pass."""
 
 
 class DriverConfig(BaseModel):
@@ -25,10 +27,10 @@ class DriverConfig(BaseModel):
     # One lost heartbeat is survived; the second time-out, 50 ms, bounds how long the combs keep their voltage after
     # the controller fell silent.
     controller_heartbeat_period_ms: HeartbeatMs = 20
-    controller_heartbeat_timeout_ms: HeartbeatMs = 50
+    controller_heartbeat_timeout_ms: int = Field(default=50, ge=1, le=OUR_TIMEOUT_MAX_MS)
     node_heartbeat_period_ms: HeartbeatMs = 20
     node_heartbeat_timeout_ms: HeartbeatMs = 50
-    drive_timeout_syncs: int = Field(default=5, ge=0, le=255, description="0x2010, written if protected; 0 is off")
+    drive_timeout_syncs: int = Field(default=5, ge=2, le=255, description="0x2010, written if protected")
 
     boot_timeout_us: int = Field(default=1_000_000, gt=0, description="from NMT reset to the boot-up message")
     start_timeout_us: int = Field(default=200_000, gt=0, description="from NMT start to a heartbeat that says so")

@@ -7,6 +7,7 @@ about when, except by the node's own clock. Imports take longest there, so proce
 """
 
 import ctypes
+import faulthandler
 import json
 import multiprocessing
 import os
@@ -17,7 +18,7 @@ import struct
 import sys
 import tempfile
 import time
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from pathlib import Path
 
 import can
@@ -37,9 +38,10 @@ from pkxyz_ctrl.config import CONFIG_DIR
 from pkxyz_ctrl.safety.modes import Mode
 
 PERIOD_US = 10_000
-TIMEOUT_US = 800_000  # the guest stands still for longer than 0.2 s now and then
+TIMEOUT_US = 1_000_000  # the guest stands still for longer than 0.2 s now and then
 CAPABILITIES_VERSION, SYS_NICE = 0x2008_0522, 23  # linux/capability.h
 CANFD_BRS = 0x01  # linux/can.h
+STUCK_S = 60  # a process that still runs then writes where it is
 SYNC, DRIVE, SENSE, EMCY, OURS = 0x080, 0x30A, 0x28A, 0x08A, 0x77F
 SCENARIO = """
 name = "slow_scan"
@@ -85,7 +87,8 @@ def bench(request):
     bus = (CONFIG_DIR / "buses" / f"{request.param}.toml").read_text(encoding="utf-8")
     for key, value in (("period", PERIOD_US), ("sense_deadline", 8000), ("heartbeat_deadline", 9900)):
         bus = replaced(rf"^{key}_us = \d+", f"{key}_us = {value}", bus)
-    timeouts = f"controller_heartbeat_timeout_ms = {TIMEOUT_US // 1000}\nnode_heartbeat_timeout_ms = 900\n"
+    timeouts = f"controller_heartbeat_timeout_ms = {TIMEOUT_US // 1000}\nnode_heartbeat_timeout_ms = 2500\n"
+    timeouts += "boot_timeout_us = 20_000_000\nstart_timeout_us = 5_000_000\nsdo_timeout_us = 5_000_000\n"
     (folder / "bus.toml").write_text(bus + timeouts)
     (folder / "slow_scan.toml").write_text(SCENARIO)
     return folder
@@ -128,6 +131,7 @@ class Command:
             stream = path.open("w")
             os.dup2(stream.fileno(), number)
             setattr(sys, name, stream)
+        faulthandler.dump_traceback_later(STUCK_S, file=sys.stderr)
         without_real_time()
         sys.argv = ["pkxyz", *map(str, words)]
         main()
@@ -193,13 +197,15 @@ def next_frame(looking):
 
 def until_driven(looking, run, frames=20):
     """Frames seen until so many drive frames of a controller carried a voltage."""
-    seen = []
+    seen, end_s = [], time.monotonic() + 120
+    looking.settimeout(1)
     while frames:
-        try:
+        if not run.process.is_alive() or time.monotonic() > end_s:
+            raise AssertionError((run.process.exitcode, run.out.read_text(), run.err.read_text()))
+        with suppress(TimeoutError):
             seen.append(next_frame(looking))
-        except TimeoutError:
-            raise AssertionError((run.process.exitcode, run.out.read_text(), run.err.read_text())) from None
-        frames -= seen[-1][0] == DRIVE and any(seen[-1][1][:6])
+            frames -= seen[-1][0] == DRIVE and any(seen[-1][1][:6])
+    looking.settimeout(90)
     return seen
 
 

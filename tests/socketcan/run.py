@@ -4,6 +4,9 @@ The host's files are the guest's root, read-only, so it runs this very checkout 
 host's cache with the kernels that were compiled there. It has one processor, and its clock is not the world's: what is
 tested is what happens, not when. Arguments are handed on to pytest.
 
+Now and then a guest kernel stops dead, with none of its processes failing and nothing to wait for; it is then booted
+once more, and that is said. A test that fails is never tried again.
+
 Exit code 0 if all tests pass, or if the two packages cannot be had, which is then said loudly; 1 if not.
 """
 
@@ -25,7 +28,10 @@ ROOT = Path(__file__).parent.parent.parent
 SCRATCH = ROOT / ".uml"
 PACKAGES = {"user-mode-linux": "usr/bin/linux.uml", "busybox-static": "bin/busybox"}
 MODULES = ("drivers/net/can/dev/can-dev", "drivers/net/can/vcan", "net/can/can", "net/can/can-raw")
-LONGEST_S = 590
+BOOTS = 2
+LONGEST_S = 420
+STILL_S, STILL_CLOCK_TICKS = 75, 20
+"""A guest whose kernel has worked for less than so many clock ticks of 10 ms for so long is dead."""
 MEMORY = "2G"  # of which a guest takes what it uses
 
 INIT = """#!{busybox} sh
@@ -57,20 +63,48 @@ def main(chosen: list[str]) -> int:
         print(f"\n*** SKIPPED: test-socketcan, nothing was tested over a real CAN socket: {missing}\n", file=sys.stderr)
         return 0
     begin_s = time.monotonic()
+    # a system call of the guest is a change between two of the host's processes, on one processor a fast one
+    os.sched_setaffinity(0, {max(os.sched_getaffinity(0))})
+    for boot in range(1, BOOTS + 1):
+        ended = _run_guest(chosen)
+        passed = _verdict(ended)
+        if passed is not None:
+            break
+        print(f"*** boot {boot} of {BOOTS}: the guest {ended} before its tests had ended\n", file=sys.stderr)
+    print(f"{time.monotonic() - begin_s:.0f} s in all, {boot} of at most {BOOTS} guests booted")
+    return 0 if passed else 1
+
+
+def _run_guest(chosen: list[str]) -> str:
+    """Boot a guest and wait for its end; says what that was."""
     with tempfile.TemporaryDirectory(prefix="uml-") as short:  # sockets of a guest have short paths
         guest = _boot(Path(short), chosen)
+        end_s = time.monotonic() + LONGEST_S
+        worked, since_s = -1, time.monotonic()
         try:
-            guest.wait(LONGEST_S)
-            ended = "halted"
-        except subprocess.TimeoutExpired:
-            ended = f"did not end within {LONGEST_S} s"
+            while guest.poll() is None:
+                now_s = time.monotonic()
+                if (done := _clock_ticks(guest.pid)) > worked + STILL_CLOCK_TICKS:
+                    worked, since_s = done, now_s
+                if now_s - since_s > STILL_S:
+                    return f"did nothing for {STILL_S} s"
+                if now_s > end_s:
+                    return f"did not end within {LONGEST_S} s"
+                time.sleep(0.2)
+            return "halted"
         finally:
             if guest.poll() is None:
                 os.killpg(guest.pid, signal.SIGKILL)
-                guest.wait()
-    passed = _verdict(ended)
-    print(f"{time.monotonic() - begin_s:.0f} s in all, the guest booted and halted")
-    return 0 if passed else 1
+            guest.wait()
+
+
+def _clock_ticks(pid: int) -> int:
+    """Processor time of a process in units of 10 ms."""
+    try:
+        after_name = Path(f"/proc/{pid}/stat").read_text(encoding="ascii").rpartition(")")[2].split()
+    except OSError:  # gone meanwhile
+        return 0
+    return int(after_name[11]) + int(after_name[12])
 
 
 def _fetch() -> str:
@@ -131,15 +165,15 @@ def _boot(short: Path, chosen: list[str]) -> subprocess.Popen[bytes]:
         )
 
 
-def _verdict(ended: str) -> bool:
-    """Whether the tests passed; says what they said."""
+def _verdict(ended: str) -> bool | None:
+    """Whether the tests passed, None if they did not come to an end; says what they said."""
     scratch = SCRATCH / "guest"
     status, report, console = (scratch / name for name in ("status", "report", "console"))
     if report.is_file():
         print(report.read_text(encoding="utf-8", errors="replace"))
     if not status.is_file():
         print(f"the guest {ended} without a verdict\n{console.read_text(encoding='utf-8', errors='replace')[-3000:]}")
-        return False
+        return None
     return status.read_text(encoding="utf-8").strip() == "0"
 
 
