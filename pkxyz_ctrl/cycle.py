@@ -336,14 +336,11 @@ def reference_row(law: np.void, memory: np.void, reference: Array, ahead: int, o
 @njit(cache=True, error_model="numpy")
 def _asked_for(memory: np.void, reference: Array) -> None:
     """Note the position asked for at this sample, for the record; while the path stops or starts, with its shift."""
-    asked = memory["asked_m"]
-    for i in range(3):
-        asked[i] = memory["here"][i]
     on_time = memory["pace"] == pace.STEADY and memory["phase"] == 0.0
-    if reference.shape[1] > _ASKED and memory["mode"] == _TRACKING and on_time:
-        index = min(max(memory["reference_tick"] - memory["input"]["reference_base"], 0), len(reference) - 1)
-        for i in range(3):
-            asked[i] = reference[index, _ASKED + i]
+    shifted = reference.shape[1] > _ASKED and memory["mode"] == _TRACKING and on_time
+    index = min(max(memory["reference_tick"] - memory["input"]["reference_base"], 0), len(reference) - 1)
+    for i in range(3):
+        memory["asked_m"][i] = reference[index, _ASKED + i] if shifted else memory["here"][i]
 
 
 @njit(cache=True, error_model="numpy")
