@@ -132,6 +132,7 @@ class Command:
             os.dup2(stream.fileno(), number)
             setattr(sys, name, stream)
         faulthandler.dump_traceback_later(STUCK_S, file=sys.stderr)
+        os.nice(10)  # whoever looks on is not left behind, with one processor for all
         without_real_time()
         sys.argv = ["pkxyz", *map(str, words)]
         main()
@@ -195,8 +196,8 @@ def next_frame(looking):
     return can_id & 0x1FFF_FFFF, raw[8 : 8 + length], len(raw) == 72, flags
 
 
-def until_driven(looking, run, frames=20):
-    """Frames seen until so many drive frames of a controller carried a voltage."""
+def until_drive_frames(looking, run, driven, frames=20):
+    """Frames seen until so many drive frames of a controller carried a voltage, or none."""
     seen, end_s = [], time.monotonic() + 120
     looking.settimeout(1)
     while frames:
@@ -204,7 +205,7 @@ def until_driven(looking, run, frames=20):
             raise AssertionError((run.process.exitcode, run.out.read_text(), run.err.read_text()))
         with suppress(TimeoutError):
             seen.append(next_frame(looking))
-            frames -= seen[-1][0] == DRIVE and any(seen[-1][1][:6])
+            frames -= seen[-1][0] == DRIVE and any(seen[-1][1][:6]) == driven
     looking.settimeout(90)
     return seen
 
@@ -214,7 +215,7 @@ def test_start_up_and_scan(bench, plant):
     plant.seen("pre-operational", False)
     with Command(bench, "run", "slow_scan.toml", "--bus", "bus.toml", "--out", "scan", "--json") as run:
         with observer(bench) as looking:
-            seen = until_driven(looking, run)
+            seen = until_drive_frames(looking, run, driven=True)
         code, out, err = run.wait()
     assert code == 0, err
     summary = json.loads(out)
@@ -251,7 +252,7 @@ def test_killed_controller_leaves_0_v_within_the_heartbeat_time(bench, plant):
         Command(bench, "run", "slow_scan.toml", "--bus", "bus.toml", "--out", "killed", "--seconds", "60") as run,
         observer(bench) as looking,
     ):
-        until_driven(looking, run)
+        until_drive_frames(looking, run, driven=True)
         run.signal(signal.SIGKILL)
         while (frame := next_frame(looking))[0] != EMCY:
             pass
@@ -268,16 +269,16 @@ def test_a_node_that_falls_silent_is_a_fault(bench, plant):
     """The plant's process is stopped: our monitors find out, say why, and only 0 V goes out from then on."""
     plant.seen("pre-operational", False)
     with Command(
-        bench, "run", "slow_scan.toml", "--bus", "bus.toml", "--out", "silent", "--seconds", "6", "--json"
+        bench, "run", "slow_scan.toml", "--bus", "bus.toml", "--out", "silent", "--seconds", "60", "--json"
     ) as run:
         with observer(bench) as looking:
-            until_driven(looking, run)
+            until_drive_frames(looking, run, driven=True)
             plant.signal(signal.SIGSTOP)
-            while next_frame(looking)[0] != DRIVE:
-                pass
+            until_drive_frames(looking, run, driven=False)
+        run.signal(signal.SIGTERM)
         code, out, err = run.wait()
         plant.signal(signal.SIGCONT)
-    assert code in (0, 1), err
+    assert code == 128 + signal.SIGTERM, err
     (fault,) = json.loads(out)["faults"]
     assert "HEARTBEAT_LOST" in fault
     silent = Recording.open(bench / "silent" / "recording.parquet")
@@ -292,10 +293,10 @@ def test_someone_else_who_sends_damaged_sense_frames_is_a_fault(bench, plant):
     """Frames with the node's identifier and a wrong CRC, from a third socket."""
     plant.seen("pre-operational", False)
     with Command(
-        bench, "run", "slow_scan.toml", "--bus", "bus.toml", "--out", "damaged", "--seconds", "4", "--json"
+        bench, "run", "slow_scan.toml", "--bus", "bus.toml", "--out", "damaged", "--seconds", "60", "--json"
     ) as run:
         with observer(bench) as looking:
-            until_driven(looking, run)
+            until_drive_frames(looking, run, driven=True)
             for n in range(20):
                 while next_frame(looking)[0] != SYNC:
                     pass
@@ -304,8 +305,10 @@ def test_someone_else_who_sends_damaged_sense_frames_is_a_fault(bench, plant):
                     looking.send(struct.pack("<IBBBB64s", SENSE, 8, CANFD_BRS, 0, 0, data))
                 else:
                     looking.send(struct.pack("<IBBBB8s", SENSE, 8, 0, 0, 0, data))
+            until_drive_frames(looking, run, driven=False)
+        run.signal(signal.SIGTERM)
         code, out, err = run.wait()
-    assert code in (0, 1), err
+    assert code == 128 + signal.SIGTERM, err
     faults = json.loads(out)["faults"]
     assert len(faults) == 1
     assert "SENSE_CRC" in faults[0]
@@ -320,7 +323,7 @@ def test_sigterm_ends_at_0_v_by_the_controller(bench, plant):
     plant.seen("pre-operational", False)
     with Command(bench, "run", "slow_scan.toml", "--bus", "bus.toml", "--out", "ended", "--seconds", "60") as run:
         with observer(bench) as looking:
-            until_driven(looking, run)
+            until_drive_frames(looking, run, driven=True)
         run.signal(signal.SIGTERM)
         code, _, err = run.wait()
     assert code == 128 + signal.SIGTERM, err
