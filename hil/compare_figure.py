@@ -34,7 +34,8 @@ def draw(runs: Sequence[Compared], title: str, path: Path) -> None:
         axes.spines[["top", "right"]].set_visible(False)
         axes.tick_params(labelbottom=n == len(shown) - 1, labelsize=8)
         if n == 0:
-            axes.set_title(f"{title}: distance from the reference (nm)", fontsize=10, loc="left")
+            cut = f", cut off at {largest:.3g}" if any(_farthest(each) > largest for each in shown) else ""
+            axes.set_title(f"{title}: distance from the reference (nm){cut}", fontsize=10, loc="left")
     if first is not None:
         figure.axes[len(shown) - 1].set_xlabel("time of the trajectory (s)", fontsize=9)
         _bars(figure, grid, shown)
@@ -67,9 +68,15 @@ def _bars(figure: Figure, grid: object, shown: Sequence[Compared]) -> None:
 
 
 def _scale(shown: Sequence[Compared]) -> float:
-    """So that the laws that work fill their rows: those that do not are cut off."""
-    sizes = sorted(np.quantile(np.linalg.norm(run.error_nm, axis=1), 0.99) for run in shown if len(run.error_nm))
-    return 1.3 * float(sizes[len(sizes) // 2]) if sizes else 1.0
+    """So that the laws that work are seen whole, and fill their rows: those that do not are cut off."""
+    ran = [run for run in shown if len(run.error_nm)]
+    usual = [float(np.quantile(np.linalg.norm(run.error_nm, axis=1), 0.99)) for run in ran]
+    middle = sorted(usual)[len(usual) // 2] if usual else 1.0
+    return 1.05 * max((_farthest(run) for run, q in zip(ran, usual, strict=True) if q <= 3.0 * middle), default=1.0)
+
+
+def _farthest(run: Compared) -> float:
+    return float(np.linalg.norm(run.error_nm, axis=1).max(initial=0.0))
 
 
 def _envelope(t_s: NDArray[np.float64], values: NDArray[np.float64]) -> tuple[NDArray[np.float64], ...]:

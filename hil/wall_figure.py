@@ -27,7 +27,8 @@ def draw_wall(recording_path: Path, summary: dict[str, Any], lateness_us: list[i
     error = np.where(tracking[:, None], estimate - reference, np.nan)
     for axis, name in enumerate("xyz"):
         colour = AXIS_COLOURS[axis]
-        plots[0].plot(t_s, reference[:, axis] * 1e6, color="#bdbdbd", linewidth=3)
+        plots[0].plot(t_s, reference[:, axis] * 1e6, color="#bdbdbd", linewidth=3,
+                      label="reference" if axis == 0 else None)  # fmt: skip
         plots[0].plot(t_s, estimate[:, axis] * 1e6, color=colour, linewidth=1, label=f"{name} estimated")
         plots[1].plot(t_s, error[:, axis] * 1e9, color=colour, linewidth=0.6)
     for comb in range(3):
@@ -36,12 +37,13 @@ def draw_wall(recording_path: Path, summary: dict[str, Any], lateness_us: list[i
     for plot, label in zip(plots, ("position  (µm)", "estimate less\nreference  (nm)", "combs  (V)"), strict=False):
         plot.set_ylabel(label)
         plot.set_xlabel("stage time  (s)")
+        plot.set_xlim(plots[0].get_xlim())  # also where the loop was closed for a while only
     for plot in (plots[0], plots[2]):
-        plot.legend(loc="lower right", ncols=3, frameon=False, fontsize=9)
+        plot.legend(loc="lower right", ncols=4, frameon=False, fontsize=9)
     draw_lateness(plots[3], {"wake-ups of this run": lateness_us})
     figure.suptitle(
         f"{summary['scenario']}   ·   wall clock   ·   bus {summary['bus']}   ·   {summary['ticks']} ticks, "
-        f"{summary['missed_ticks']} missed, {len(summary['faults'])} faults",
+        f"{summary['missed_ticks']} missed, faults: {len(summary['faults'])}",
         fontsize=15,
     )
     figure.savefig(out)
