@@ -27,7 +27,7 @@ TABLES = {
               ("bus_and_node", "driver_and_gate", "cycle", "plant", "recording_and_log"))),
     "parts": ("controller", "driver", "gate", "codec", "wire"),
     "floor": ("limits", "bus"),
-    "quality": ("nominal", "mild", "harsh", "learning", "control"),
+    "quality": ("nominal", "mild", "harsh", "learning", "control", "margins"),
 }  # fmt: skip
 COLOURS = ("#0072b2", "#56b4e9", "#009e73", "#e69f00", "#8a8a8a")
 

@@ -6,7 +6,7 @@ from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import Any
 
-from hil.bench import control, lanes, learning, limits, parts, plant, quality, startup, study, tick
+from hil.bench import control, lanes, learning, limits, margins, parts, plant, quality, startup, study, tick
 from hil.bench.figure import Figure
 from hil.versions import versions
 from pkxyz_ctrl.config import ConfigError
@@ -25,6 +25,7 @@ MEASUREMENTS: dict[str, Measurement] = {
     "harsh": quality.harsh,
     "learning": learning.learning,
     "control": control.control,
+    "margins": margins.margins,
     "controller": parts.controller,
     "codec": parts.codec,
     "gate": parts.gate,

@@ -1,0 +1,83 @@
+"""How far the laws are from instability and up to where they reject disturbances: computed, and one of them measured."""
+
+import math
+
+import numpy as np
+from numpy.typing import NDArray
+
+from hil.bench.figure import Figure
+from hil.excitation import excitation, tones
+from hil.loop_margins import Loop, agreement, over_changed_plants
+from hil.measured_loop import at_point, measure
+from hil.setup import bare_setup
+from pkxyz_ctrl.bus_config import BusConfig
+from pkxyz_ctrl.config import load
+from pkxyz_ctrl.controller_config import ControllerConfig
+from pkxyz_ctrl.design.law import design_law
+from pkxyz_ctrl.design.margins import Margins
+from pkxyz_ctrl.design.tolerances import Tolerances
+from pkxyz_ctrl.stage import Stage
+
+PEAK_S, DISK, CHANGED = 2.0, 0.6, 3.0
+REJECTED_HZ, RESONANCE_HZ = 200.0, 631.0
+"""Up to where |S| has to stay below -3 dB: on fd_5k, and on local_20k, where that is the first resonance."""
+BASELINES = ("pi_notch_robust", "irc_robust")
+PERIODS = 6
+
+
+def margins() -> list[Figure]:
+    """The law ``robust`` on ``fd_5k`` and ``robust_20k`` on ``local_20k``, at mid-workspace."""
+    stage, middle = Stage.load("reconstructed"), np.full(3, 12.5e-6)
+    loop = _loop(stage, "robust", "fd_5k")
+    found = loop.margins(middle)
+    fast = _loop(stage, "robust_20k", "local_20k").margins(middle)
+    reach = {name: _rejected_hz(_loop(stage, name, "fd_5k").margins(middle)) for name in BASELINES}
+    changed = over_changed_plants(loop, load("tolerances", "wide", Tolerances).cases())
+    case, worst = changed.worst
+    words = ", ".join(f"{name} {hz:.0f} Hz" for name, hz in reach.items())
+    each = "worst of x, y, z and MIMO, law robust, nominal plant"
+    return [
+        Figure("margins.peak_s", _peak_s(found), "Ms", PEAK_S, "at most", detail=each),
+        Figure("margins.disk", _disk(found), "disk margin", DISK, "at least", detail=each),
+        Figure("margins.rejection", _rejected_hz(found), "Hz", REJECTED_HZ, "at least",
+               detail=f"S below -3 dB up to; {each}"),
+        Figure("margins.over_baselines", _rejected_hz(found) / max(reach.values()), "times", 1.0, "at least",
+               detail=f"as far as the commercial baseline and irc, each tuned to be as robust: {words}"),
+        Figure("margins.changed_plants", worst if math.isfinite(worst) else 1e9, "Ms", CHANGED, "at most",
+               detail=f"worst of {len(changed.cases)} changed plants at nine points: {case.name}"),
+        Figure("margins.measured", _measured(loop, middle), "of bound", 1.0, "at most",
+               detail="largest distance of S measured in the running loop from the computed one, over what noise explains"),
+        Figure("margins.local_20k_rejection", _rejected_hz(fast), "Hz", RESONANCE_HZ, "at least",
+               detail="S below -3 dB up to; law robust_20k, worst of x, y, z and MIMO: to the first resonance"),
+        Figure("margins.local_20k_peak_s", _peak_s(fast), "Ms", PEAK_S, "at most", detail="the same"),
+    ]  # fmt: skip
+
+
+def _loop(stage: Stage, controller: str, bus: str) -> Loop:
+    config, on_bus = load("controllers", controller, ControllerConfig), load("buses", bus, BusConfig)
+    return Loop(stage, on_bus, design_law(stage, config, on_bus, autostart=True))
+
+
+def _peak_s(found: Margins) -> float:
+    return max(each.peak_s for each in (*found.axes, found.mimo)) if found.stable else 1e9
+
+
+def _disk(found: Margins) -> float:
+    return min(each.disk_margin for each in (*found.axes, found.mimo)) if found.stable else 0.0
+
+
+def _rejected_hz(found: Margins) -> float:
+    return min(each.bandwidth_hz for each in (*found.axes, found.mimo)) if found.stable else 0.0
+
+
+def _measured(loop: Loop, strokes_m: NDArray[np.float64]) -> float:
+    period_ticks = round(1.0 / loop.bus.period_s)
+    added = excitation(
+        "multisine", tones(period_ticks, 120, 5), period_ticks=period_ticks, periods=PERIODS, amplitude_m=5e-9,
+        first_tick=0, seed=1,
+    )  # fmt: skip
+    config = load("controllers", "robust", ControllerConfig)
+    run = at_point(bare_setup("reconstructed", "nominal", config, loop.bus, 1), strokes_m, added)
+    seen = measure(run, "fast")
+    compared = agreement(seen, loop.response(strokes_m, seen.frequency_hz), PERIODS)
+    return compared.largest / compared.bound
