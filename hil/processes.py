@@ -21,12 +21,12 @@ def processes(workers: int | None) -> Iterator[ProcessPoolExecutor]:
             pool.submit(int)  # the first call starts them all
         yield pool
     except BaseException:
-        pool.shutdown(wait=False, cancel_futures=True)
         for child in multiprocessing.active_children():
             if child not in before:
                 child.terminate()
-        raise
-    pool.shutdown()
+        raise  # what waits is not cancelled: the executor finds itself broken, fails all of it and tidies up
+    finally:
+        pool.shutdown()
 
 
 @contextmanager

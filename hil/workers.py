@@ -83,20 +83,16 @@ def as_done(
     """
     waiting: dict[Future[Result], Item] = {}
     source, more = iter(items), True
-    try:
-        while waiting or more:
-            while more and len(waiting) < width + ahead:
-                try:
-                    item = next(source)
-                except StopIteration:
-                    more = False
-                    break
-                waiting[pool.submit(function, item)] = item
-            if not waiting:
-                return
-            done, _ = wait(waiting, return_when=FIRST_COMPLETED)
-            for future in sorted(done, key=lambda f: list(waiting).index(f)):
-                yield waiting.pop(future), future.result()
-    finally:
-        for future in waiting:
-            future.cancel()
+    while waiting or more:
+        while more and len(waiting) < width + ahead:
+            try:
+                item = next(source)
+            except StopIteration:
+                more = False
+                break
+            waiting[pool.submit(function, item)] = item
+        if not waiting:
+            return
+        done, _ = wait(waiting, return_when=FIRST_COMPLETED)
+        for future in sorted(done, key=lambda f: list(waiting).index(f)):
+            yield waiting.pop(future), future.result()

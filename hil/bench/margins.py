@@ -1,4 +1,4 @@
-"""How far the laws are from instability and up to where they reject disturbances: computed, and one of them measured."""
+"""How far the laws are from instability and how far they reject disturbances: computed, and one of them measured."""
 
 import math
 
@@ -46,7 +46,7 @@ def margins() -> list[Figure]:
         Figure("margins.changed_plants", worst if math.isfinite(worst) else 1e9, "Ms", CHANGED, "at most",
                detail=f"worst of {len(changed.cases)} changed plants at nine points: {case.name}"),
         Figure("margins.measured", _measured(loop, middle), "of bound", 1.0, "at most",
-               detail="largest distance of S measured in the running loop from the computed one, over what noise explains"),
+               detail="largest distance of S measured in the running loop from S computed, over what noise explains"),
         Figure("margins.local_20k_rejection", _rejected_hz(fast), "Hz", RESONANCE_HZ, "at least",
                detail="S below -3 dB up to; law robust_20k, worst of x, y, z and MIMO: to the first resonance"),
         Figure("margins.local_20k_peak_s", _peak_s(fast), "Ms", PEAK_S, "at most", detail="the same"),
