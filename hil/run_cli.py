@@ -70,7 +70,9 @@ def run(
     except RecordingError as error:
         raise ConfigError(str(error)) from None
     except (StartUpError, DesignError) as error:
-        print(f"pkxyz: {error}", file=sys.stderr)
+        on_this_machine = isinstance(error, StartUpError) and require_real_bus(loaded.bus).interface == "pkxyz-unix"
+        hint = f"; here the amplifier is another process: is `pkxyz plant --bus {bus or loaded.bus.name}` running?"
+        print(f"pkxyz: {error}{hint if on_this_machine else ''}", file=sys.stderr)
         raise typer.Exit(1) from None
     if as_json:
         print(json.dumps(summary | {"folder": str(folder.path)}, allow_nan=False))
@@ -121,6 +123,8 @@ def plant(
     except Ended:
         pass
     except OSError as error:
+        if truth is None:
+            raise
         raise ConfigError(f"--truth: {truth}: {(error.strerror or str(error)).lower()}") from None
 
 

@@ -18,6 +18,7 @@ from rich.table import Table
 from hil import cli
 from hil.outputs import what_to_do
 from hil.tables import print_whole
+from pkxyz_ctrl.config import CONFIG_DIR
 
 ROOT = Path(__file__).parent.parent
 
@@ -169,6 +170,22 @@ def test_where_no_law_ran_there_is_no_picture(tmp_path, monkeypatch, capsys):
     assert ended.value.code == 1
     assert json.loads(capsys.readouterr().out)["picture"] is None
     assert not list(tmp_path.iterdir())
+
+
+def test_without_a_plant_the_run_says_what_to_start(tmp_path):
+    bus = (CONFIG_DIR / "buses" / "unix_2k.toml").read_text(encoding="utf-8")
+    (tmp_path / "mine.toml").write_text(
+        bus.replace('channel = "pkxyz"', f'channel = "{tmp_path}/bus"'), encoding="utf-8"
+    )
+    done = subprocess.run(
+        [sys.executable, "-m", "hil.cli", "run", "--bus", "mine.toml", "--seconds", "0.5"],
+        cwd=tmp_path, env={**os.environ, "PYTHONPATH": str(ROOT)}, capture_output=True, text=True, check=False,
+        timeout=600,
+    )  # fmt: skip
+    assert done.returncode == 1
+    line = done.stderr.splitlines()[-1]
+    assert "sent no boot-up message" in line
+    assert line.endswith("is `pkxyz plant --bus mine.toml` running?")
 
 
 def test_output_that_nobody_reads_on_is_no_error(tmp_path):
