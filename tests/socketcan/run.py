@@ -81,7 +81,7 @@ def main(chosen: list[str]) -> int:
 
 def _run_guest(chosen: list[str]) -> str:
     """Boot a guest and wait for its end; says what that was."""
-    with tempfile.TemporaryDirectory(prefix="uml-") as short:  # sockets of a guest have short paths
+    with tempfile.TemporaryDirectory(prefix="uml-", dir=_memory_folder()) as short:  # its sockets need short paths
         guest = _boot(Path(short), chosen)
         end_s = time.monotonic() + LONGEST_S
         worked, since_s = -1, time.monotonic()
@@ -100,6 +100,16 @@ def _run_guest(chosen: list[str]) -> str:
             if guest.poll() is None:
                 os.killpg(guest.pid, signal.SIGKILL)
             guest.wait()
+
+
+def _memory_folder() -> str | None:
+    """Where a file is memory and may be executed, as a guest's memory is a file: on a disk, all that it writes to its
+    memory is written there as well. None for the usual place.
+    """
+    shared = "/dev/shm"
+    if os.access(shared, os.W_OK) and not os.statvfs(shared).f_flag & os.ST_NOEXEC:
+        return shared
+    return None
 
 
 def _clock_ticks(pid: int) -> int:
@@ -136,7 +146,7 @@ def _apt(*words: str, cwd: str) -> subprocess.CompletedProcess[str]:
 
 
 def _boot(short: Path, chosen: list[str]) -> subprocess.Popen[bytes]:
-    """Start the guest; ``short`` is a folder for its sockets."""
+    """Start the guest; ``short`` is a folder for its memory and its sockets."""
     scratch = SCRATCH / "guest"
     scratch.mkdir(exist_ok=True)
     for name in ("status", "report"):
