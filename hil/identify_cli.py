@@ -83,6 +83,8 @@ def identify(
         )
     if out is not None:
         folder_to_write(out)
+        if (out / STAGE).exists() and (out / STAGE).samefile(find("stages", stage)):
+            raise ConfigError(f"--out: {out}: its {STAGE} is the --stage that is identified; give another folder")
     strokes = operating_strokes(Stage.load(stage), at_um)
     say_if_compiling(quiet=as_json)
     outside = None if reference is None else outside_scale(Stage.load(stage), *read_points(reference))

@@ -221,6 +221,7 @@ def design(
     """Dimensions from requirements (the paper's section IV), written as a stage file that `pkxyz sil --stage`
     runs.
     """
+    from hil.stage_file import require_replaceable, write_stage_file
     from pkxyz_ctrl.mechanics.combs import voltage_for_force_v
     from pkxyz_ctrl.mechanics.selection import Requirements, select
     from pkxyz_ctrl.stage_config import StageConfig
@@ -230,6 +231,7 @@ def design(
         raise ConfigError(f"--chains must be 1 (Eq. 19 as printed) or 3 (as the text describes it), got {chains}")
     if out.suffix != ".toml":
         raise ConfigError(f"{out}: --out must be a .toml file, so that --stage finds it")
+    require_replaceable(out)
     if picture is not None:
         picture_to_write(picture, "--picture")
     layer = _layers_m(layers)
@@ -254,8 +256,6 @@ def design(
         if need.voltage_max_v > 1000:
             raise ConfigError(f"voltage limit <= 1000 V is violated: {need.voltage_max_v:g} V")
         chosen = select(need, template, name=out.stem)
-    from hil.stage_file import write_stage_file
-
     write_stage_file(chosen, need, out)
     if picture is not None:
         from hil.mechanics_figures import draw_selection

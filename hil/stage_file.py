@@ -7,6 +7,17 @@ import tomlkit
 from pkxyz_ctrl.config import ConfigError, plain
 from pkxyz_ctrl.mechanics.selection import Requirements, Selection
 
+HEAD = "Dimensions selected by `pkxyz design` from requirements: the point of the feasible region"
+
+
+def require_replaceable(path: Path) -> None:
+    """Raise ``ConfigError`` for a file that is there and was not written here: somebody's work."""
+    try:
+        if path.exists() and not path.read_text(encoding="utf-8").startswith(f"# {HEAD}"):
+            raise ConfigError(f"--out: {path}: was not written by `pkxyz design`; give another file, or move it away")
+    except (OSError, UnicodeDecodeError):
+        raise ConfigError(f"--out: {path}: is no stage file that could be replaced; give another file") from None
+
 
 def write_stage_file(selection: Selection, need: Requirements, path: Path) -> None:
     """Write ``selection`` so that ``Stage.load(path)`` gives the same device. Raises ``ConfigError`` if it can't be
@@ -14,9 +25,7 @@ def write_stage_file(selection: Selection, need: Requirements, path: Path) -> No
     """
     data = plain(selection.config)
     document = tomlkit.document()
-    document.add(
-        tomlkit.comment("Dimensions selected by `pkxyz design` from requirements: the point of the feasible region")
-    )
+    document.add(tomlkit.comment(HEAD))
     document.add(tomlkit.comment("where the product of the margins is largest."))
     document.add("name", data.pop("name"))
     for section, values in data.items():

@@ -71,6 +71,17 @@ def test_refused_in_one_line_before_anything_is_done(words, says, capsys, monkey
     assert (tmp_path / "file").read_text() == "mine"
 
 
+def test_no_file_of_the_users_is_replaced(capsys, monkeypatch, tmp_path):
+    monkeypatch.chdir(tmp_path)
+    mine = (CONFIG_DIR / "stages" / "reconstructed.toml").read_text(encoding="utf-8")
+    for name in ("stage.toml", "drawn.toml"):
+        (tmp_path / name).write_text(mine, encoding="utf-8")
+    line = refused(capsys, monkeypatch, "identify", "--stage", "stage.toml", "--out", ".")
+    assert "its stage.toml is the --stage that is identified" in line
+    assert "was not written by `pkxyz design`" in refused(capsys, monkeypatch, "design", "--out", "drawn.toml")
+    assert all((tmp_path / name).read_text(encoding="utf-8") == mine for name in ("stage.toml", "drawn.toml"))
+
+
 @pytest.mark.skipif(os.getuid() == 0, reason="root may write everywhere")
 def test_a_folder_without_permission_is_refused_beforehand(capsys, monkeypatch, tmp_path):
     tmp_path.chmod(0o500)
