@@ -43,28 +43,29 @@ def _tabulate(p: np.void, s: np.void, h: float) -> None:
     for i in range(STAGES):
         t = C[i] * h
         s["decay"][i] = math.exp(-t / tau) if tau > 0.0 else 0.0
-        _exponential(p["damping_per_s"], -0.5 * t, s["shrink"][i])
-        _exponential(p["damping_per_s"], 0.5 * t, s["swell"][i])
+        _exponentials(p["damping_per_s"], 0.5 * t, s["shrink"][i], s["swell"][i])
 
 
 @njit(cache=True, error_model="numpy")
-def _exponential(d: np.ndarray, t: float, out: np.ndarray) -> None:
-    """exp(d t) of a (3, 3) for |d t| well below 1, by its series, column by column."""
+def _exponentials(d: np.ndarray, t: float, shrink: np.ndarray, swell: np.ndarray) -> None:
+    """exp(-d t) and exp(d t) of a (3, 3) for |d t| well below 1, by their series, column by column."""
     for j in range(3):
         a, b, c = (1.0 if j == 0 else 0.0), (1.0 if j == 1 else 0.0), (1.0 if j == 2 else 0.0)
-        out[0, j], out[1, j], out[2, j] = a, b, c
-        n = 1
+        shrink[0, j], shrink[1, j], shrink[2, j] = a, b, c
+        swell[0, j], swell[1, j], swell[2, j] = a, b, c
+        n, sign = 0, 1.0
         while max(abs(a), abs(b), abs(c)) > 1e-18:
+            n += 1
+            sign = -sign
             f = t / n
             a, b, c = (
                 f * (d[0, 0] * a + d[0, 1] * b + d[0, 2] * c),
                 f * (d[1, 0] * a + d[1, 1] * b + d[1, 2] * c),
                 f * (d[2, 0] * a + d[2, 1] * b + d[2, 2] * c),
             )
-            out[0, j] += a
-            out[1, j] += b
-            out[2, j] += c
-            n += 1
+            shrink[0, j], swell[0, j] = shrink[0, j] + sign * a, swell[0, j] + a
+            shrink[1, j], swell[1, j] = shrink[1, j] + sign * b, swell[1, j] + b
+            shrink[2, j], swell[2, j] = shrink[2, j] + sign * c, swell[2, j] + c
 
 
 @njit(cache=True, error_model="numpy")
