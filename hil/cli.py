@@ -32,7 +32,7 @@ from hil import (
 from hil.choices import Lane
 from hil.first_run import say_if_compiling
 from hil.outputs import what_to_do
-from pkxyz_ctrl.config import CONFIG_DIR, ConfigError, names
+from pkxyz_ctrl.config import CONFIG_DIR, ConfigError, find, names
 
 app = typer.Typer(
     help="Real-time controller of a parallel-kinematics XYZ MEMS stage, and the harness that proves it.",
@@ -129,6 +129,7 @@ def sil(
     """Close the loop on a scenario; exit code 0 if its checks hold, 1 if not, 2 for bad input or a full disk, 130 if
     interrupted.
     """
+    find("scenarios", scenario)  # a typo is said before anything is compiled
     say_if_compiling(quiet=as_json)
     from hil.faults.fault import parse
     from hil.scenario import load_scenario
