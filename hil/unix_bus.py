@@ -1,8 +1,10 @@
 """A CAN bus among the processes of one machine: python-can's ``can.Bus(interface="pkxyz-unix", channel=...)``.
 
 Frames, FD included, are datagrams between Unix sockets in one folder, the channel: whoever opens the channel binds a
-socket there, and a frame goes to all others. There is no wire timing and no arbitration, and a receiver that does not
-read loses frames when its queue in the kernel is full (``net.unix.max_dgram_qlen``), as CAN controllers do.
+socket there, and a frame goes to all others. There is no wire timing and no arbitration. A receiver that stands still
+finds some 256 frames when it goes on, as on a socket of the kernel's CAN; what it missed beyond them is lost. The queue
+of a Unix socket is shorter (``net.unix.max_dgram_qlen``, often 10: three ticks), so what does not fit waits with the
+sender, which hands it over whenever it sends or receives.
 
 Unlike over other interfaces, ``timestamp`` is when the frame was sent, in seconds of the time of day.
 """
@@ -15,6 +17,7 @@ import socket
 import struct
 import tempfile
 import time
+from collections import deque
 from itertools import count
 from pathlib import Path
 
@@ -26,6 +29,9 @@ _EXTENDED, _REMOTE, _ERROR = 0x8000_0000, 0x4000_0000, 0x2000_0000
 _BIT_RATE_SWITCH, _ERROR_STATE, _FD = 0x01, 0x02, 0x04
 _LONGEST_PATH = 107  # sockaddr_un.sun_path less its closing zero
 _GONE = {errno.ECONNREFUSED, errno.ENOENT, errno.ECONNRESET, errno.ENOTCONN}
+_WAITING_MOST = 256  # frames for one receiver
+_RETRY_S = 0.5e-3  # how often a sender that waits for frames itself looks whether its own can be handed over
+_LEAVE_S = 0.1  # for how long it does so before it leaves
 _numbers = count(1)
 
 
@@ -58,6 +64,7 @@ class UnixBus(can.BusABC):
         self._fd = fd
         self._peers: list[str] = []
         self._listed_ns = -1
+        self._waiting: dict[str, deque[bytes]] = {}
         self.dropped = 0
         self._own: list[can.Message] | None = [] if receive_own_messages else None
         self.channel = str(channel)
@@ -84,25 +91,53 @@ class UnixBus(can.BusABC):
         if msg.is_fd and not self._fd:
             raise can.CanOperationError(f"{self.channel_info}: opened without fd, cannot send an FD frame")
         datagram = _pack(msg)
-        sender = self._socket
+        if self._waiting:
+            self._hand_over()
         for peer in self._others():
-            try:
-                sender.sendto(datagram, peer)
-            except BlockingIOError:
+            waiting = self._waiting.get(peer)
+            if waiting is None and self._reaches(peer, datagram):
+                continue
+            waiting = self._waiting.setdefault(peer, deque())
+            if len(waiting) < _WAITING_MOST:
+                waiting.append(datagram)
+            else:
                 self.dropped += 1
-            except OSError as error:
-                if error.errno not in _GONE:
-                    raise can.CanOperationError(f"{self.channel_info}: {error.strerror}", error.errno) from error
-                self._forget(peer)
         if self._own is not None:
             own = _unpack(datagram, self.channel)
             own.is_rx = False
             self._own.append(own)
 
+    def _reaches(self, peer: str, datagram: bytes) -> bool:
+        """Send to one other; False if its queue is full. One that is gone is forgotten, which is as good."""
+        try:
+            self._socket.sendto(datagram, peer)
+        except BlockingIOError:
+            return False
+        except OSError as error:
+            if error.errno not in _GONE:
+                raise can.CanOperationError(f"{self.channel_info}: {error.strerror}", error.errno) from error
+            self._forget(peer)
+        return True
+
+    def _hand_over(self) -> None:
+        """What waits, as far as there is room for it, in its order."""
+        for peer, waiting in list(self._waiting.items()):
+            while waiting and self._reaches(peer, waiting[0]):
+                waiting.popleft()
+            if not waiting:
+                self._waiting.pop(peer, None)
+
+    def flush_tx_buffer(self) -> None:
+        """Forget what waits."""
+        self._waiting.clear()
+
     def _recv_internal(self, timeout: float | None) -> tuple[can.Message | None, bool]:
         if self._own:
             return self._own.pop(0), False
         receiver = self._socket
+        if self._waiting:
+            self._hand_over()
+            timeout = _RETRY_S if timeout is None else min(timeout, _RETRY_S)  # python-can asks again until its time
         for attempt in range(2):
             try:
                 message = _unpack(receiver.recv(128), self.channel)
@@ -128,8 +163,12 @@ class UnixBus(can.BusABC):
         return self._socket.fileno()
 
     def shutdown(self) -> None:
-        """Leave the channel."""
+        """Leave the channel, once what waits was handed over or nobody takes it."""
         if not self._is_shutdown:
+            end_s = time.monotonic() + _LEAVE_S
+            while self._waiting and time.monotonic() < end_s:
+                time.sleep(_RETRY_S)
+                self._hand_over()
             super().shutdown()
             self._socket.close()
             self._path.unlink(missing_ok=True)
@@ -155,6 +194,7 @@ class UnixBus(can.BusABC):
         with contextlib.suppress(OSError):
             os.unlink(peer)
         self._peers = [other for other in self._peers if other != peer]
+        self._waiting.pop(peer, None)
 
 
 def _pack(msg: can.Message) -> bytes:

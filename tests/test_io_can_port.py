@@ -5,6 +5,7 @@ import re
 import socket
 import subprocess
 import sys
+import threading
 import time
 from pathlib import Path
 
@@ -84,18 +85,41 @@ def test_a_classic_bus_refuses_fd_frames_and_does_not_see_them(tmp_path):
         assert port.receive(clock.now_us + 100_000) == Frame(0x124, b"ok")
 
 
-def test_a_receiver_that_does_not_read_loses_the_newest_and_delays_nobody(tmp_path):
-    limit = int(Path("/proc/sys/net/unix/max_dgram_qlen").read_text(encoding="ascii"))
+def test_a_receiver_that_stands_still_misses_nothing_for_256_frames_and_delays_nobody(tmp_path):
+    """The kernel's queue holds some, the others wait with their sender, and beyond that the newest are lost."""
+    queue = int(Path("/proc/sys/net/unix/max_dgram_qlen").read_text(encoding="ascii"))
+    sent = queue + 256 + 50
     with UnixBus(f"{tmp_path}/bus") as sender, UnixBus(f"{tmp_path}/bus") as deaf, UnixBus(f"{tmp_path}/bus") as awake:
-        for n in range(2 * limit + 50):
+        for n in range(sent):
             sender.send(can.Message(arbitration_id=n & 0x7FF, is_extended_id=False))
             assert awake.recv(1.0).arbitration_id == n & 0x7FF
         kept = 0
         while (message := deaf.recv(0)) is not None:
             assert message.arbitration_id == kept
             kept += 1
-        assert limit <= kept <= limit + 1
-        assert sender.dropped == 2 * limit + 50 - kept
+            sender.recv(0)  # hands over what waits
+        assert queue + 256 <= kept <= queue + 257
+        assert sender.dropped == sent - kept
+        sender.send(can.Message(arbitration_id=0x123, is_extended_id=False))
+        assert deaf.recv(1.0).arbitration_id == 0x123
+
+
+def test_what_waits_can_be_forgotten_and_goes_out_before_its_sender_leaves(tmp_path):
+    """No voltage of before a fault may reach the node after it; 0 V and pre-operational, sent last, should."""
+    queue = int(Path("/proc/sys/net/unix/max_dgram_qlen").read_text(encoding="ascii"))
+    with UnixBus(f"{tmp_path}/bus") as deaf:
+        sender = UnixBus(f"{tmp_path}/bus")
+        for n in range(queue + 20):
+            sender.send(can.Message(arbitration_id=n, is_extended_id=False))
+        sender.flush_tx_buffer()
+        sender.send(can.Message(arbitration_id=0x700, is_extended_id=False))
+        leaving = threading.Thread(target=sender.shutdown)
+        leaving.start()
+        seen = [deaf.recv(0.05) for _ in range(queue + 2)]
+        leaving.join()
+        identifiers = [message.arbitration_id for message in seen if message is not None]
+        assert identifiers == [*range(len(identifiers) - 1), 0x700]
+        assert len(identifiers) in (queue + 1, queue + 2)
 
 
 def test_what_a_killed_process_leaves_behind_is_cleared_away(tmp_path):
