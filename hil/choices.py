@@ -34,9 +34,10 @@ def operating_strokes(stage: "Stage", at_um: tuple[float, float, float] | None) 
 
     from pkxyz_ctrl.stage import StageDomainError
 
+    limits = stage.config.limits
     if at_um is None:
-        return np.full(3, 12.5e-6)
-    strokes, limits = np.array(at_um) * 1e-6, stage.config.limits
+        return np.full(3, 0.5 * (limits.stroke_min_m + limits.stroke_max_m))
+    strokes = np.array(at_um) * 1e-6
     words = " ".join(f"{q:g}" for q in at_um)
     if not ((strokes >= limits.stroke_min_m) & (strokes <= limits.stroke_max_m)).all():
         raise ConfigError(

@@ -155,6 +155,7 @@ class SimBus(can.BusABC):
 
     @state.setter
     def state(self, new_state: can.BusState) -> None:
+        # what python-can raises for every interface whose state can't be set
         raise NotImplementedError("the error state follows from what happens on the wire")
 
     def flush_tx_buffer(self) -> None:

@@ -10,7 +10,7 @@ import typer
 from rich.console import Console
 
 from hil.first_run import say_if_compiling
-from hil.outputs import folder_to_write
+from hil.outputs import folder_to_write, writing
 from hil.progress import progress_bar
 from pkxyz_ctrl.config import ConfigError
 
@@ -39,18 +39,17 @@ def soak(
     folder = _folder(out)
     say_if_compiling(quiet=as_json)
     try:
-        with progress_bar("soak", quiet=as_json) as tell:
-            soaked = soaking.soak(60.0 * minutes, seed, law, folder, keep=keep, on_progress=tell)
-        if out is not None:
-            from hil.soak_figure import draw_soak
+        with writing(folder):
+            with progress_bar("soak", quiet=as_json) as tell:
+                soaked = soaking.soak(60.0 * minutes, seed, law, folder, keep=keep, on_progress=tell)
+            if out is not None:
+                from hil.soak_figure import draw_soak
 
-            text = json.dumps(soaking.as_json(soaked), indent=1) + "\n"
-            (out / "soak.json").write_text(text, encoding="utf-8")
-            draw_soak(soaked, out / "soak.png")
+                text = json.dumps(soaking.as_json(soaked), indent=1) + "\n"
+                (out / "soak.json").write_text(text, encoding="utf-8")
+                draw_soak(soaked, out / "soak.png")
     except RecordingError as error:
         raise ConfigError(str(error)) from None
-    except OSError as error:
-        raise ConfigError(f"--out: {out}: {(error.strerror or str(error)).lower()}; give another folder") from None
     finally:
         if out is None:
             shutil.rmtree(folder, ignore_errors=True)

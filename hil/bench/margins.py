@@ -6,6 +6,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from hil.bench.figure import Figure
+from hil.choices import operating_strokes
 from hil.excitation import excitation, tones
 from hil.loop_margins import Loop, agreement, over_changed_plants
 from hil.measured_loop import at_point, measure
@@ -27,7 +28,8 @@ PERIODS = 6
 
 def margins() -> list[Figure]:
     """The law ``robust`` on ``fd_5k`` and ``robust_20k`` on ``local_20k``, at mid-workspace."""
-    stage, middle = Stage.load("reconstructed"), np.full(3, 12.5e-6)
+    stage = Stage.load("reconstructed")
+    middle = operating_strokes(stage, None)
     loop = _loop(stage, "robust", "fd_5k")
     found = loop.margins(middle)
     fast = _loop(stage, "robust_20k", "local_20k").margins(middle)

@@ -114,6 +114,8 @@ class CanPort:
         return 0
 
     def discard_unsent(self) -> None:
-        """Empty the transmit queue of interfaces that can; the kernel's sockets can't."""
+        """Empty the transmit queue of interfaces that can. The kernel's sockets can't, which python-can tells by
+        NotImplementedError.
+        """
         with suppress(can.CanError, OSError, NotImplementedError):
             self._bus.flush_tx_buffer()

@@ -4,8 +4,8 @@ The host's files are the guest's root, read-only, so it runs this very checkout 
 host's cache with the kernels that were compiled there. It has one processor, and its clock is not the world's: what is
 tested is what happens, not when. Arguments are handed on to pytest.
 
-Now and then a guest kernel stops dead, with none of its processes failing and nothing to wait for; it is then booted
-once more, and that is said. A test that fails is never tried again.
+A guest that does nothing for long, or does not end, is booted once more, and that is said: what stands still there is
+the guest's kernel and not what is tested. A test that fails is never tried again.
 
 Exit code 0 if all tests pass, or if the two packages cannot be had, which is then said loudly; 1 if not.
 """
