@@ -27,12 +27,12 @@ bench: .venv/.ready
 
 SECONDS ?= 1200
 mutate: .venv/.ready
-	$(BIN)/python tests/mutate.py --seconds $(SECONDS) --report
+	$(BIN)/python tests/mutation/mutate.py --seconds $(SECONDS) --report
 
 FRAMES ?= 1000000
 DOCUMENTS ?= 10000
 fuzz: .venv/.ready
-	$(BIN)/python tests/fuzz.py --frames $(FRAMES) --documents $(DOCUMENTS)
+	$(BIN)/python tests/fuzz/fuzz.py --frames $(FRAMES) --documents $(DOCUMENTS)
 
 docs: .venv/.ready
 	$(BIN)/python docs/build.py

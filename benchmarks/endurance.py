@@ -30,14 +30,14 @@ import numpy as np
 from numpy.typing import NDArray
 
 from hil.bench.suite import describe_machine
-from hil.ending import Ended, Ending
-from hil.run_folder import RunFolder, metadata_of
-from hil.scenario import Scenario, load_scenario
-from hil.wall import WallRig
-from hil.wall_recorder import WallRecorder
-from pkxyz_ctrl.config import CONFIG_DIR
+from hil.lanes.ending import Ended, Ending
+from hil.lanes.wall import WallRig
+from hil.recording.wall_recorder import WallRecorder
+from hil.runs.run_folder import RunFolder, metadata_of
+from hil.runs.scenario import Scenario, load_scenario
+from pkxyz_ctrl.config.files import CONFIG_DIR
 from pkxyz_ctrl.io.realtime import go_real_time, leave_real_time, settle_memory
-from pkxyz_ctrl.row import ROW
+from pkxyz_ctrl.loop.row import ROW
 from pkxyz_ctrl.safety.modes import LOOP_CLOSED, Mode
 
 Array = NDArray[np.float64]

@@ -11,7 +11,7 @@ import sys
 from pathlib import Path
 
 from hil.bench.suite import MEASUREMENTS, describe_machine, results
-from hil.bench_cli import measure_all
+from hil.commands.bench import measure_all
 
 RESULTS = Path(__file__).with_name("results.json")
 PERFORMANCE = Path(__file__).parents[1] / "docs" / "figures" / "performance.py"

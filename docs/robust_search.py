@@ -5,17 +5,17 @@ files. Takes some minutes, so it is no part of ``make docs``.
 import numpy as np
 import tomlkit
 
-from pkxyz_ctrl.bus_config import BusConfig
-from pkxyz_ctrl.config import CONFIG_DIR, load
-from pkxyz_ctrl.controller_config import ControllerConfig
-from pkxyz_ctrl.design.estimator_gain import measurement_noise
+from pkxyz_ctrl.config.bus import BusConfig
+from pkxyz_ctrl.config.controller import ControllerConfig
+from pkxyz_ctrl.config.files import CONFIG_DIR, load
 from pkxyz_ctrl.design.hold_noise import rounding_force_n
 from pkxyz_ctrl.design.law import design_law
-from pkxyz_ctrl.design.loop_plant import LoopPlant, Perturbation, loop_plant
+from pkxyz_ctrl.design.laws.estimator_gain import measurement_noise
+from pkxyz_ctrl.design.laws.minimax import AxisLaw, Bounds, axis_law, minimax
 from pkxyz_ctrl.design.lqg_equivalent import lqg_equivalent
-from pkxyz_ctrl.design.minimax import AxisLaw, Bounds, axis_law, minimax
-from pkxyz_ctrl.design.plant_model import linearise
-from pkxyz_ctrl.design.tolerances import Tolerances
+from pkxyz_ctrl.design.margins.tolerances import Tolerances
+from pkxyz_ctrl.design.model.loop_plant import LoopPlant, Perturbation, loop_plant
+from pkxyz_ctrl.design.model.plant_model import linearise
 from pkxyz_ctrl.stage import Stage
 
 ENDS = ("middle", "3/3/3 um", "22/22/22 um")

@@ -14,25 +14,23 @@ import typer
 from rich.console import Console
 from rich.table import Table
 
-from hil import (
-    bench_cli,
-    check_amplifier_cli,
-    compare_cli,
-    faults_cli,
-    identify_cli,
-    latency_cli,
-    margins_cli,
-    mechanics_cli,
-    montecarlo_cli,
-    replay_cli,
-    run_cli,
-    soak_cli,
-    tune_cli,
-)
-from hil.choices import Lane
-from hil.first_run import say_if_compiling
-from hil.outputs import what_to_do
-from pkxyz_ctrl.config import CONFIG_DIR, ConfigError, find, names
+from hil.commands import bench as bench_cli
+from hil.commands import check_amplifier as check_amplifier_cli
+from hil.commands import compare as compare_cli
+from hil.commands import faults as faults_cli
+from hil.commands import identify as identify_cli
+from hil.commands import latency as latency_cli
+from hil.commands import margins as margins_cli
+from hil.commands import mechanics as mechanics_cli
+from hil.commands import montecarlo as montecarlo_cli
+from hil.commands import replay as replay_cli
+from hil.commands import run as run_cli
+from hil.commands import soak as soak_cli
+from hil.commands import tune as tune_cli
+from hil.screen.choices import Lane
+from hil.screen.first_run import say_if_compiling
+from hil.screen.outputs import what_to_do
+from pkxyz_ctrl.config.files import CONFIG_DIR, ConfigError, find, names
 
 app = typer.Typer(
     help="Real-time controller of a parallel-kinematics XYZ MEMS stage, and the harness that proves it.",
@@ -132,18 +130,18 @@ def sil(
     find("scenarios", scenario)  # a typo is said before anything is compiled
     say_if_compiling(quiet=as_json)
     from hil.faults.fault import parse
-    from hil.scenario import load_scenario
+    from hil.runs.scenario import load_scenario
 
     faults = [parse(text) for text in fault or ()]
     learning = run_cli.learning_of(learn, replay, refresh)
     loaded = load_scenario(
         scenario, seed=seed, stage=stage, plant=plant, controller=controller, bus=bus, faults=faults, learning=learning
     )
-    from hil.recording import RecordingError
-    from hil.run_folder import RunFolder, next_free
-    from hil.sil import draw, require_bus
-    from pkxyz_ctrl.controller import StartUpError
-    from pkxyz_ctrl.design.design_error import DesignError
+    from hil.recording.recording import RecordingError
+    from hil.runs.in_process import draw, require_bus
+    from hil.runs.run_folder import RunFolder, next_free
+    from pkxyz_ctrl.design.model.design_error import DesignError
+    from pkxyz_ctrl.loop.controller import StartUpError
 
     require_bus(loaded, lane.value)
     folder = RunFolder(out if out is not None else next_free(Path("runs"), loaded.config.name, lane.value))
@@ -202,7 +200,7 @@ for _name, _command, _words in _COMMANDS:
 
 
 def _run_with_progress(folder: Any, scenario: Any, lane: str, *, quiet: bool) -> dict[str, Any]:
-    from hil.sil import run_into
+    from hil.runs.in_process import run_into
 
     if quiet or not _notes.is_terminal:
         return run_into(folder, scenario, lane, lambda done, total: None)
@@ -220,7 +218,7 @@ def _run_with_progress(folder: Any, scenario: Any, lane: str, *, quiet: bool) ->
 
 
 def _show(summary: dict[str, Any], folder: Path) -> None:
-    from hil.report import bound_words
+    from hil.pictures.report import bound_words
 
     table = Table(box=None, pad_edge=False, header_style="dim")
     for heading, side in (("check", "left"), ("value", "right"), ("bound", "right"), ("", "left")):

@@ -5,7 +5,7 @@
 
 from typing import TYPE_CHECKING, Any
 
-from pkxyz_ctrl.kernel_cache import choose_kernel_cache
+from pkxyz_ctrl.compiled.kernel_cache import choose_kernel_cache
 
 if TYPE_CHECKING:
     from pkxyz_ctrl.stage import Stage as Stage

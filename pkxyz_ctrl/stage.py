@@ -16,13 +16,13 @@ import numpy as np
 from numba import njit
 from numpy.typing import ArrayLike, NDArray
 
-from pkxyz_ctrl.calibration_config import AS_DRAWN, Calibration
-from pkxyz_ctrl.config import load
+from pkxyz_ctrl.config.calibration import AS_DRAWN, Calibration
+from pkxyz_ctrl.config.files import load
+from pkxyz_ctrl.config.stage import StageConfig
 from pkxyz_ctrl.core import elasticity, kinematics
 from pkxyz_ctrl.core.linear3 import inverse3
-from pkxyz_ctrl.mechanics.combs import capacitance_gradient_f_per_m, force_gain_n_per_v2
-from pkxyz_ctrl.mechanics.flexures import crank_hinge_stiffness, folded_spring_stiffness, link_hinge_stiffness
-from pkxyz_ctrl.stage_config import StageConfig
+from pkxyz_ctrl.elements.combs import capacitance_gradient_f_per_m, force_gain_n_per_v2
+from pkxyz_ctrl.elements.flexures import crank_hinge_stiffness, folded_spring_stiffness, link_hinge_stiffness
 
 Array = NDArray[np.float64]
 Records = NDArray[np.void]

@@ -3,7 +3,7 @@
     python docs/figures/bus_timing.py
 
 Each table stands between ``<!-- generated: NAME -->`` and ``<!-- end -->``. The figure shows a cycle that the wire
-really ran; its numbers and the tables' come from ``hil.frame_time``.
+really ran; its numbers and the tables' come from ``hil.bus.frame_time``.
 """
 
 import re
@@ -11,9 +11,9 @@ from math import floor
 from pathlib import Path
 from typing import NamedTuple
 
-from hil.clock import Lockstep
-from hil.frame_time import INTERFRAME_BITS, frame_bit_counts, frame_duration_ns, frame_range_us
-from hil.wire import Wire
+from hil.bus.clock import Lockstep
+from hil.bus.frame_time import INTERFRAME_BITS, frame_bit_counts, frame_duration_ns, frame_range_us
+from hil.bus.wire import Wire
 from pkxyz_ctrl.can.frame import Frame
 
 PAGE = Path(__file__).parents[1] / "bus.md"

@@ -8,14 +8,14 @@ from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
 from numpy.typing import NDArray
 
-from hil import lanes
-from hil.calibrated_stage import write_calibrated_stage
-from hil.identification import identify
-from hil.scenario import load_scenario
-from hil.setup import bare_setup
-from pkxyz_ctrl.bus_config import BusConfig
-from pkxyz_ctrl.config import find, load
-from pkxyz_ctrl.controller_config import ControllerConfig
+from hil.lanes import either as lanes
+from hil.lanes.setup import bare_setup
+from hil.runs.scenario import load_scenario
+from hil.studies.identify.calibrated_stage import write_calibrated_stage
+from hil.studies.identify.identification import identify
+from pkxyz_ctrl.config.bus import BusConfig
+from pkxyz_ctrl.config.controller import ControllerConfig
+from pkxyz_ctrl.config.files import find, load
 
 ORANGE, BLUE, GREY = "#d55e00", "#0072b2", "#9aa5ad"
 WINDOW_MS = (330.0, 560.0)

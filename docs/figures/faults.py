@@ -12,12 +12,12 @@ import shutil
 import sys
 from pathlib import Path
 
+from hil.commands.faults import run_matrix
 from hil.faults.catalogue import KINDS, PARTS
-from hil.faults.matrix import CASES
-from hil.faults.outcome import Outcome
-from hil.faults.picture import draw
-from hil.faults_cli import run_matrix
-from pkxyz_ctrl.config import names
+from hil.pictures.faults import draw
+from hil.studies.faults.matrix import CASES
+from hil.studies.faults.outcome import Outcome
+from pkxyz_ctrl.config.files import names
 
 HERE = Path(__file__).parent
 PAGE = HERE.parent / "faults.md"

@@ -4,12 +4,12 @@ from pathlib import Path
 
 import numpy as np
 
-from hil.identification import identify
-from hil.identify_figures import draw_response
-from hil.setup import bare_setup
-from pkxyz_ctrl.bus_config import BusConfig
-from pkxyz_ctrl.config import load
-from pkxyz_ctrl.controller_config import ControllerConfig
+from hil.lanes.setup import bare_setup
+from hil.pictures.identify import draw_response
+from hil.studies.identify.identification import identify
+from pkxyz_ctrl.config.bus import BusConfig
+from pkxyz_ctrl.config.controller import ControllerConfig
+from pkxyz_ctrl.config.files import load
 
 
 def main() -> None:

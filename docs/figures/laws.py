@@ -9,9 +9,9 @@ from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
 from numpy.typing import NDArray
 
-from hil import lanes
-from hil.scenario import load_scenario
-from hil.setup import Setup
+from hil.lanes import either as lanes
+from hil.lanes.setup import Setup
+from hil.runs.scenario import load_scenario
 
 BLUE, ORANGE, GREY = "#0072b2", "#d55e00", "#8a8a8a"
 

@@ -4,9 +4,9 @@ import shutil
 import tempfile
 from pathlib import Path
 
-from hil.run_folder import RunFolder
-from hil.scenario import load_scenario
-from hil.sil import draw, run_into
+from hil.runs.in_process import draw, run_into
+from hil.runs.run_folder import RunFolder
+from hil.runs.scenario import load_scenario
 
 if __name__ == "__main__":
     with tempfile.TemporaryDirectory() as scratch:

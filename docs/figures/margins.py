@@ -8,16 +8,16 @@ import numpy as np
 from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
 
-from hil.loop_margins import Loop, over_changed_plants
-from pkxyz_ctrl.bus_config import BusConfig
-from pkxyz_ctrl.config import load
-from pkxyz_ctrl.controller_config import ControllerConfig
-from pkxyz_ctrl.design.discrete_law import response
+from hil.studies.margins.loop import Loop, over_changed_plants
+from pkxyz_ctrl.config.bus import BusConfig
+from pkxyz_ctrl.config.controller import ControllerConfig
+from pkxyz_ctrl.config.files import load
 from pkxyz_ctrl.design.hold_noise import hold_noise_m
 from pkxyz_ctrl.design.law import design_law
 from pkxyz_ctrl.design.law_about import law_about
-from pkxyz_ctrl.design.loop_plant import loop_plant
-from pkxyz_ctrl.design.tolerances import Tolerances
+from pkxyz_ctrl.design.margins.tolerances import Tolerances
+from pkxyz_ctrl.design.model.discrete_law import response
+from pkxyz_ctrl.design.model.loop_plant import loop_plant
 from pkxyz_ctrl.stage import Stage
 
 MIDDLE = np.full(3, 12.5e-6)

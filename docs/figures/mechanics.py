@@ -8,15 +8,15 @@ The table stands between ``<!-- generated: numbers -->`` and ``<!-- end -->``.
 import re
 from pathlib import Path
 
-from hil.mechanics_figures import draw_design_space, draw_linearisation, draw_modes, draw_selection
-from hil.workspace_figures import draw_edge_path, draw_workspace
-from pkxyz_ctrl.config import load
+from hil.pictures.mechanics import draw_design_space, draw_linearisation, draw_modes, draw_selection
+from hil.pictures.workspace import draw_edge_path, draw_workspace
+from pkxyz_ctrl.config.files import load
+from pkxyz_ctrl.config.stage import StageConfig
 from pkxyz_ctrl.mechanics.linearisation import linearisation_study
 from pkxyz_ctrl.mechanics.published import entries
 from pkxyz_ctrl.mechanics.reproduction import reproduction_table
 from pkxyz_ctrl.mechanics.selection import Requirements, select
 from pkxyz_ctrl.stage import Stage
-from pkxyz_ctrl.stage_config import StageConfig
 
 HERE = Path(__file__).parent
 PAGE = HERE.parent / "mechanics.md"

@@ -14,7 +14,7 @@ from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure as Picture
 
 from hil.bench.figure import Figure
-from hil.bench_cli import bound_of, in_digits
+from hil.commands.bench import bound_of, in_digits
 
 ROOT = Path(__file__).parents[2]
 PAGE = ROOT / "docs" / "performance.md"

@@ -6,12 +6,12 @@ import numpy as np
 from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
 
-from hil.loop_margins import Loop
-from pkxyz_ctrl.bus_config import BusConfig
-from pkxyz_ctrl.config import load
-from pkxyz_ctrl.controller_config import ControllerConfig
+from hil.studies.margins.loop import Loop
+from pkxyz_ctrl.config.bus import BusConfig
+from pkxyz_ctrl.config.controller import ControllerConfig
+from pkxyz_ctrl.config.files import load
 from pkxyz_ctrl.design.law import design_law
-from pkxyz_ctrl.design.tolerances import Tolerances
+from pkxyz_ctrl.design.margins.tolerances import Tolerances
 from pkxyz_ctrl.stage import Stage
 
 

@@ -10,7 +10,7 @@ matplotlib.use("Agg")
 import matplotlib.pyplot as plt
 
 from hil.bench.control import BAND_M, LOW_M, WAY_M
-from hil.bench.motions import run, settled_s
+from hil.bench.rigs.motions import run, settled_s
 from pkxyz_ctrl.trajectory import Steps
 
 COLOURS = {"lqg": "tab:gray", "mpc": "tab:blue"}

@@ -8,7 +8,7 @@ from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
 from numpy.typing import NDArray
 
-from hil.scenario import load_scenario
+from hil.runs.scenario import load_scenario
 from pkxyz_ctrl.trajectory import Sine, Trajectory
 
 BLUE, ORANGE, GREY = "#0072b2", "#d55e00", "#b4b4b4"

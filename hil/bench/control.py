@@ -10,11 +10,11 @@ import numpy as np
 from numpy.typing import NDArray
 
 from hil.bench.figure import Figure
-from hil.bench.motions import MIDDLE_M, error_m, run, settled_s, setup_of
-from hil.fast_lane import run_block_in_steps
-from pkxyz_ctrl.cycle import new_memory
-from pkxyz_ctrl.period import period_of
-from pkxyz_ctrl.row import ROW
+from hil.bench.rigs.motions import MIDDLE_M, error_m, run, settled_s, setup_of
+from hil.lanes.fast import run_block_in_steps
+from pkxyz_ctrl.loop.cycle import new_memory
+from pkxyz_ctrl.loop.period import period_of
+from pkxyz_ctrl.loop.row import ROW
 from pkxyz_ctrl.safety.modes import Mode
 from pkxyz_ctrl.trajectory import Circle, Hold, Move, Raster, Sine, Steps
 

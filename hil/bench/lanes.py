@@ -7,17 +7,17 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from hil import lanes
-from hil.bench.closed_loop import scan
 from hil.bench.figure import Figure, once, repeated, times_of
-from hil.bench.played import Played, PlayedPort, drive_counts, recorded_frames
+from hil.bench.rigs.closed_loop import scan
+from hil.bench.rigs.played import Played, PlayedPort, drive_counts, recorded_frames
 from hil.bench.tick import ticks_from_python
-from hil.metrics import Metrics
-from hil.plant_on_bus import PlantOnBus
-from hil.recording import RecordingWriter
-from hil.run_folder import metadata_of
-from hil.scenario import Scenario, load_scenario, resolve
-from hil.setup import Setup
+from hil.lanes import either as lanes
+from hil.lanes.setup import Setup
+from hil.plant.on_bus import PlantOnBus
+from hil.recording.recording import RecordingWriter
+from hil.runs.metrics import Metrics
+from hil.runs.run_folder import metadata_of
+from hil.runs.scenario import Scenario, load_scenario, resolve
 
 REPEATS = 15
 

@@ -2,11 +2,11 @@
 
 import numpy as np
 
-from hil import lanes
 from hil.bench.figure import Figure
-from hil.metrics import Metrics
-from hil.period_errors import WITHIN, PeriodErrors
-from hil.scenario import load_scenario
+from hil.lanes import either as lanes
+from hil.runs.metrics import Metrics
+from hil.runs.period_errors import WITHIN, PeriodErrors
+from hil.runs.scenario import load_scenario
 
 LINE_M = 10e-6
 _SETTLED = 3

@@ -6,17 +6,17 @@ import numpy as np
 from numpy.typing import NDArray
 
 from hil.bench.figure import Figure
-from hil.choices import operating_strokes
-from hil.excitation import excitation, tones
-from hil.loop_margins import Loop, agreement, over_changed_plants
-from hil.measured_loop import at_point, measure
-from hil.setup import bare_setup
-from pkxyz_ctrl.bus_config import BusConfig
-from pkxyz_ctrl.config import load
-from pkxyz_ctrl.controller_config import ControllerConfig
+from hil.lanes.excitation import excitation, tones
+from hil.lanes.setup import bare_setup
+from hil.screen.choices import operating_strokes
+from hil.studies.margins.loop import Loop, agreement, over_changed_plants
+from hil.studies.margins.measured import at_point, measure
+from pkxyz_ctrl.config.bus import BusConfig
+from pkxyz_ctrl.config.controller import ControllerConfig
+from pkxyz_ctrl.config.files import load
 from pkxyz_ctrl.design.law import design_law
-from pkxyz_ctrl.design.margins import Margins
-from pkxyz_ctrl.design.tolerances import Tolerances
+from pkxyz_ctrl.design.margins.margins import Margins
+from pkxyz_ctrl.design.margins.tolerances import Tolerances
 from pkxyz_ctrl.stage import Stage
 
 PEAK_S, DISK, CHANGED = 2.0, 0.6, 3.0

@@ -4,12 +4,12 @@ from functools import partial
 
 import numpy as np
 
-from hil.bench.closed_loop import scan
 from hil.bench.figure import Figure, calls, once, times_of
-from hil.bench.played import Played, PlayedPort, TimedPort, recorded_frames
-from hil.clock import Lockstep
-from hil.frame_time import frame_duration_ns
-from hil.wire import Wire
+from hil.bench.rigs.closed_loop import scan
+from hil.bench.rigs.played import Played, PlayedPort, TimedPort, recorded_frames
+from hil.bus.clock import Lockstep
+from hil.bus.frame_time import frame_duration_ns
+from hil.bus.wire import Wire
 from pkxyz_ctrl.can import cob_id
 from pkxyz_ctrl.can.codec import ProcessCodec
 from pkxyz_ctrl.can.driver import AmplifierDriver

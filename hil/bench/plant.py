@@ -2,10 +2,10 @@
 
 import numpy as np
 
-from hil.bench.closed_loop import scan
 from hil.bench.figure import Figure, repeated
-from hil.bench.kernels import replay_plant
-from hil.bench.reference_motion import reference_motion
+from hil.bench.rigs.closed_loop import scan
+from hil.bench.rigs.kernels import replay_plant
+from hil.bench.rigs.reference_motion import reference_motion
 
 PM = 1e-12
 REPEATS = 11

@@ -2,10 +2,10 @@
 
 from typing import Any
 
-from hil import lanes
 from hil.bench.figure import Direction, Figure
-from hil.metrics import Metrics
-from hil.scenario import load_scenario
+from hil.lanes import either as lanes
+from hil.runs.metrics import Metrics
+from hil.runs.scenario import load_scenario
 
 RMS_NM, HOLD_NM, MILD = 5.0, 2.0, 3.0
 """Bounds on the nominal plant, each axis, and how much more the mild plant may have."""

@@ -11,7 +11,7 @@ from collections import Counter
 from pathlib import Path
 
 from hil.bench.figure import Figure
-from hil.run_folder import PICTURE
+from hil.runs.run_folder import PICTURE
 
 REPEATS = 3
 _COMMAND = "from hil.cli import main; main()"

@@ -7,12 +7,12 @@ import statistics
 import time
 
 from hil.bench.figure import Figure
-from hil.montecarlo import Study, run_one
-from hil.scenario import load_scenario
-from hil.search import evaluate, load_problem
-from hil.workers import as_done, given, hands
-from pkxyz_ctrl.config import load
-from pkxyz_ctrl.design.tolerances import Tolerances
+from hil.runs.scenario import load_scenario
+from hil.studies.montecarlo import Study, run_one
+from hil.studies.spread.workers import as_done, given, hands
+from hil.studies.tune.search import evaluate, load_problem
+from pkxyz_ctrl.config.files import load
+from pkxyz_ctrl.design.margins.tolerances import Tolerances
 
 WORKERS = 2
 ROUNDS = 5

@@ -8,8 +8,8 @@ from typing import Any
 
 from hil.bench import control, lanes, learning, limits, margins, parts, plant, quality, startup, study, tick
 from hil.bench.figure import Figure
-from hil.versions import versions
-from pkxyz_ctrl.config import ConfigError
+from hil.runs.versions import versions
+from pkxyz_ctrl.config.files import ConfigError
 
 Measurement = Callable[[], list[Figure]]
 

@@ -4,7 +4,7 @@ import random
 from collections.abc import Callable
 from typing import NamedTuple
 
-from hil.frame_time import frame_bit_counts
+from hil.bus.frame_time import frame_bit_counts
 from pkxyz_ctrl.can.frame import Frame
 
 

@@ -6,11 +6,11 @@ from enum import IntEnum
 from heapq import heappush
 from typing import TYPE_CHECKING
 
-from hil.frame_time import FrameFormatError, frame_duration_ns
+from hil.bus.frame_time import FrameFormatError, frame_duration_ns
 from pkxyz_ctrl.can.frame import Frame
 
 if TYPE_CHECKING:
-    from hil.wire import Wire
+    from hil.bus.wire import Wire
 
 
 class ErrorState(IntEnum):

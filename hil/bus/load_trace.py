@@ -7,7 +7,7 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from hil.frame_time import frame_duration_ns
+from hil.bus.frame_time import frame_duration_ns
 from pkxyz_ctrl.can.cob_id import SYNC
 from pkxyz_ctrl.can.frame import Frame
 

@@ -2,7 +2,7 @@
 
 from weakref import WeakValueDictionary
 
-from hil.wire import Wire
+from hil.bus.wire import Wire
 
 _by_channel: "WeakValueDictionary[str, Wire]" = WeakValueDictionary()
 

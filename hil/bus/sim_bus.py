@@ -18,11 +18,11 @@ from can.broadcastmanager import (
     RestartableCyclicTaskABC,
 )
 
-from hil.clock import Lockstep
-from hil.endpoint import ErrorState
-from hil.frame_time import FrameFormatError
-from hil.published_wires import find_wire, publish
-from hil.wire import Wire
+from hil.bus.clock import Lockstep
+from hil.bus.endpoint import ErrorState
+from hil.bus.frame_time import FrameFormatError
+from hil.bus.published_wires import find_wire, publish
+from hil.bus.wire import Wire
 from pkxyz_ctrl.can.frame import Frame
 from pkxyz_ctrl.io.can_port import to_frame
 

@@ -11,12 +11,12 @@ from functools import partial
 from heapq import heapify, heappop
 from typing import NamedTuple
 
-from hil.clock import Lockstep
-from hil.disturbance import Disturbance
-from hil.endpoint import Endpoint, Entry, Listener, dominance
-from hil.frame_time import INTERFRAME_BITS, duration_ns_kernel
+from hil.bus.clock import Lockstep
+from hil.bus.disturbance import Disturbance
+from hil.bus.endpoint import Endpoint, Entry, Listener, dominance
+from hil.bus.frame_time import INTERFRAME_BITS, duration_ns_kernel
 from pkxyz_ctrl.can.frame import Frame
-from pkxyz_ctrl.direct_call import direct
+from pkxyz_ctrl.compiled.direct_call import direct
 
 ERROR_DELIMITER_BITS = 8  # the error flags themselves, 6 + 1 bits, lie where the frame's EOF would have been
 SUSPEND_BITS = 8  # an error-passive sender waits so long after its own frame

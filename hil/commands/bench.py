@@ -58,7 +58,7 @@ def measure_all(only: list[str], *, quiet: bool) -> "list[Figure]":
 
 
 def _say_if_compiling(*, quiet: bool) -> None:
-    from hil.bench.kernels import replay_cycle
+    from hil.bench.rigs.kernels import replay_cycle
 
     cache = getattr(replay_cycle, "_cache", None)  # absent when the compiler is switched off
     if not quiet and cache is not None and not any(Path(cache.cache_path).glob("kernels.replay_cycle-*.nbi")):

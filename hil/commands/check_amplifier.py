@@ -10,13 +10,13 @@ import typer
 from rich.console import Console
 from rich.markup import escape
 
-from hil.outputs import folder_to_write, writing
-from pkxyz_ctrl.config import CONFIG_DIR, load
+from hil.screen.outputs import folder_to_write, writing
+from pkxyz_ctrl.config.files import CONFIG_DIR, load
 
 if TYPE_CHECKING:
     from hil.conformance.talker import Talker
     from hil.conformance.verdict import Line
-    from pkxyz_ctrl.bus_config import BusConfig
+    from pkxyz_ctrl.config.bus import BusConfig
 
 _screen = Console(highlight=False)
 _COLOURS = {"PASS": "green", "FAIL": "bold red", "NOT TESTED": "dim"}
@@ -34,7 +34,7 @@ def check_amplifier(
     """Conformance run for a CANopen amplifier; exit code 0 if no line fails, 1 if one does."""
     from hil.conformance import report
     from hil.conformance.run import run_all
-    from pkxyz_ctrl.bus_config import BusConfig
+    from pkxyz_ctrl.config.bus import BusConfig
 
     config = load("buses", bus, BusConfig)
     path = eds if eds is not None else CONFIG_DIR / "comb_amplifier.eds"

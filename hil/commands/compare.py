@@ -8,14 +8,14 @@ import typer
 from rich.console import Console
 from rich.table import Table
 
-from hil.choices import Lane
-from hil.first_run import say_if_compiling
-from hil.outputs import picture_to_write
-from hil.progress import progress_bar
-from hil.tables import print_whole
+from hil.screen.choices import Lane
+from hil.screen.first_run import say_if_compiling
+from hil.screen.outputs import picture_to_write
+from hil.screen.progress import progress_bar
+from hil.screen.tables import print_whole
 
 if TYPE_CHECKING:
-    from hil.compare import Compared
+    from hil.studies.compare import Compared
 
 _screen = Console(highlight=False)
 
@@ -35,9 +35,9 @@ def compare(
     as_json: Annotated[bool, typer.Option("--json", help="Print JSON, and nothing else.")] = False,
 ) -> None:
     """Run all laws on one scenario and plant. Exit code 0 if each ran without a fault, 1 if not, 2 for bad input."""
-    from hil.compare import DEFAULT
-    from hil.compare import compare as run_all
-    from hil.compare_figure import draw
+    from hil.pictures.compare import draw
+    from hil.studies.compare import DEFAULT
+    from hil.studies.compare import compare as run_all
 
     picture_to_write(out, "--out")
     say_if_compiling(quiet=as_json)

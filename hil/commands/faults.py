@@ -10,14 +10,14 @@ import typer
 from rich.console import Console
 from rich.table import Table
 
-from hil.first_run import say_if_compiling
-from hil.outputs import folder_to_write, writing
-from hil.processes import processes
-from pkxyz_ctrl.config import ConfigError, names
+from hil.screen.first_run import say_if_compiling
+from hil.screen.outputs import folder_to_write, writing
+from hil.studies.spread.processes import processes
+from pkxyz_ctrl.config.files import ConfigError, names
 
 if TYPE_CHECKING:
-    from hil.faults.matrix import Case
-    from hil.faults.outcome import Outcome
+    from hil.studies.faults.matrix import Case
+    from hil.studies.faults.outcome import Outcome
 
 _screen = Console(highlight=False)
 _notes = Console(stderr=True, highlight=False)
@@ -43,8 +43,8 @@ def faults(
 
     Exit code 0 if every bound held, 1 if not, 2 for bad input, 130 if interrupted (laws that are through are kept).
     """
-    from hil.faults.matrix import CASES
-    from hil.faults.outcome import as_json as plain
+    from hil.studies.faults.matrix import CASES
+    from hil.studies.faults.outcome import as_json as plain
 
     laws = law or names("controllers")
     cases = [case for case in CASES if not only or any(text in case.text for text in only)]
@@ -67,7 +67,7 @@ def faults(
         "outcomes": [plain(o) for o in outcomes],
     }  # fmt: skip
     if out is not None:
-        from hil.faults.picture import draw
+        from hil.pictures.faults import draw
 
         with writing(out):
             (out / "faults.json").write_text(json.dumps(result, indent=1) + "\n", encoding="utf-8")
@@ -128,8 +128,8 @@ def _over_processes(
 
 
 def _run_chunk(law: str, cases: "list[Case]") -> "list[Outcome] | str":
-    from hil.faults.outcome import run_case, setup_for
-    from pkxyz_ctrl.design.design_error import DesignError
+    from hil.studies.faults.outcome import run_case, setup_for
+    from pkxyz_ctrl.design.model.design_error import DesignError
 
     try:
         setup = setup_for(law)

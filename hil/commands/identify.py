@@ -8,16 +8,16 @@ import typer
 from rich.console import Console
 from rich.table import Table
 
-from hil.choices import Lane, Tones, operating_strokes
-from hil.first_run import say_if_compiling
-from hil.one_line_errors import one_line_errors
-from hil.outputs import folder_to_write, writing
-from hil.progress import progress_bar
-from hil.tables import print_whole
-from pkxyz_ctrl.config import ConfigError, find, load
+from hil.screen.choices import Lane, Tones, operating_strokes
+from hil.screen.errors import one_line_errors
+from hil.screen.first_run import say_if_compiling
+from hil.screen.outputs import folder_to_write, writing
+from hil.screen.progress import progress_bar
+from hil.screen.tables import print_whole
+from pkxyz_ctrl.config.files import ConfigError, find, load
 
 if TYPE_CHECKING:
-    from hil.identification import Identification
+    from hil.studies.identify.identification import Identification
 
 _screen = Console(highlight=False)
 
@@ -65,12 +65,12 @@ def identify(
     """
     from dataclasses import replace
 
-    from hil.identification import as_data
-    from hil.identification import identify as identified
-    from hil.outside_scale import outside_scale, read_points
-    from hil.setup import bare_setup
-    from pkxyz_ctrl.bus_config import BusConfig
-    from pkxyz_ctrl.controller_config import ControllerConfig
+    from hil.lanes.setup import bare_setup
+    from hil.studies.identify.identification import as_data
+    from hil.studies.identify.identification import identify as identified
+    from hil.studies.identify.outside_scale import outside_scale, read_points
+    from pkxyz_ctrl.config.bus import BusConfig
+    from pkxyz_ctrl.config.controller import ControllerConfig
     from pkxyz_ctrl.stage import Stage
 
     on_bus, config = load("buses", bus, BusConfig), load("controllers", controller, ControllerConfig)
@@ -106,10 +106,10 @@ def identify(
 
 
 def _write(out: Path | None, found: "Identification", data: dict[str, Any], stage: Path) -> Path:
-    from hil.calibrated_stage import write_calibrated_stage
-    from hil.identification import response_csv
-    from hil.identify_figures import draw_response
-    from hil.run_folder import next_free
+    from hil.pictures.identify import draw_response
+    from hil.runs.run_folder import next_free
+    from hil.studies.identify.calibrated_stage import write_calibrated_stage
+    from hil.studies.identify.identification import response_csv
 
     folder = folder_to_write(out or next_free(Path("runs"), f"identify_{found.setup.plant.name}", found.lane))
     with writing(folder):

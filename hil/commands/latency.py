@@ -6,7 +6,7 @@ from typing import Annotated, Any
 
 import typer
 
-from hil.outputs import picture_to_write
+from hil.screen.outputs import picture_to_write
 
 
 def latency(
@@ -17,7 +17,7 @@ def latency(
     as_json: Annotated[bool, typer.Option("--json", help="Print JSON with the histograms, and nothing else.")] = False,
 ) -> None:
     """Run the controller at rate without a bus and show its lateness, beside cyclictest's if that is installed."""
-    from hil.latency import measure
+    from hil.studies.latency import measure
 
     if out is not None:
         picture_to_write(out, "--out")
@@ -59,7 +59,7 @@ def _draw(measured: Any, out: Path) -> None:
     from matplotlib.backends.backend_agg import FigureCanvasAgg
     from matplotlib.figure import Figure
 
-    from hil.wall_figure import draw_lateness
+    from hil.pictures.wall import draw_lateness
 
     figure = Figure(figsize=(11, 5), dpi=120, facecolor="white", layout="constrained")
     FigureCanvasAgg(figure)

@@ -9,20 +9,20 @@ import typer
 from rich.console import Console
 from rich.table import Table
 
-from hil.choices import Lane, Tones, operating_strokes
-from hil.first_run import say_if_compiling
-from hil.one_line_errors import one_line_errors
-from hil.outputs import folder_to_write, writing
-from hil.progress import progress_bar
-from hil.tables import print_whole
-from pkxyz_ctrl.config import ConfigError, load
+from hil.screen.choices import Lane, Tones, operating_strokes
+from hil.screen.errors import one_line_errors
+from hil.screen.first_run import say_if_compiling
+from hil.screen.outputs import folder_to_write, writing
+from hil.screen.progress import progress_bar
+from hil.screen.tables import print_whole
+from pkxyz_ctrl.config.files import ConfigError, load
 
 if TYPE_CHECKING:
     from collections.abc import Callable
 
-    from hil.loop_margins import Agreement, ChangedPlants, Loop
-    from hil.measured_loop import MeasuredLoop
-    from pkxyz_ctrl.design.margins import Margins, Sensitivities
+    from hil.studies.margins.loop import Agreement, ChangedPlants, Loop
+    from hil.studies.margins.measured import MeasuredLoop
+    from pkxyz_ctrl.design.margins.margins import Margins, Sensitivities
 
 _screen = Console(highlight=False)
 
@@ -54,11 +54,11 @@ def margins(
     Exit code 0 if every loop is stable and, on the nominal plant, what was measured agrees with what was computed; 1 if
     not; 2 for bad input.
     """
-    from hil.loop_margins import Loop, agreement, as_data, over_changed_plants
-    from pkxyz_ctrl.bus_config import BusConfig
-    from pkxyz_ctrl.controller_config import ControllerConfig
+    from hil.studies.margins.loop import Loop, agreement, as_data, over_changed_plants
+    from pkxyz_ctrl.config.bus import BusConfig
+    from pkxyz_ctrl.config.controller import ControllerConfig
     from pkxyz_ctrl.design.law import design_law
-    from pkxyz_ctrl.design.tolerances import Tolerances
+    from pkxyz_ctrl.design.margins.tolerances import Tolerances
     from pkxyz_ctrl.stage import Stage
 
     device, on_bus = Stage.load(stage), load("buses", bus, BusConfig)
@@ -109,9 +109,9 @@ def _measure(
     stage: str, plant: str, config: Any, bus: Any, strokes: Any, lane: Lane, kind: Tones, amplitude_nm: float,
     periods: int, seed: int, tell: "Callable[[int, int], None]",
 ) -> "MeasuredLoop":  # fmt: skip
-    from hil.excitation import excitation, tones
-    from hil.measured_loop import at_point, measure
-    from hil.setup import bare_setup
+    from hil.lanes.excitation import excitation, tones
+    from hil.lanes.setup import bare_setup
+    from hil.studies.margins.measured import at_point, measure
 
     if lane is Lane.LOCKSTEP and bus.can is None:
         raise ConfigError(f"bus {bus.name!r} has no [can] and carries no frames; measure with --lane fast")
@@ -143,7 +143,7 @@ def _write(
 ) -> None:  # fmt: skip
     import numpy as np
 
-    from hil.margins_figures import draw_bode, draw_nyquist
+    from hil.pictures.margins import draw_bode, draw_nyquist
 
     with writing(out):
         (out / "margins.json").write_text(json.dumps(data, indent=2, allow_nan=False) + "\n", encoding="utf-8")

@@ -16,8 +16,8 @@ from rich.console import Console
 from rich.markup import escape
 from rich.table import Table
 
-from hil.outputs import folder_to_write, picture_to_write
-from pkxyz_ctrl.config import ConfigError, load, require_finite
+from hil.screen.outputs import folder_to_write, picture_to_write
+from pkxyz_ctrl.config.files import ConfigError, load, require_finite
 
 if TYPE_CHECKING:
     from pkxyz_ctrl.mechanics.reproduction import Row
@@ -35,7 +35,7 @@ OutFolder = Annotated[Path | None, typer.Option(help="Folder for the pictures; n
 
 @contextmanager
 def _one_line_errors() -> Iterator[None]:
-    from pkxyz_ctrl.mechanics.errors import GeometryError, InfeasibleDesignError
+    from pkxyz_ctrl.elements.errors import GeometryError, InfeasibleDesignError
     from pkxyz_ctrl.stage import StageDomainError
 
     try:
@@ -53,8 +53,8 @@ def paper(as_json: AsJson = False, out: OutFolder = None) -> None:
     stages = {name: Stage.load(name) for name in ("printed", "reconstructed")}
     rows = reproduction_table(entries(), stages["printed"], stages["reconstructed"])
     if out is not None:
-        from hil.mechanics_figures import draw_design_space, draw_modes
-        from hil.workspace_figures import draw_edge_path, draw_workspace
+        from hil.pictures.mechanics import draw_design_space, draw_modes
+        from hil.pictures.workspace import draw_edge_path, draw_workspace
 
         folder, stage = folder_to_write(out), stages["reconstructed"]
         draw_design_space(stages, folder / "figure_4_design_space.png")
@@ -140,7 +140,7 @@ def workspace(
             },
         }
         if out is not None:
-            from hil.workspace_figures import draw_workspace
+            from hil.pictures.workspace import draw_workspace
 
             draw_workspace(device, limit, folder_to_write(out) / "workspace.png")
     if as_json:
@@ -221,10 +221,10 @@ def design(
     """Dimensions from requirements (the paper's section IV), written as a stage file that `pkxyz sil --stage`
     runs.
     """
-    from hil.stage_file import require_replaceable, write_stage_file
-    from pkxyz_ctrl.mechanics.combs import voltage_for_force_v
+    from hil.studies.designed_stage import require_replaceable, write_stage_file
+    from pkxyz_ctrl.config.stage import StageConfig
+    from pkxyz_ctrl.elements.combs import voltage_for_force_v
     from pkxyz_ctrl.mechanics.selection import Requirements, select
-    from pkxyz_ctrl.stage_config import StageConfig
 
     template = load("stages", stage, StageConfig)
     if chains not in (1, 3):
@@ -258,7 +258,7 @@ def design(
         chosen = select(need, template, name=out.stem)
     write_stage_file(chosen, need, out)
     if picture is not None:
-        from hil.mechanics_figures import draw_selection
+        from hil.pictures.mechanics import draw_selection
 
         draw_selection(chosen, picture)
     _report_design(chosen, out, as_json)
@@ -326,7 +326,7 @@ def linearisation(
     }
     worst = {k: dict(zip("xyz", (np.abs(e).max(axis=0) * 1e9).tolist(), strict=True)) for k, e in kinds.items()}
     if out is not None:
-        from hil.mechanics_figures import draw_linearisation
+        from hil.pictures.mechanics import draw_linearisation
 
         draw_linearisation(study, device.config.name, folder_to_write(out) / "linearisation.png")
     if as_json:

@@ -9,10 +9,10 @@ import typer
 from rich.console import Console
 from rich.table import Table
 
-from hil.first_run import say_if_compiling
-from hil.outputs import folder_to_write
-from hil.progress import progress_bar
-from hil.tables import print_whole
+from hil.screen.first_run import say_if_compiling
+from hil.screen.outputs import folder_to_write
+from hil.screen.progress import progress_bar
+from hil.screen.tables import print_whole
 
 _screen = Console(highlight=False)
 
@@ -42,11 +42,11 @@ def montecarlo(
 
     Exit code 0 if every loop held, 1 if one did not, 2 for bad input, 130 if interrupted (what is done is kept).
     """
-    from hil.montecarlo import Results, Study, draw, run_study, summary
-    from hil.scenario import load_scenario
-    from hil.workers import cores
-    from pkxyz_ctrl.config import load
-    from pkxyz_ctrl.design.tolerances import Tolerances
+    from hil.runs.scenario import load_scenario
+    from hil.studies.montecarlo import Results, Study, draw, run_study, summary
+    from hil.studies.spread.workers import cores
+    from pkxyz_ctrl.config.files import load
+    from pkxyz_ctrl.design.margins.tolerances import Tolerances
 
     loaded = load_scenario(scenario, controller=controller, stage=stage, plant=plant, bus=bus)
     study = Study(loaded, load("tolerances", tolerances, Tolerances))
@@ -79,9 +79,9 @@ def montecarlo(
 
 def _replay(study: Any, seed: int, out: Path, *, as_json: bool) -> None:
     """One plant with everything a run leaves; the figures are those of the study, bit for bit."""
-    from hil.montecarlo import run_one
-    from hil.run_folder import RunFolder
-    from hil.sil import draw, run_into
+    from hil.runs.in_process import draw, run_into
+    from hil.runs.run_folder import RunFolder
+    from hil.studies.montecarlo import run_one
 
     scenario = study.drawn(seed)
     folder = RunFolder(out / f"seed-{seed}")

@@ -12,8 +12,8 @@ from rich.console import Console
 from rich.table import Table
 
 if TYPE_CHECKING:
-    from hil.replay import Replay
-    from pkxyz_ctrl.controller_config import ControllerConfig
+    from hil.runs.replay import Replay
+    from pkxyz_ctrl.config.controller import ControllerConfig
 
 _screen = Console(highlight=False)
 _notes = Console(stderr=True, highlight=False)
@@ -28,11 +28,11 @@ def replay(
     as_json: Annotated[bool, typer.Option("--json", help="Print JSON, and nothing else.")] = False,
 ) -> None:
     """Put a recording through the tick again; exit code 0 if it agrees in every bit, 1 if not, 2 for bad input."""
-    from hil.recording import RecordingError
-    from hil.run_folder import RECORDING
-    from pkxyz_ctrl.config import load
-    from pkxyz_ctrl.controller_config import ControllerConfig
-    from pkxyz_ctrl.design.design_error import DesignError
+    from hil.recording.recording import RecordingError
+    from hil.runs.run_folder import RECORDING
+    from pkxyz_ctrl.config.controller import ControllerConfig
+    from pkxyz_ctrl.config.files import load
+    from pkxyz_ctrl.design.model.design_error import DesignError
 
     other = None if controller is None else load("controllers", controller, ControllerConfig)
     try:
@@ -48,7 +48,7 @@ def replay(
 
 
 def _with_progress(path: Path, controller: "ControllerConfig | None", *, quiet: bool) -> "Replay":
-    from hil.replay import replay as played
+    from hil.runs.replay import replay as played
 
     if quiet or not _notes.is_terminal:
         return played(path, controller)

@@ -7,8 +7,8 @@ from typing import Annotated, Any
 
 import typer
 
-from hil.first_run import say_if_compiling
-from pkxyz_ctrl.config import ConfigError
+from hil.screen.first_run import say_if_compiling
+from pkxyz_ctrl.config.files import ConfigError
 
 Scenario = Annotated[str, typer.Argument(help="A shipped scenario's name or a TOML file.")]
 Bus = Annotated[
@@ -45,11 +45,11 @@ def run(
 
     Ctrl-C, SIGTERM and errors leave the combs at 0 V. Errors of position are those of the estimate.
     """
-    from hil.recording import RecordingError
-    from hil.run_folder import RunFolder, next_free
-    from hil.wall import LANE, require_real_bus, run_into
-    from pkxyz_ctrl.controller import StartUpError
-    from pkxyz_ctrl.design.design_error import DesignError
+    from hil.lanes.wall import LANE, require_real_bus, run_into
+    from hil.recording.recording import RecordingError
+    from hil.runs.run_folder import RunFolder, next_free
+    from pkxyz_ctrl.design.model.design_error import DesignError
+    from pkxyz_ctrl.loop.controller import StartUpError
 
     learning = learning_of(learn, replay, refresh)
     loaded = _load(scenario, duration_s, stage=stage, controller=controller, bus=bus, learning=learning)
@@ -59,12 +59,12 @@ def run(
     try:
         summary, result = run_into(folder, loaded, _tell)
         if summary["ticks"]:
-            from hil.wall_figure import draw_wall
+            from hil.pictures.wall import draw_wall
 
             with folder.in_one_line():
                 draw_wall(folder.recording, summary, result.lateness_us, folder.picture)
                 if summary.get("learning_factor") is not None:
-                    from hil.learning_figure import draw_learning
+                    from hil.pictures.learning import draw_learning
 
                     draw_learning(folder.recording, summary, folder.learning_picture)
     except RecordingError as error:
@@ -90,14 +90,14 @@ def plant(
     stage: Annotated[str | None, typer.Option(help="Name or file, instead of the scenario's.")] = None,
     seed: Annotated[int | None, typer.Option(help="Instead of the scenario's.")] = None,
     truth: Annotated[
-        Path | None, typer.Option(help="File for the truth at each sample, as rows of hil.wall_plant.TRUTH.")
+        Path | None, typer.Option(help="File for the truth at each sample, as rows of hil.lanes.wall_plant.TRUTH.")
     ] = None,
     as_json: Annotated[bool, typer.Option("--json", help="Print each change as a line of JSON.")] = False,
 ) -> None:
     """Serve amplifier node and plant on a bus until Ctrl-C or SIGTERM."""
-    from hil.ending import Ended, Ending
-    from hil.wall import require_real_bus
-    from hil.wall_plant import WallPlant, WitnessedPlant
+    from hil.lanes.ending import Ended, Ending
+    from hil.lanes.wall import require_real_bus
+    from hil.lanes.wall_plant import WallPlant, WitnessedPlant
     from pkxyz_ctrl.io.can_port import open_bus
     from pkxyz_ctrl.io.realtime import go_real_time, settle_memory
 
@@ -139,7 +139,7 @@ def learning_of(learn: bool, replay: str | None, refresh: str | None) -> dict[st
 
 def _met(scenario: str, **instead: Any) -> Any:
     """The scenario on the bus that was given, else on its own, unless that is simulated and ends with its process."""
-    from hil.scenario import load_scenario
+    from hil.runs.scenario import load_scenario
 
     loaded = load_scenario(scenario, **instead)
     can_config = loaded.bus.can

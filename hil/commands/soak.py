@@ -9,10 +9,10 @@ from typing import Annotated
 import typer
 from rich.console import Console
 
-from hil.first_run import say_if_compiling
-from hil.outputs import folder_to_write, writing
-from hil.progress import progress_bar
-from pkxyz_ctrl.config import ConfigError
+from hil.screen.first_run import say_if_compiling
+from hil.screen.outputs import folder_to_write, writing
+from hil.screen.progress import progress_bar
+from pkxyz_ctrl.config.files import ConfigError
 
 _screen = Console(highlight=False)
 
@@ -31,8 +31,8 @@ def soak(
 
     Exit code 0 if not, 1 if so, 2 for bad input. Some minutes for half an hour.
     """
-    from hil import soak as soaking
-    from hil.recording import RecordingError
+    from hil.recording.recording import RecordingError
+    from hil.studies import soak as soaking
 
     if keep and out is None:
         raise ConfigError("--keep: needs --out, the folder to keep the recordings in")
@@ -43,7 +43,7 @@ def soak(
             with progress_bar("soak", quiet=as_json) as tell:
                 soaked = soaking.soak(60.0 * minutes, seed, law, folder, keep=keep, on_progress=tell)
             if out is not None:
-                from hil.soak_figure import draw_soak
+                from hil.pictures.soak import draw_soak
 
                 text = json.dumps(soaking.as_json(soaked), indent=1) + "\n"
                 (out / "soak.json").write_text(text, encoding="utf-8")

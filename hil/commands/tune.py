@@ -8,9 +8,9 @@ import typer
 from rich.console import Console
 from rich.table import Table
 
-from hil.first_run import say_if_compiling
-from hil.outputs import folder_to_write
-from hil.progress import progress_bar
+from hil.screen.first_run import say_if_compiling
+from hil.screen.outputs import folder_to_write
+from hil.screen.progress import progress_bar
 
 _screen = Console(highlight=False)
 
@@ -34,10 +34,10 @@ def tune(
     Call it again to go on. Exit code 0 if numbers were found that keep every constraint, 1 if not, 2 for bad input,
     130 if interrupted (what is done is kept).
     """
-    from hil.search import load_problem
-    from hil.tuning import best, draw, judged, nearest, open_study, write_controller
-    from hil.tuning import search as run_search
-    from hil.workers import cores
+    from hil.studies.spread.workers import cores
+    from hil.studies.tune.search import load_problem
+    from hil.studies.tune.tuning import best, draw, judged, nearest, open_study, write_controller
+    from hil.studies.tune.tuning import search as run_search
 
     problem = load_problem(search)
     folder_to_write(out)

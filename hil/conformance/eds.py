@@ -5,7 +5,7 @@ from pathlib import Path
 
 import canopen
 
-from pkxyz_ctrl.config import ConfigError
+from pkxyz_ctrl.config.files import ConfigError
 
 _BYTES = {0x01: 1, 0x02: 1, 0x03: 2, 0x04: 4, 0x05: 1, 0x06: 2, 0x07: 4, 0x08: 4, 0x11: 8, 0x15: 8, 0x1B: 8}
 _SIGNED = (0x02, 0x03, 0x04, 0x15)  # CiA 301, 7.4.7.1

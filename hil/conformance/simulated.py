@@ -2,16 +2,16 @@
 
 from pathlib import Path
 
-from hil.clock import Lockstep
+from hil.bus.clock import Lockstep
+from hil.bus.wire import Wire
 from hil.conformance.eds import read_eds
 from hil.conformance.talker import SAMPLE_CYCLES, Talker
-from hil.lockstep import WirePort
-from hil.node import AmplifierNode
-from hil.node_sense import Plant
-from hil.plant_on_bus import PlantOnBus
-from hil.wire import Wire
-from pkxyz_ctrl.bus_config import BusConfig
-from pkxyz_ctrl.config import CONFIG_DIR, ConfigError, load
+from hil.lanes.lockstep import WirePort
+from hil.node.amplifier import AmplifierNode
+from hil.node.sense import Plant
+from hil.plant.on_bus import PlantOnBus
+from pkxyz_ctrl.config.bus import BusConfig
+from pkxyz_ctrl.config.files import CONFIG_DIR, ConfigError, load
 from sim.config import Device, PlantConfig
 from sim.plant import Plant as SimulatedPlant
 

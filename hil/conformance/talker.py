@@ -6,14 +6,14 @@ from hil.conformance import sdo_client
 from hil.conformance.eds import Variable
 from hil.conformance.sdo_client import Outcome
 from hil.conformance.verdict import DeviationError
-from pkxyz_ctrl.bus_config import BusConfig
 from pkxyz_ctrl.can import cob_id
 from pkxyz_ctrl.can.cob_id import NmtCommand
 from pkxyz_ctrl.can.codec import Counts, ProcessCodec
 from pkxyz_ctrl.can.frame import Frame
 from pkxyz_ctrl.can.startup import configuration_steps
-from pkxyz_ctrl.config import ConfigError
-from pkxyz_ctrl.runtime import Clock, Port
+from pkxyz_ctrl.config.bus import BusConfig
+from pkxyz_ctrl.config.files import ConfigError
+from pkxyz_ctrl.loop.runtime import Clock, Port
 
 SETTLE_US = 5_000  # for a node to take note of a command; also longer than the usual EMCY inhibit time
 ZERO: Counts = (0, 0, 0)

@@ -2,7 +2,7 @@
 
 from collections.abc import Sequence
 
-from hil.clock import Lockstep
+from hil.bus.clock import Lockstep
 from hil.faults.fault import Fault
 
 

@@ -10,7 +10,7 @@ from typing import Annotated, Self
 from pydantic import Field, ValidationError, model_validator
 
 from hil.faults.catalogue import KINDS, refusal
-from pkxyz_ctrl.config import ConfigError, FrozenModel
+from pkxyz_ctrl.config.files import ConfigError, FrozenModel
 
 SYNTAX = "TARGET:KIND@SECONDS[+DURATION][,NAME=VALUE...], such as sense.2:stuck@0.3+0.05"
 _TEXT = re.compile(

@@ -7,12 +7,12 @@ from hil.faults.clock import FaultyClock
 from hil.faults.fault import Fault
 from hil.faults.plant import FAMILIES, FaultyPlant
 from hil.faults.wire import WireFaults
-from hil.plant_on_bus import PlantOnBus
+from hil.plant.on_bus import PlantOnBus
 from pkxyz_ctrl.safety.modes import Mode
 
 if TYPE_CHECKING:
-    from hil.lockstep import LockstepRig
-    from hil.setup import Setup
+    from hil.lanes.lockstep import LockstepRig
+    from hil.lanes.setup import Setup
 
 _LOOK_US = 1_000  # how often the combs are looked at while nobody controls them
 

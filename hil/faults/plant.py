@@ -6,8 +6,8 @@ from collections import deque
 from collections.abc import Callable, Sequence
 
 from hil.faults.fault import Fault
-from hil.plant_on_bus import PlantOnBus
-from pkxyz_ctrl.bus_config import BusConfig
+from hil.plant.on_bus import PlantOnBus
+from pkxyz_ctrl.config.bus import BusConfig
 from sim.plant import Plant
 
 FAMILIES = ("sense", "amplifier", "plant")

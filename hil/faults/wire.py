@@ -3,12 +3,12 @@
 import random
 from collections.abc import Callable, Sequence
 
-from hil.clock import Lockstep
-from hil.disturbance import CORRUPTED, DROPPED, Outcome
-from hil.endpoint import Endpoint
+from hil.bus.clock import Lockstep
+from hil.bus.disturbance import CORRUPTED, DROPPED, Outcome
+from hil.bus.endpoint import Endpoint
+from hil.bus.wire import Wire
 from hil.faults.fault import Fault
-from hil.node import AmplifierNode
-from hil.wire import Wire
+from hil.node.amplifier import AmplifierNode
 from pkxyz_ctrl.can.driver_config import DriverConfig
 from pkxyz_ctrl.can.frame import Frame
 

@@ -9,9 +9,9 @@ from functools import lru_cache
 import numpy as np
 from numpy.typing import NDArray
 
-from hil.excitation import Excitation
+from hil.lanes.excitation import Excitation
 from pkxyz_ctrl.learning import Learner
-from pkxyz_ctrl.row import ROW
+from pkxyz_ctrl.loop.row import ROW
 from pkxyz_ctrl.trajectory import Trajectory
 
 BLOCK_TICKS = 4096

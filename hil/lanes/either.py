@@ -9,14 +9,14 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from hil.blocks import Blocks
-from hil.fast_lane import RunBlock, runner_of
-from hil.frame_time import INTERFRAME_BITS, frame_duration_ns
-from hil.lockstep import LockstepRig
-from hil.setup import Setup
+from hil.bus.frame_time import INTERFRAME_BITS, frame_duration_ns
+from hil.lanes.blocks import Blocks
+from hil.lanes.fast import RunBlock, runner_of
+from hil.lanes.lockstep import LockstepRig
+from hil.lanes.setup import Setup
 from pkxyz_ctrl.can.frame import Frame
-from pkxyz_ctrl.cycle import new_memory
 from pkxyz_ctrl.learning import Learner
+from pkxyz_ctrl.loop.cycle import new_memory
 from pkxyz_ctrl.safety.modes import Mode
 from pkxyz_ctrl.safety.trips import explain
 from sim.plant import Plant

@@ -11,10 +11,10 @@ import numpy as np
 from numba import njit
 from numpy.typing import NDArray
 
-from hil.truth import observe
+from hil.plant.truth import observe
 from pkxyz_ctrl.core.tick import PREDICTIVE
-from pkxyz_ctrl.cycle import cycle
-from pkxyz_ctrl.period import Period, period_of
+from pkxyz_ctrl.loop.cycle import cycle
+from pkxyz_ctrl.loop.period import Period, period_of
 from sim import kernels
 
 Array = NDArray[np.float64]

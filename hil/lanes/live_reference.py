@@ -6,7 +6,7 @@ The same learner as in the lanes, and the same ticks; only that its work is done
 import numpy as np
 from numpy.typing import NDArray
 
-from hil.blocks import PREVIEW_ROWS
+from hil.lanes.blocks import PREVIEW_ROWS
 from pkxyz_ctrl.learning import Learner
 from pkxyz_ctrl.learning.timetable import FADE_TICKS, LEAD_TICKS
 from pkxyz_ctrl.trajectory import Trajectory

@@ -13,24 +13,24 @@ from typing import Final
 import numpy as np
 from numpy.typing import NDArray
 
-from hil.blocks import Blocks
-from hil.clock import Lockstep
-from hil.endpoint import Endpoint
+from hil.bus.clock import Lockstep
+from hil.bus.endpoint import Endpoint
+from hil.bus.frame_log import FrameLog
+from hil.bus.wire import Wire
 from hil.faults.clock import ControllerKilledError
 from hil.faults.injection import Injection, plant_of
-from hil.frame_log import FrameLog
-from hil.node import AmplifierNode
-from hil.plant_on_bus import EXCHANGE
-from hil.setup import Setup
-from hil.truth import TRUTH_BYTES
-from hil.wire import Wire
-from pkxyz_ctrl.bus_config import CanConfig
+from hil.lanes.blocks import Blocks
+from hil.lanes.setup import Setup
+from hil.node.amplifier import AmplifierNode
+from hil.plant.on_bus import EXCHANGE
+from hil.plant.truth import TRUTH_BYTES
 from pkxyz_ctrl.can.cob_id import SYNC
 from pkxyz_ctrl.can.frame import Frame
-from pkxyz_ctrl.config import CONFIG_DIR, ConfigError
-from pkxyz_ctrl.controller import Controller
-from pkxyz_ctrl.row import ROW
-from pkxyz_ctrl.runtime import Clock, Port, run, start
+from pkxyz_ctrl.config.bus import CanConfig
+from pkxyz_ctrl.config.files import CONFIG_DIR, ConfigError
+from pkxyz_ctrl.loop.controller import Controller
+from pkxyz_ctrl.loop.row import ROW
+from pkxyz_ctrl.loop.runtime import Clock, Port, run, start
 
 _ROW_BYTES: Final = ROW.itemsize
 _TRUTH_AT: Final = ROW.itemsize - TRUTH_BYTES

@@ -6,19 +6,19 @@ from functools import cached_property, partial
 import numpy as np
 from numpy.typing import NDArray
 
-from hil.excitation import Excitation
 from hil.faults.fault import Fault
-from pkxyz_ctrl.bus_config import BusConfig
+from hil.lanes.excitation import Excitation
 from pkxyz_ctrl.can.driver_config import OUR_TIMEOUT_MAX_MS
-from pkxyz_ctrl.config import load
-from pkxyz_ctrl.controller_config import ControllerConfig
-from pkxyz_ctrl.drive_limits import count_max, slew_counts
-from pkxyz_ctrl.law_store import law_of
+from pkxyz_ctrl.config.bus import BusConfig
+from pkxyz_ctrl.config.controller import ControllerConfig
+from pkxyz_ctrl.config.files import load
+from pkxyz_ctrl.config.stage import StageConfig
+from pkxyz_ctrl.design.drive_limits import count_max, slew_counts
+from pkxyz_ctrl.design.law_store import law_of
 from pkxyz_ctrl.learning import Learner, LearningConfig, timetable
 from pkxyz_ctrl.learning.store import Stored
 from pkxyz_ctrl.safety.gate import GateConfig
 from pkxyz_ctrl.stage import Stage
-from pkxyz_ctrl.stage_config import StageConfig
 from pkxyz_ctrl.trajectory import Hold, Trajectory
 from pkxyz_ctrl.trajectory.check import DriveLimits, within_limits
 from sim.config import Device, PlantConfig

@@ -3,7 +3,7 @@
 import numpy as np
 from numpy.typing import NDArray
 
-from hil.blocks import PREVIEW_ROWS
+from hil.lanes.blocks import PREVIEW_ROWS
 from pkxyz_ctrl.trajectory import Trajectory
 
 BLOCK_ROWS = 1024

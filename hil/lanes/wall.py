@@ -7,27 +7,27 @@ from typing import Any
 
 import numpy as np
 
-from hil.ending import Ended, Ending
-from hil.learning_run import Learning
-from hil.metrics import Metrics
-from hil.recording import Recording
-from hil.run_folder import RunFolder, metadata_of, summarise
-from hil.scenario import Scenario
-from hil.setup import Setup
-from hil.streamed_reference import StreamedReference
-from hil.wall_learning import LiveReference
-from hil.wall_recorder import WallRecorder
-from pkxyz_ctrl import cycle as cycling
-from pkxyz_ctrl.bus_config import BusConfig, CanConfig
+from hil.lanes.ending import Ended, Ending
+from hil.lanes.live_reference import LiveReference
+from hil.lanes.setup import Setup
+from hil.lanes.streamed_reference import StreamedReference
+from hil.recording.recording import Recording
+from hil.recording.wall_recorder import WallRecorder
+from hil.runs.learning import Learning
+from hil.runs.metrics import Metrics
+from hil.runs.run_folder import RunFolder, metadata_of, summarise
+from hil.runs.scenario import Scenario
 from pkxyz_ctrl.can.frame import Frame
-from pkxyz_ctrl.config import ConfigError
-from pkxyz_ctrl.controller import Controller
+from pkxyz_ctrl.config.bus import BusConfig, CanConfig
+from pkxyz_ctrl.config.files import ConfigError
 from pkxyz_ctrl.io.can_port import CanPort, open_bus
 from pkxyz_ctrl.io.clocks import TickClock, WallClock, percentile_us
 from pkxyz_ctrl.io.realtime import go_real_time, leave_real_time, settle_memory
 from pkxyz_ctrl.learning import Learner
-from pkxyz_ctrl.row import ROW, TRUTH_FIELDS
-from pkxyz_ctrl.runtime import run, start
+from pkxyz_ctrl.loop import cycle as cycling
+from pkxyz_ctrl.loop.controller import Controller
+from pkxyz_ctrl.loop.row import ROW, TRUTH_FIELDS
+from pkxyz_ctrl.loop.runtime import run, start
 from pkxyz_ctrl.safety.gate import GateConfig
 
 LANE = "wall"

@@ -12,16 +12,16 @@ from pathlib import Path
 import can
 import numpy as np
 
-from hil.clock import Lockstep
-from hil.node import AmplifierNode, NmtState
-from hil.plant_on_bus import PlantOnBus
-from hil.setup import Setup
-from hil.truth import TRUTH_BYTES
-from pkxyz_ctrl.bus_config import CanConfig
-from pkxyz_ctrl.config import CONFIG_DIR
+from hil.bus.clock import Lockstep
+from hil.lanes.setup import Setup
+from hil.node.amplifier import AmplifierNode, NmtState
+from hil.plant.on_bus import PlantOnBus
+from hil.plant.truth import TRUTH_BYTES
+from pkxyz_ctrl.config.bus import CanConfig
+from pkxyz_ctrl.config.files import CONFIG_DIR
 from pkxyz_ctrl.io.can_port import CanPort
 from pkxyz_ctrl.io.clocks import WallClock
-from pkxyz_ctrl.row import TRUTH_FIELDS
+from pkxyz_ctrl.loop.row import TRUTH_FIELDS
 from sim.plant import Plant
 
 TRUTH = np.dtype([("t_us", "i8"), *TRUTH_FIELDS, ("sense_count", "i4", (3,))])

@@ -8,15 +8,15 @@ from collections.abc import Callable
 from enum import IntEnum
 from pathlib import Path
 
-from hil.alarm import Alarm, Clock
-from hil.node_drive import Counts, DriveReceiver
-from hil.node_emergency import EmergencyProducer, ErrorCode, FrameErrors
-from hil.node_heartbeat import HeartbeatConsumer, HeartbeatProducer
-from hil.node_objects import NodeObjects
-from hil.node_pdo import PdoParameters
-from hil.node_sense import Plant, SenseTransmitter
-from hil.object_dictionary import ObjectDictionary
-from hil.sdo_server import SdoServer
+from hil.node.alarm import Alarm, Clock
+from hil.node.drive import Counts, DriveReceiver
+from hil.node.emergency import EmergencyProducer, ErrorCode, FrameErrors
+from hil.node.heartbeat import HeartbeatConsumer, HeartbeatProducer
+from hil.node.object_dictionary import ObjectDictionary
+from hil.node.objects import NodeObjects
+from hil.node.pdo import PdoParameters
+from hil.node.sdo_server import SdoServer
+from hil.node.sense import Plant, SenseTransmitter
 from pkxyz_ctrl.can.frame import FD_FAST, UNUSUAL, Frame
 
 BOOT_US = 2_000  # from reset to boot-up message; a small microcontroller takes a few ms

@@ -3,10 +3,10 @@
 import struct
 from collections.abc import Callable
 
-from hil.node_crc import WORDS, crc8h2f, last_byte_table
-from hil.node_emergency import ErrorCode, FrameErrors
-from hil.node_pdo import Layout, PdoParameters
-from hil.object_dictionary import ObjectDictionary
+from hil.node.crc import WORDS, crc8h2f, last_byte_table
+from hil.node.emergency import ErrorCode, FrameErrors
+from hil.node.object_dictionary import ObjectDictionary
+from hil.node.pdo import Layout, PdoParameters
 
 Counts = tuple[int, int, int]
 

@@ -5,8 +5,8 @@ from collections import deque
 from collections.abc import Callable
 from enum import IntEnum
 
-from hil.alarm import Alarm, Clock
-from hil.object_dictionary import ObjectDictionary
+from hil.node.alarm import Alarm, Clock
+from hil.node.object_dictionary import ObjectDictionary
 
 HISTORY_LENGTH = 8
 _WAITING_MAX = 16  # a queue that a flood of errors cannot grow: raise and clear of every code in use here

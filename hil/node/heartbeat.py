@@ -2,7 +2,7 @@
 
 from collections.abc import Callable
 
-from hil.alarm import Alarm, Clock
+from hil.node.alarm import Alarm, Clock
 
 
 class HeartbeatProducer:

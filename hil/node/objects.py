@@ -2,8 +2,8 @@
 
 from collections.abc import Callable
 
-from hil.node_pdo import PdoParameters, check_can_id
-from hil.object_dictionary import Abort, Entry, ObjectDictionary, SdoAbortError
+from hil.node.object_dictionary import Abort, Entry, ObjectDictionary, SdoAbortError
+from hil.node.pdo import PdoParameters, check_can_id
 
 
 class NodeObjects:

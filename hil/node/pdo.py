@@ -8,7 +8,7 @@ import struct
 from dataclasses import dataclass
 from typing import Literal
 
-from hil.object_dictionary import Abort, ObjectDictionary, SdoAbortError
+from hil.node.object_dictionary import Abort, ObjectDictionary, SdoAbortError
 
 COMMUNICATION_BASE = {"receive": 0x1400, "transmit": 0x1800}
 MAPPING_OFFSET = 0x200

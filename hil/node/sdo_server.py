@@ -7,7 +7,7 @@ has one client. What may be read and written is decided by the `Objects` behind 
 import struct
 from typing import Protocol
 
-from hil.object_dictionary import Abort, SdoAbortError
+from hil.node.object_dictionary import Abort, SdoAbortError
 
 _LONGEST_DOWNLOAD = 1024  # bytes; far above any object here, and a bound on what a hostile client can make us keep
 

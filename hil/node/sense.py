@@ -4,11 +4,11 @@ import struct
 from collections.abc import Callable
 from typing import Protocol
 
-from hil.alarm import Alarm, Clock
-from hil.node_crc import WORDS, crc8h2f, last_byte_table
-from hil.node_heartbeat import HeartbeatProducer
-from hil.node_pdo import PdoParameters
-from hil.object_dictionary import ObjectDictionary
+from hil.node.alarm import Alarm, Clock
+from hil.node.crc import WORDS, crc8h2f, last_byte_table
+from hil.node.heartbeat import HeartbeatProducer
+from hil.node.object_dictionary import ObjectDictionary
+from hil.node.pdo import PdoParameters
 
 _pack_protected = struct.Struct("<3hBB").pack
 _INPUT = 0x6401

@@ -8,7 +8,7 @@ from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
 from numpy.typing import NDArray
 
-from hil.compare import Compared
+from hil.studies.compare import Compared
 
 COLOURS = ("#0072B2", "#56B4E9", "#009E73", "#D55E00", "#8a8a8a", "#CC79A7", "#E69F00", "#2b2b2b")
 _BINS = 700

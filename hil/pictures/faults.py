@@ -9,8 +9,8 @@ matplotlib.use("Agg")
 import matplotlib.pyplot as plt
 from matplotlib.patches import Rectangle
 
-from hil.faults.matrix import Case
-from hil.faults.outcome import Outcome
+from hil.studies.faults.matrix import Case
+from hil.studies.faults.outcome import Outcome
 
 _BAD, _UNSEEN = "#c0392b", "#dfe3e8"
 _SHADES = ((5, "#1b7f4d"), (12, "#5aa469"), (50, "#a3c585"), (10_000, "#e4cf7b"))

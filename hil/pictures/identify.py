@@ -6,7 +6,7 @@ import numpy as np
 from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
 
-from hil.identification import Identification
+from hil.studies.identify.identification import Identification
 
 COLOURS = ("#0072b2", "#d55e00", "#009e73")
 GREY = "#9aa5ad"

@@ -9,10 +9,10 @@ from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
 from matplotlib.ticker import FormatStrFormatter, LogLocator, MaxNLocator, NullFormatter
 
-from hil.period_errors import WITHIN, PeriodErrors
-from hil.recording import Recording
-from hil.report import AXIS_COLOURS
-from hil.scenario import restore
+from hil.pictures.report import AXIS_COLOURS
+from hil.recording.recording import Recording
+from hil.runs.period_errors import WITHIN, PeriodErrors
+from hil.runs.scenario import restore
 
 _INK, _FAINT = "#2b2b2b", "#9a9a9a"
 _SENSED, _TRUE = "#51626f", "#D55E00"

@@ -8,8 +8,8 @@ from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
 from numpy.typing import NDArray
 
-from hil.measured_loop import MeasuredLoop
-from pkxyz_ctrl.design.margins import HALF_POWER, LoopResponse
+from hil.studies.margins.measured import MeasuredLoop
+from pkxyz_ctrl.design.margins.margins import HALF_POWER, LoopResponse
 
 Array = NDArray[np.float64]
 

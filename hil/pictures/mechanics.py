@@ -13,7 +13,7 @@ from matplotlib.lines import Line2D
 from matplotlib.patches import Circle
 from numpy.typing import NDArray
 
-from pkxyz_ctrl.mechanics.flexures import folded_spring_stiffness, link_hinge_stiffness
+from pkxyz_ctrl.elements.flexures import folded_spring_stiffness, link_hinge_stiffness
 from pkxyz_ctrl.mechanics.jacobians import nominal_jacobians
 from pkxyz_ctrl.mechanics.linearisation import LinearisationStudy
 from pkxyz_ctrl.mechanics.modes import modes

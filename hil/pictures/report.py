@@ -14,8 +14,8 @@ from matplotlib.figure import Figure
 from mpl_toolkits.mplot3d.art3d import Line3DCollection
 from numpy.typing import NDArray
 
-from hil.bus_trace import BusTrace, read_bus_trace
-from hil.recording import Recording
+from hil.bus.load_trace import BusTrace, read_bus_trace
+from hil.recording.recording import Recording
 
 Array = NDArray[np.float64]
 

@@ -10,7 +10,7 @@ import matplotlib.pyplot as plt
 import numpy as np
 
 if TYPE_CHECKING:
-    from hil.soak import Soaked
+    from hil.studies.soak import Soaked
 
 _BLUE, _RED, _GREY = "#1f5f8b", "#c0392b", "#8a929b"
 

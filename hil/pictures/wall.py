@@ -8,8 +8,8 @@ from matplotlib.axes import Axes
 from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
 
-from hil.recording import Recording
-from hil.report import AXIS_COLOURS, COMB_COLOURS
+from hil.pictures.report import AXIS_COLOURS, COMB_COLOURS
+from hil.recording.recording import Recording
 
 _POINTS = 20_000
 

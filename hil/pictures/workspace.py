@@ -12,7 +12,7 @@ from matplotlib.figure import Figure
 from mpl_toolkits.mplot3d.art3d import Poly3DCollection
 from numpy.typing import NDArray
 
-from hil.mechanics_figures import COLOURS, INK, dress, sheet
+from hil.pictures.mechanics import COLOURS, INK, dress, sheet
 from pkxyz_ctrl.mechanics.workspace import stroke_box, voltage_needed_v
 from pkxyz_ctrl.stage import Stage, StageDomainError
 

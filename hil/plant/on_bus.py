@@ -6,9 +6,9 @@ import numpy as np
 from numba import njit
 from numpy.typing import NDArray
 
-from hil.truth import observe
-from pkxyz_ctrl.direct_call import direct
-from pkxyz_ctrl.row import TRUTH_FIELDS
+from hil.plant.truth import observe
+from pkxyz_ctrl.compiled.direct_call import direct
+from pkxyz_ctrl.loop.row import TRUTH_FIELDS
 from sim import kernels
 from sim.plant import Plant
 

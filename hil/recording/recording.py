@@ -19,7 +19,7 @@ import pyarrow as pa
 import pyarrow.parquet as pq
 from numpy.typing import NDArray
 
-from pkxyz_ctrl.row import ROW, columns
+from pkxyz_ctrl.loop.row import ROW, columns
 
 _BATCH_ROWS = 2048
 _GROUP_ROWS = 8 * _BATCH_ROWS  # of the Parquet file: 7 MB at a time, and 10 minutes at 5 kHz are 180 groups

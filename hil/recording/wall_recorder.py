@@ -13,11 +13,11 @@ from typing import Any
 
 import numpy as np
 
-from hil.frame_log import FrameLog
-from hil.recording import RecordingError, RecordingWriter
-from hil.run_folder import RunFolder
+from hil.bus.frame_log import FrameLog
+from hil.recording.recording import RecordingError, RecordingWriter
+from hil.runs.run_folder import RunFolder
 from pkxyz_ctrl.can.frame import Frame
-from pkxyz_ctrl.row import ROW
+from pkxyz_ctrl.loop.row import ROW
 
 _HEAD = struct.Struct("<BBqI")  # kind of entry, length of the data that follow, time in us, identifier
 _FRAME, _ROW = 0, 1  # a frame's kind is a bit set of its flags, shifted past the kind

@@ -6,13 +6,13 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from hil import lanes
-from hil.learning_run import Learning
-from hil.metrics import Metrics
-from hil.recording import RecordingWriter
-from hil.run_folder import RunFolder, metadata_of, summarise
-from hil.scenario import Scenario
-from pkxyz_ctrl.config import ConfigError
+from hil.lanes import either as lanes
+from hil.recording.recording import RecordingWriter
+from hil.runs.learning import Learning
+from hil.runs.metrics import Metrics
+from hil.runs.run_folder import RunFolder, metadata_of, summarise
+from hil.runs.scenario import Scenario
+from pkxyz_ctrl.config.files import ConfigError
 
 
 def run_into(
@@ -73,11 +73,11 @@ def draw(folder: RunFolder, summary: dict[str, Any]) -> None:
     """Draw the picture of a run that is already recorded; there is none of a run that never began."""
     if summary["ticks"] == 0:
         return
-    from hil.report import draw_report  # matplotlib takes as long to import as a run takes
+    from hil.pictures.report import draw_report  # matplotlib takes as long to import as a run takes
 
     with folder.in_one_line():
         draw_report(folder.recording, folder.frames, summary, folder.picture)
         if summary.get("learning_factor") is not None:
-            from hil.learning_figure import draw_learning
+            from hil.pictures.learning import draw_learning
 
             draw_learning(folder.recording, summary, folder.learning_picture)

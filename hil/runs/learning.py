@@ -3,19 +3,19 @@
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from hil.period_errors import PeriodErrors
-from hil.versions import versions
-from pkxyz_ctrl import config
-from pkxyz_ctrl.bus_config import BusConfig
-from pkxyz_ctrl.controller_config import ControllerConfig
+from hil.runs.period_errors import PeriodErrors
+from hil.runs.versions import versions
+from pkxyz_ctrl.config import files as config
+from pkxyz_ctrl.config.bus import BusConfig
+from pkxyz_ctrl.config.controller import ControllerConfig
+from pkxyz_ctrl.config.stage import StageConfig
 from pkxyz_ctrl.learning import Learner, LearningConfig, timetable
 from pkxyz_ctrl.learning.store import Belongs, Stored, belonging, load, require_same, save
-from pkxyz_ctrl.stage_config import StageConfig
 from pkxyz_ctrl.trajectory import Trajectory
 
 if TYPE_CHECKING:
-    from hil.run_folder import RunFolder
-    from hil.scenario import Scenario
+    from hil.runs.run_folder import RunFolder
+    from hil.runs.scenario import Scenario
 
 
 def belongs(trajectory: Trajectory, stage: StageConfig, controller: ControllerConfig, bus: BusConfig) -> Belongs:

@@ -11,7 +11,7 @@ from typing import Any, Protocol
 import numpy as np
 from numpy.typing import NDArray
 
-from pkxyz_ctrl.row import ROW
+from pkxyz_ctrl.loop.row import ROW
 from pkxyz_ctrl.safety.modes import Mode
 from pkxyz_ctrl.trajectory import Trajectory
 

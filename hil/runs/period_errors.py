@@ -10,10 +10,10 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from hil.recording import Recording
+from hil.recording.recording import Recording
 from pkxyz_ctrl.learning import LearningConfig, timetable
 from pkxyz_ctrl.learning.harmonics import count_up_to, harmonics
-from pkxyz_ctrl.row import ROW
+from pkxyz_ctrl.loop.row import ROW
 from pkxyz_ctrl.safety.modes import Mode
 from pkxyz_ctrl.trajectory import Trajectory
 

@@ -13,14 +13,14 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from hil.blocks import Handout
-from hil.recording import Recording, RecordingError
-from hil.scenario import Scenario, resolve, restore
-from hil.versions import versions
-from pkxyz_ctrl import cycle as cycling
-from pkxyz_ctrl.controller_config import ControllerConfig
-from pkxyz_ctrl.period import period_of
-from pkxyz_ctrl.row import CONTROLLER_FIELDS, ROW, columns
+from hil.lanes.blocks import Handout
+from hil.recording.recording import Recording, RecordingError
+from hil.runs.scenario import Scenario, resolve, restore
+from hil.runs.versions import versions
+from pkxyz_ctrl.config.controller import ControllerConfig
+from pkxyz_ctrl.loop import cycle as cycling
+from pkxyz_ctrl.loop.period import period_of
+from pkxyz_ctrl.loop.row import CONTROLLER_FIELDS, ROW, columns
 from pkxyz_ctrl.safety.modes import Mode
 from pkxyz_ctrl.safety.monitors import SenseStatus
 

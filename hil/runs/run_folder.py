@@ -8,10 +8,10 @@ from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
-from hil.metrics import evaluate
-from hil.scenario import LEARNT_FROM, Scenario, resolve, tables
-from hil.versions import versions
-from pkxyz_ctrl.config import ConfigError, write_toml
+from hil.runs.metrics import evaluate
+from hil.runs.scenario import LEARNT_FROM, Scenario, resolve, tables
+from hil.runs.versions import versions
+from pkxyz_ctrl.config.files import ConfigError, write_toml
 
 RECORDING, FRAMES, CONFIG, SUMMARY, PICTURE = (
     "recording.parquet",

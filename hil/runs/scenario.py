@@ -14,23 +14,23 @@ from typing import TYPE_CHECKING, Annotated, Any, Self
 from pydantic import BaseModel, Field, field_validator, model_validator
 
 from hil.faults.fault import Fault
-from hil.learning_run import belongs, stored_for
-from hil.metrics import METRICS
-from pkxyz_ctrl import config
-from pkxyz_ctrl.bus_config import BusConfig
-from pkxyz_ctrl.config import ConfigError, FrozenModel
-from pkxyz_ctrl.controller_config import ControllerConfig
+from hil.runs.learning import belongs, stored_for
+from hil.runs.metrics import METRICS
+from pkxyz_ctrl.config import files as config
+from pkxyz_ctrl.config.bus import BusConfig
+from pkxyz_ctrl.config.controller import ControllerConfig
+from pkxyz_ctrl.config.files import ConfigError, FrozenModel
+from pkxyz_ctrl.config.stage import StageConfig
 from pkxyz_ctrl.learning import LearningConfig
 from pkxyz_ctrl.learning.store import Stored
 from pkxyz_ctrl.stage import Stage
-from pkxyz_ctrl.stage_config import StageConfig
 from pkxyz_ctrl.trajectory import Segment, Trajectory, TrajectoryError
 from pkxyz_ctrl.trajectory.check import DriveLimits, check_against
 from pkxyz_ctrl.trajectory.table import Table, in_folder
 from sim.config import Device, PlantConfig
 
 if TYPE_CHECKING:
-    from hil.setup import Setup
+    from hil.lanes.setup import Setup
 
 Text = Annotated[str, Field(min_length=1)]
 
@@ -104,7 +104,7 @@ class Scenario:
 
     def setup(self) -> "Setup":
         """What the lanes are handed."""
-        from hil.setup import Setup  # brings the design tools, which a mistake in a file need not wait for
+        from hil.lanes.setup import Setup  # brings the design tools, which a mistake in a file need not wait for
 
         return Setup(
             self.stage, self.device, self.plant, self.controller, self.bus, self.trajectory,

@@ -3,7 +3,7 @@
 from enum import StrEnum
 from typing import TYPE_CHECKING
 
-from pkxyz_ctrl.config import ConfigError
+from pkxyz_ctrl.config.files import ConfigError
 
 if TYPE_CHECKING:
     import numpy as np

@@ -6,7 +6,7 @@ from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
 
-from pkxyz_ctrl.config import ConfigError
+from pkxyz_ctrl.config.files import ConfigError
 
 _ELSEWHERE = "give another place to write"
 _REMEDIES = {

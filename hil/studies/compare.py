@@ -7,11 +7,11 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from hil import lanes
-from hil.metrics import Metrics
-from hil.scenario import load_scenario
-from hil.sil import require_bus
-from pkxyz_ctrl.config import ConfigError
+from hil.lanes import either as lanes
+from hil.runs.in_process import require_bus
+from hil.runs.metrics import Metrics
+from hil.runs.scenario import load_scenario
+from pkxyz_ctrl.config.files import ConfigError
 
 Rows = NDArray[np.void]
 

@@ -4,7 +4,7 @@ from pathlib import Path
 
 import tomlkit
 
-from pkxyz_ctrl.config import ConfigError, plain
+from pkxyz_ctrl.config.files import ConfigError, plain
 from pkxyz_ctrl.mechanics.selection import Requirements, Selection
 
 HEAD = "Dimensions selected by `pkxyz design` from requirements: the point of the feasible region"

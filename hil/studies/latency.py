@@ -17,21 +17,21 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from hil import lanes
-from hil.blocks import PREVIEW_ROWS
-from hil.ending import Ended, Ending
-from hil.scenario import load_scenario
-from hil.setup import Setup
-from hil.wall import wall_gate
-from pkxyz_ctrl import cycle as cycling
+from hil.lanes import either as lanes
+from hil.lanes.blocks import PREVIEW_ROWS
+from hil.lanes.ending import Ended, Ending
+from hil.lanes.setup import Setup
+from hil.lanes.wall import wall_gate
+from hil.runs.scenario import load_scenario
 from pkxyz_ctrl.can import cob_id
 from pkxyz_ctrl.can.codec import ProcessCodec
 from pkxyz_ctrl.can.frame import Frame
-from pkxyz_ctrl.config import ConfigError
-from pkxyz_ctrl.controller import Controller
+from pkxyz_ctrl.config.files import ConfigError
 from pkxyz_ctrl.io.clocks import TickClock, WallClock, percentile_us
 from pkxyz_ctrl.io.realtime import FIFO_PRIORITY, go_real_time, leave_real_time, settle_memory
-from pkxyz_ctrl.runtime import run
+from pkxyz_ctrl.loop import cycle as cycling
+from pkxyz_ctrl.loop.controller import Controller
+from pkxyz_ctrl.loop.runtime import run
 from pkxyz_ctrl.safety.modes import Mode
 
 _HISTOGRAM_US = 2000

@@ -12,15 +12,15 @@ from typing import Any
 
 import numpy as np
 
-from hil import lanes
-from hil.loop_margins import Loop
-from hil.metrics import Metrics
-from hil.scenario import Scenario, resolve
-from hil.workers import as_done, given, hands
-from pkxyz_ctrl import config
-from pkxyz_ctrl.config import ConfigError
-from pkxyz_ctrl.design.loop_plant import Perturbation
-from pkxyz_ctrl.design.tolerances import Tolerances
+from hil.lanes import either as lanes
+from hil.runs.metrics import Metrics
+from hil.runs.scenario import Scenario, resolve
+from hil.studies.margins.loop import Loop
+from hil.studies.spread.workers import as_done, given, hands
+from pkxyz_ctrl.config import files as config
+from pkxyz_ctrl.config.files import ConfigError
+from pkxyz_ctrl.design.margins.tolerances import Tolerances
+from pkxyz_ctrl.design.model.loop_plant import Perturbation
 from pkxyz_ctrl.stage import Stage
 from sim.config import PlantConfig
 

@@ -16,12 +16,12 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from hil.blocks import Blocks
 from hil.faults.fault import Fault, parse
-from hil.faults.matrix import CASES
-from hil.lockstep import LockstepRig
-from hil.recording import Recording, RecordingWriter
-from hil.scenario import load_scenario
+from hil.lanes.blocks import Blocks
+from hil.lanes.lockstep import LockstepRig
+from hil.recording.recording import Recording, RecordingWriter
+from hil.runs.scenario import load_scenario
+from hil.studies.faults.matrix import CASES
 from pkxyz_ctrl.safety.modes import Mode
 from pkxyz_ctrl.safety.trips import Trip
 

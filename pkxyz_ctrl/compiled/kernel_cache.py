@@ -40,7 +40,7 @@ def _digest_of_kernels() -> str:
     """Over every file that holds a kernel and all of ours that these import: a kernel freezes the constants that it
     uses.
     """
-    root = Path(__file__).parent.parent
+    root = Path(__file__).parents[2]
     sources = {path: path.read_bytes() for package in _PACKAGES for path in sorted((root / package).rglob("*.py"))}
     relevant: set[Path] = set()
     waiting = [path for path, source in sources.items() if b"njit" in source]

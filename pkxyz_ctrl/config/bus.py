@@ -5,7 +5,7 @@ from typing import Annotated, Self
 from pydantic import Field, model_validator
 
 from pkxyz_ctrl.can.driver_config import DriverConfig
-from pkxyz_ctrl.config import FrozenModel
+from pkxyz_ctrl.config.files import FrozenModel
 
 Positive = Annotated[float, Field(gt=0)]
 

@@ -8,7 +8,7 @@ from typing import Annotated, Literal
 
 from pydantic import Field
 
-from pkxyz_ctrl.config import FrozenModel
+from pkxyz_ctrl.config.files import FrozenModel
 
 Relative = Annotated[float, Field(gt=0.1, lt=10.0)]
 EachChain = tuple[Relative, Relative, Relative]

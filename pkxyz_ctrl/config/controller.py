@@ -4,8 +4,8 @@ from typing import Annotated, Self
 
 from pydantic import Field, model_validator
 
-from pkxyz_ctrl.config import FrozenModel
-from pkxyz_ctrl.law_config import LAWS, SECTIONS, Hinf, Irc, Linear, Mpc, PiNotch
+from pkxyz_ctrl.config.files import FrozenModel
+from pkxyz_ctrl.config.laws import LAWS, SECTIONS, Hinf, Irc, Linear, Mpc, PiNotch
 from pkxyz_ctrl.safety.thresholds import (
     FORCE_CHANGE_MAX_N,
     FORCE_CHANGE_SHARE,

@@ -15,8 +15,8 @@ from typing import Any, TypeVar
 import tomlkit
 from pydantic import BaseModel, ConfigDict, ValidationError
 
-_PACKAGED = Path(__file__).parent / "configs"
-CONFIG_DIR = _PACKAGED if _PACKAGED.is_dir() else Path(__file__).parent.parent / "configs"
+_PACKAGED = Path(__file__).parents[1] / "configs"
+CONFIG_DIR = _PACKAGED if _PACKAGED.is_dir() else Path(__file__).parents[2] / "configs"
 """Where the shipped configuration files live: inside an installed wheel, or beside the packages in a checkout."""
 
 

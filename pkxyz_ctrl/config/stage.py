@@ -5,8 +5,8 @@ from typing import Annotated, Literal, Self
 
 from pydantic import Field, model_validator
 
-from pkxyz_ctrl.calibration_config import Calibration
-from pkxyz_ctrl.config import FrozenModel
+from pkxyz_ctrl.config.calibration import Calibration
+from pkxyz_ctrl.config.files import FrozenModel
 
 Positive = Annotated[float, Field(gt=0)]
 

@@ -16,7 +16,7 @@ import numpy as np
 from numba import njit
 from numpy.typing import NDArray
 
-from pkxyz_ctrl.stage_config import GeometryConfig
+from pkxyz_ctrl.config.stage import GeometryConfig
 
 Array = NDArray[np.float64]
 

@@ -2,8 +2,8 @@
 
 import math
 
-from pkxyz_ctrl.bus_config import BusConfig
-from pkxyz_ctrl.controller_config import ControllerConfig
+from pkxyz_ctrl.config.bus import BusConfig
+from pkxyz_ctrl.config.controller import ControllerConfig
 from pkxyz_ctrl.stage import Stage
 
 

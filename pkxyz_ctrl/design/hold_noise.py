@@ -3,12 +3,12 @@
 import numpy as np
 from numpy.typing import NDArray
 
-from pkxyz_ctrl.bus_config import BusConfig
-from pkxyz_ctrl.design.discrete_law import DiscreteLaw, LawError
-from pkxyz_ctrl.design.estimator_gain import measurement_noise
-from pkxyz_ctrl.design.loop_plant import LoopPlant
-from pkxyz_ctrl.design.plant_model import LinearStage, linearise
-from pkxyz_ctrl.design.sensitivity import closed_loop
+from pkxyz_ctrl.config.bus import BusConfig
+from pkxyz_ctrl.design.laws.estimator_gain import measurement_noise
+from pkxyz_ctrl.design.margins.sensitivity import closed_loop
+from pkxyz_ctrl.design.model.discrete_law import DiscreteLaw, LawError
+from pkxyz_ctrl.design.model.loop_plant import LoopPlant
+from pkxyz_ctrl.design.model.plant_model import LinearStage, linearise
 from pkxyz_ctrl.stage import Stage
 
 Array = NDArray[np.float64]

@@ -6,19 +6,19 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from pkxyz_ctrl import cycle
-from pkxyz_ctrl.bus_config import BusConfig
-from pkxyz_ctrl.config import ConfigError
-from pkxyz_ctrl.controller_config import ControllerConfig, RegulatorConfig
+from pkxyz_ctrl.config.bus import BusConfig
+from pkxyz_ctrl.config.controller import ControllerConfig, RegulatorConfig
+from pkxyz_ctrl.config.files import ConfigError
+from pkxyz_ctrl.config.laws import Mpc
 from pkxyz_ctrl.core.tick import LINEAR, OPEN_LOOP, PREDICTIVE, STATE_FEEDBACK
-from pkxyz_ctrl.design.chosen_law import chosen_law, unwinding
-from pkxyz_ctrl.design.discrete_law import LawError
-from pkxyz_ctrl.design.estimator_gain import kalman_gain, measurement_matrix, measurement_noise, process_noise
-from pkxyz_ctrl.design.loop_plant import loop_plant
-from pkxyz_ctrl.design.plant_model import LinearStage, SampledStage, linearise, sample
-from pkxyz_ctrl.design.regulator import cost_to_go, regulator_gain
-from pkxyz_ctrl.drive_limits import count_max, slew_counts
-from pkxyz_ctrl.law_config import Mpc
+from pkxyz_ctrl.design.drive_limits import count_max, slew_counts
+from pkxyz_ctrl.design.laws.chosen_law import chosen_law, unwinding
+from pkxyz_ctrl.design.laws.estimator_gain import kalman_gain, measurement_matrix, measurement_noise, process_noise
+from pkxyz_ctrl.design.laws.regulator import cost_to_go, regulator_gain
+from pkxyz_ctrl.design.model.discrete_law import LawError
+from pkxyz_ctrl.design.model.loop_plant import loop_plant
+from pkxyz_ctrl.design.model.plant_model import LinearStage, SampledStage, linearise, sample
+from pkxyz_ctrl.loop import cycle
 from pkxyz_ctrl.stage import Stage
 
 KINDS = {"open_loop": OPEN_LOOP, "lqg": STATE_FEEDBACK, "mpc": PREDICTIVE}

@@ -4,9 +4,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from pkxyz_ctrl.core.tick import LINEAR, OPEN_LOOP
-from pkxyz_ctrl.design.discrete_law import DiscreteLaw, LawError
-from pkxyz_ctrl.design.loop_plant import NOMINAL, Perturbation
 from pkxyz_ctrl.design.lqg_equivalent import lqg_equivalent
+from pkxyz_ctrl.design.model.discrete_law import DiscreteLaw, LawError
+from pkxyz_ctrl.design.model.loop_plant import NOMINAL, Perturbation
 from pkxyz_ctrl.stage import Stage
 
 Array = NDArray[np.float64]

@@ -14,10 +14,10 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from pkxyz_ctrl import cycle
-from pkxyz_ctrl.bus_config import BusConfig
-from pkxyz_ctrl.controller_config import ControllerConfig
-from pkxyz_ctrl.stage_config import StageConfig
+from pkxyz_ctrl.config.bus import BusConfig
+from pkxyz_ctrl.config.controller import ControllerConfig
+from pkxyz_ctrl.config.stage import StageConfig
+from pkxyz_ctrl.loop import cycle
 
 _LIBRARIES = ("numpy", "scipy", "control", "filterpy")
 _KEPT = 256
@@ -56,7 +56,7 @@ def _path_of(stage: StageConfig, controller: ControllerConfig, bus: BusConfig, a
 def _program() -> str:
     """Digest of what designs: the sources as they were when this process looked first, and the libraries."""
     digest = hashlib.sha256()
-    for source in sorted(Path(__file__).parent.rglob("*.py")):
+    for source in sorted(Path(__file__).parents[1].rglob("*.py")):
         digest.update(source.read_bytes())
     digest.update(repr((sys.version, [version(name) for name in _LIBRARIES], cycle.LAW)).encode())
     return digest.hexdigest()

@@ -10,8 +10,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from pkxyz_ctrl.core.tick import PREDICTIVE
-from pkxyz_ctrl.design.discrete_law import DiscreteLaw
-from pkxyz_ctrl.design.loop_plant import NOMINAL, Perturbation, held_force_softening
+from pkxyz_ctrl.design.model.discrete_law import DiscreteLaw
+from pkxyz_ctrl.design.model.loop_plant import NOMINAL, Perturbation, held_force_softening
 from pkxyz_ctrl.stage import Stage
 
 Array = NDArray[np.float64]

@@ -7,8 +7,8 @@ import math
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from pkxyz_ctrl.mechanics.errors import require_positive
-from pkxyz_ctrl.stage_config import CombConfig
+from pkxyz_ctrl.config.stage import CombConfig
+from pkxyz_ctrl.elements.errors import require_positive
 
 EPSILON_0_F_PER_M = 8.8541878128e-12
 """Vacuum permittivity, CODATA 2018."""

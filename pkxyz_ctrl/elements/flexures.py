@@ -2,8 +2,8 @@
 
 import math
 
-from pkxyz_ctrl.mechanics.errors import require_positive
-from pkxyz_ctrl.stage_config import FlexureConfig
+from pkxyz_ctrl.config.stage import FlexureConfig
+from pkxyz_ctrl.elements.errors import require_positive
 
 
 def folded_spring_stiffness(flexures: FlexureConfig) -> float:

@@ -6,9 +6,9 @@ from typing import Any, Protocol
 
 import can
 
-from pkxyz_ctrl.bus_config import CanConfig
 from pkxyz_ctrl.can.frame import Frame
-from pkxyz_ctrl.config import ConfigError
+from pkxyz_ctrl.config.bus import CanConfig
+from pkxyz_ctrl.config.files import ConfigError
 
 _STAMP_MAX_AGE_S = 1.0
 

@@ -4,7 +4,7 @@ from typing import Annotated, Literal, Self
 
 from pydantic import Field, model_validator
 
-from pkxyz_ctrl.config import ConfigError, FrozenModel
+from pkxyz_ctrl.config.files import ConfigError, FrozenModel
 
 
 class LearningError(ConfigError):

@@ -8,12 +8,12 @@ from collections.abc import Callable
 import numpy as np
 from numpy.typing import NDArray
 
-from pkxyz_ctrl import cycle as cycling
-from pkxyz_ctrl.bus_config import BusConfig, CanConfig
 from pkxyz_ctrl.can.driver import AmplifierDriver, DriverState
 from pkxyz_ctrl.can.frame import Frame
-from pkxyz_ctrl.period import period_on
-from pkxyz_ctrl.row import ROW
+from pkxyz_ctrl.config.bus import BusConfig, CanConfig
+from pkxyz_ctrl.loop import cycle as cycling
+from pkxyz_ctrl.loop.period import period_on
+from pkxyz_ctrl.loop.row import ROW
 from pkxyz_ctrl.safety.gate import GateConfig, TransmitGate
 from pkxyz_ctrl.safety.modes import Event, Mode, next_mode
 from pkxyz_ctrl.safety.trips import Trip, explain

@@ -12,7 +12,7 @@ from numba import njit
 from numpy.typing import NDArray
 
 from pkxyz_ctrl.core import pace, tick
-from pkxyz_ctrl.row import ROW
+from pkxyz_ctrl.loop.row import ROW
 from pkxyz_ctrl.safety.modes import (
     LOOP_CLOSED,
     NODE_EXPECTED,

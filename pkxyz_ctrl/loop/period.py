@@ -6,9 +6,9 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from pkxyz_ctrl import cycle as cycling
+from pkxyz_ctrl.compiled.direct_call import direct
 from pkxyz_ctrl.core.tick import PREDICTIVE
-from pkxyz_ctrl.direct_call import direct
+from pkxyz_ctrl.loop import cycle as cycling
 
 Records = NDArray[np.void]
 Array = NDArray[np.float64]
@@ -35,6 +35,6 @@ def period_on(law: Records, reference: Array) -> Period:
 
 
 def _planning(law: Records) -> Any:
-    from pkxyz_ctrl.predictive_cycle import PredictiveCycle  # brings OSQP and scipy's solvers
+    from pkxyz_ctrl.loop.predictive_cycle import PredictiveCycle  # brings OSQP and scipy's solvers
 
     return PredictiveCycle(law)

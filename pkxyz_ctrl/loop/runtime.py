@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from pkxyz_ctrl.can.frame import Frame
-from pkxyz_ctrl.controller import Controller
+from pkxyz_ctrl.loop.controller import Controller
 
 _POLL_US = 1000
 

@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 from scipy.optimize import minimize, root
 from scipy.spatial.transform import Rotation
 
-from pkxyz_ctrl.mechanics.errors import GeometryError
+from pkxyz_ctrl.elements.errors import GeometryError
 from pkxyz_ctrl.mechanics.workspace import box_corners, stroke_box
 from pkxyz_ctrl.stage import Stage
 

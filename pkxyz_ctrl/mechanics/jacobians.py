@@ -12,8 +12,8 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from pkxyz_ctrl.config.stage import GeometryConfig
 from pkxyz_ctrl.stage import Stage
-from pkxyz_ctrl.stage_config import GeometryConfig
 
 Array = NDArray[np.float64]
 

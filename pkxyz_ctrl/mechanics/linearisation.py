@@ -10,7 +10,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from pkxyz_ctrl.mechanics.errors import require_positive
+from pkxyz_ctrl.elements.errors import require_positive
 from pkxyz_ctrl.mechanics.workspace import stroke_box
 from pkxyz_ctrl.stage import Stage
 

@@ -6,7 +6,7 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from pkxyz_ctrl.mechanics.errors import require_positive
+from pkxyz_ctrl.elements.errors import require_positive
 
 Array = NDArray[np.float64]
 

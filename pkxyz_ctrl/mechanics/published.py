@@ -4,7 +4,8 @@ Units are the paper's: um, mm, mN, N/mm, N mm/rad, mg, Hz. Where the text contra
 other reading; ``reproduction.verdict`` decides, not this file.
 """
 
-from pkxyz_ctrl.mechanics import flexures, published_device
+from pkxyz_ctrl.elements import flexures
+from pkxyz_ctrl.mechanics import published_device
 from pkxyz_ctrl.mechanics import readings as read
 from pkxyz_ctrl.mechanics.reproduction import Entry
 from pkxyz_ctrl.mechanics.sextic import closure_polynomial

@@ -8,7 +8,7 @@ import math
 import numpy as np
 from scipy.optimize import brentq
 
-from pkxyz_ctrl.mechanics import combs, flexures
+from pkxyz_ctrl.elements import combs, flexures
 from pkxyz_ctrl.mechanics.jacobians import nominal_jacobians
 from pkxyz_ctrl.mechanics.modes import modes
 from pkxyz_ctrl.mechanics.sextic import appendix_coefficients

@@ -18,17 +18,17 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.optimize import minimize
 
-from pkxyz_ctrl.config import plain
-from pkxyz_ctrl.mechanics.combs import force_gain_n_per_v2
-from pkxyz_ctrl.mechanics.errors import InfeasibleDesignError, require_positive
-from pkxyz_ctrl.mechanics.flexures import crank_hinge_range_rad, link_hinge_range_rad
+from pkxyz_ctrl.config.files import plain
+from pkxyz_ctrl.config.stage import StageConfig
+from pkxyz_ctrl.elements.combs import force_gain_n_per_v2
+from pkxyz_ctrl.elements.errors import InfeasibleDesignError, require_positive
+from pkxyz_ctrl.elements.flexures import crank_hinge_range_rad, link_hinge_range_rad
 from pkxyz_ctrl.mechanics.inscribed import inscribed_cube, standing_cube_m
 from pkxyz_ctrl.mechanics.jacobians import joint_angles
 from pkxyz_ctrl.mechanics.modes import modes
 from pkxyz_ctrl.mechanics.stiffness import nominal_stiffness_n_per_m
 from pkxyz_ctrl.mechanics.workspace import box_corners
 from pkxyz_ctrl.stage import Stage, StageDomainError
-from pkxyz_ctrl.stage_config import StageConfig
 
 Array = NDArray[np.float64]
 

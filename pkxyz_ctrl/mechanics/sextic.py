@@ -19,9 +19,9 @@ import numpy as np
 from numpy.polynomial import Polynomial
 from numpy.typing import ArrayLike, NDArray
 
+from pkxyz_ctrl.config.stage import GeometryConfig
 from pkxyz_ctrl.core.kinematics import geometry_record
-from pkxyz_ctrl.mechanics.errors import GeometryError
-from pkxyz_ctrl.stage_config import GeometryConfig
+from pkxyz_ctrl.elements.errors import GeometryError
 
 Array = NDArray[np.float64]
 

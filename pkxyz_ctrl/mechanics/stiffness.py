@@ -10,11 +10,11 @@ import math
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from pkxyz_ctrl.mechanics.errors import require_positive
-from pkxyz_ctrl.mechanics.flexures import crank_hinge_stiffness, folded_spring_stiffness, link_hinge_stiffness
+from pkxyz_ctrl.config.stage import StageConfig
+from pkxyz_ctrl.elements.errors import require_positive
+from pkxyz_ctrl.elements.flexures import crank_hinge_stiffness, folded_spring_stiffness, link_hinge_stiffness
 from pkxyz_ctrl.mechanics.jacobians import nominal_jacobians, stroke_curvature_per_m
 from pkxyz_ctrl.stage import Stage
-from pkxyz_ctrl.stage_config import StageConfig
 
 Array = NDArray[np.float64]
 

@@ -13,7 +13,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 from scipy.optimize import minimize
 
-from pkxyz_ctrl.mechanics.errors import GeometryError
+from pkxyz_ctrl.elements.errors import GeometryError
 from pkxyz_ctrl.stage import Stage, StageDomainError
 
 Array = NDArray[np.float64]

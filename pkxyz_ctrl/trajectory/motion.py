@@ -5,7 +5,7 @@ from typing import Protocol
 import numpy as np
 from numpy.typing import NDArray
 
-from pkxyz_ctrl.config import ConfigError
+from pkxyz_ctrl.config.files import ConfigError
 
 Array = NDArray[np.float64]
 

@@ -10,7 +10,7 @@ from typing import Annotated, Literal, Self
 import numpy as np
 from pydantic import Field, model_validator
 
-from pkxyz_ctrl.config import FrozenModel
+from pkxyz_ctrl.config.files import FrozenModel
 from pkxyz_ctrl.trajectory.motion import Array
 from pkxyz_ctrl.trajectory.segments import NotNegative, Plan, Position, Positive
 from pkxyz_ctrl.trajectory.tones import Tones

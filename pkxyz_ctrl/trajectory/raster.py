@@ -6,7 +6,7 @@ from typing import Literal, NamedTuple, Self
 import numpy as np
 from pydantic import model_validator
 
-from pkxyz_ctrl.config import FrozenModel
+from pkxyz_ctrl.config.files import FrozenModel
 from pkxyz_ctrl.trajectory.motion import Array, TrajectoryError, at_rest
 from pkxyz_ctrl.trajectory.pieces import Phases, Pieces, from_phases, joined
 from pkxyz_ctrl.trajectory.segments import Count, Limits, NotNegative, Plan, Position, Positive, travel

@@ -12,7 +12,7 @@ import numpy as np
 import ruckig
 from pydantic import Field
 
-from pkxyz_ctrl.config import FrozenModel
+from pkxyz_ctrl.config.files import FrozenModel
 from pkxyz_ctrl.trajectory.motion import Array, Motion, TrajectoryError
 from pkxyz_ctrl.trajectory.pieces import Phases, Pieces, from_phases, still
 

@@ -11,7 +11,7 @@ from typing import Literal, NamedTuple, Protocol, Self
 import numpy as np
 from pydantic import model_validator
 
-from pkxyz_ctrl.config import FrozenModel
+from pkxyz_ctrl.config.files import FrozenModel
 from pkxyz_ctrl.trajectory.motion import Array, TrajectoryError
 from pkxyz_ctrl.trajectory.segments import Plan, Positive
 

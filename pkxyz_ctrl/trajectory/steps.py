@@ -5,7 +5,7 @@ from typing import Literal, Self
 import numpy as np
 from pydantic import model_validator
 
-from pkxyz_ctrl.config import FrozenModel
+from pkxyz_ctrl.config.files import FrozenModel
 from pkxyz_ctrl.trajectory.motion import Array
 from pkxyz_ctrl.trajectory.pieces import joined, still
 from pkxyz_ctrl.trajectory.segments import Count, Limits, NotNegative, Plan, Position, Positive, straight

@@ -7,7 +7,7 @@ from typing import Literal, Self
 import numpy as np
 from pydantic import model_validator
 
-from pkxyz_ctrl.config import FrozenModel
+from pkxyz_ctrl.config.files import FrozenModel
 from pkxyz_ctrl.trajectory.motion import Array, at_rest
 from pkxyz_ctrl.trajectory.periodic import LEAD_S, Axis, Lead, unit
 from pkxyz_ctrl.trajectory.segments import Plan, Positive

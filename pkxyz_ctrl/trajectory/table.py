@@ -10,7 +10,7 @@ from typing import Annotated, Any, Literal
 import numpy as np
 from pydantic import Field
 
-from pkxyz_ctrl.config import FrozenModel
+from pkxyz_ctrl.config.files import FrozenModel
 from pkxyz_ctrl.trajectory.motion import Array, TrajectoryError, at_rest
 from pkxyz_ctrl.trajectory.pieces import Pieces
 from pkxyz_ctrl.trajectory.segments import Limits, Plan, Positive, travel

@@ -7,7 +7,7 @@ from typing import Annotated, Literal, NamedTuple
 import numpy as np
 from pydantic import Field
 
-from pkxyz_ctrl.config import FrozenModel
+from pkxyz_ctrl.config.files import FrozenModel
 from pkxyz_ctrl.trajectory.motion import Array, TrajectoryError
 from pkxyz_ctrl.trajectory.pieces import Phases, Pieces, from_phases, joined
 from pkxyz_ctrl.trajectory.segments import Limits, NotNegative, Plan, Position, Positive, straight

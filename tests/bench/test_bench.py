@@ -17,12 +17,12 @@ import pytest
 from sim_rig import config, counts, plant
 
 from hil.bench import figure, quality, startup, suite, tick
-from hil.bench.closed_loop import scan
 from hil.bench.figure import Figure
-from hil.bench.reference_motion import reference_motion
-from pkxyz_ctrl.config import ConfigError
+from hil.bench.rigs.closed_loop import scan
+from hil.bench.rigs.reference_motion import reference_motion
+from pkxyz_ctrl.config.files import ConfigError
 
-ROOT = Path(__file__).parents[1]
+ROOT = Path(__file__).parents[2]
 KEYS = {"name", "value", "unit", "target", "direction", "met", "median", "detail"}
 QUICK = ("tick", "fast", "bus", "limits", "codec", "gate", "wire")
 drawing = runpy.run_path(str(ROOT / "docs" / "figures" / "performance.py"))
@@ -93,7 +93,7 @@ def test_verdicts_state_by_state() -> None:
 
 
 def test_the_targets_of_quality_are_those_of_the_shipped_scenario() -> None:
-    from hil.scenario import load_scenario
+    from hil.runs.scenario import load_scenario
 
     checks = load_scenario("raster").config.checks
     assert {name: bound.max for name, bound in checks.items()} == quality._AT_MOST["nominal"]

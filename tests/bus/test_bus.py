@@ -9,10 +9,10 @@ import canopen.objectdictionary
 import cantools.database
 import pytest
 
-from hil.clock import Lockstep
-from hil.published_wires import publish
-from hil.sim_bus import SimBus, to_frame, to_message
-from hil.wire import Wire
+from hil.bus.clock import Lockstep
+from hil.bus.published_wires import publish
+from hil.bus.sim_bus import SimBus, to_frame, to_message
+from hil.bus.wire import Wire
 from pkxyz_ctrl.can.frame import Frame
 
 _channels = (f"test-bus-{n}" for n in itertools.count())

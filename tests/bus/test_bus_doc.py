@@ -5,7 +5,7 @@ from pathlib import Path
 
 import pytest
 
-SCRIPT = Path(__file__).parents[1] / "docs" / "figures" / "bus_timing.py"
+SCRIPT = Path(__file__).parents[2] / "docs" / "figures" / "bus_timing.py"
 drawing = runpy.run_path(str(SCRIPT))
 
 

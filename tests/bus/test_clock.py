@@ -4,7 +4,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from hil.clock import ClockReentryError, Lockstep, TimeInPastError
+from hil.bus.clock import ClockReentryError, Lockstep, TimeInPastError
 
 
 @given(times=st.lists(st.integers(0, 50), max_size=60), horizon=st.integers(0, 60))

@@ -9,10 +9,10 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from hil.clock import Lockstep
-from hil.frame_time import FrameFormatError, frame_duration_ns
-from hil.published_wires import find_wire, publish
-from hil.wire import Wire
+from hil.bus.clock import Lockstep
+from hil.bus.frame_time import FrameFormatError, frame_duration_ns
+from hil.bus.published_wires import find_wire, publish
+from hil.bus.wire import Wire
 from pkxyz_ctrl.can.frame import Frame
 
 NOMINAL, FAST = 1_000_000, 5_000_000

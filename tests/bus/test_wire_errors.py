@@ -4,11 +4,11 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from hil.clock import Lockstep
-from hil.disturbance import CORRUPTED, DROPPED, Outcome
-from hil.endpoint import ErrorState
-from hil.frame_time import frame_duration_ns
-from hil.wire import ERROR_ACK, ERROR_BUS, ERROR_BUS_OFF, ERROR_PROTOCOL, ERROR_RESTARTED, Wire
+from hil.bus.clock import Lockstep
+from hil.bus.disturbance import CORRUPTED, DROPPED, Outcome
+from hil.bus.endpoint import ErrorState
+from hil.bus.frame_time import frame_duration_ns
+from hil.bus.wire import ERROR_ACK, ERROR_BUS, ERROR_BUS_OFF, ERROR_PROTOCOL, ERROR_RESTARTED, Wire
 from pkxyz_ctrl.can.frame import Frame
 
 BITRATE = 1_000_000

@@ -12,7 +12,7 @@ from crccheck.crc import Crc15, Crc17CanFd, Crc21CanFd
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from hil.frame_time import (
+from hil.bus.frame_time import (
     FD_LENGTHS,
     FrameFormatError,
     duration_ns_kernel,

@@ -9,11 +9,11 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from hil.clock import Lockstep
-from hil.frame_log import BLOCK_FRAMES, FrameLog
-from hil.frame_time import FD_LENGTHS
-from hil.sim_bus import to_frame
-from hil.wire import Wire
+from hil.bus.clock import Lockstep
+from hil.bus.frame_log import BLOCK_FRAMES, FrameLog
+from hil.bus.frame_time import FD_LENGTHS
+from hil.bus.sim_bus import to_frame
+from hil.bus.wire import Wire
 from pkxyz_ctrl.can.frame import Frame
 
 data_of_any_length = st.sampled_from(FD_LENGTHS).flatmap(lambda n: st.binary(min_size=n, max_size=n))

@@ -17,7 +17,7 @@ from pkxyz_ctrl.can.driver_config import DriverConfig
 from pkxyz_ctrl.can.startup import configuration_steps, identity_steps, mapping
 from pkxyz_ctrl.can.wire_doc import object_table, pdo_table
 
-ROOT = Path(__file__).resolve().parent.parent
+ROOT = Path(__file__).resolve().parents[2]
 EDS = ROOT / "configs" / "comb_amplifier.eds"
 DBC = ROOT / "configs" / "comb_amplifier.dbc"
 WIRE_DOC = ROOT / "docs" / "wire.md"

@@ -16,7 +16,7 @@ from pkxyz_ctrl.can.driver_config import DriverConfig
 from pkxyz_ctrl.can.frame import Frame
 from pkxyz_ctrl.can.sense_input import SENSE_COUNTER, SENSE_MISSING
 
-EDS = str(Path(__file__).resolve().parent.parent / "configs" / "comb_amplifier.eds")
+EDS = str(Path(__file__).resolve().parents[2] / "configs" / "comb_amplifier.eds")
 FRAME_US = 100
 
 

@@ -7,26 +7,11 @@ import subprocess
 import sys
 import time
 from functools import partial
-from pathlib import Path
 
 import pytest
+from command_line import ROOT, pkxyz
 
-from pkxyz_ctrl.config import CONFIG_DIR
-
-ROOT = Path(__file__).parent.parent
-
-
-def pkxyz(*words, cwd):
-    """Run ``pkxyz`` in a folder; the checkout itself is found by PYTHONPATH, as if installed."""
-    return subprocess.run(
-        [sys.executable, "-m", "hil.cli", *map(str, words)],
-        cwd=cwd,
-        env={**os.environ, "PYTHONPATH": str(ROOT), "COLUMNS": "120"},
-        capture_output=True,
-        text=True,
-        check=False,
-        timeout=600,
-    )
+from pkxyz_ctrl.config.files import CONFIG_DIR
 
 
 def assert_one_line_each(done, *expected):
@@ -96,7 +81,7 @@ def test_lockstep_without_a_bus_is_refused(tmp_path):
 
 
 def read_run(folder):
-    from hil.recording import Recording
+    from hil.recording.recording import Recording
 
     return json.loads((folder / "summary.json").read_text(encoding="utf-8")), Recording.open(
         folder / "recording.parquet"

@@ -14,9 +14,9 @@ from rich.console import Console
 from typer import Typer
 from typer.testing import CliRunner, Result
 
-from hil import mechanics_cli
-from hil.workspace_figures import edge_path, section
-from pkxyz_ctrl.config import ConfigError
+from hil.commands import mechanics as mechanics_cli
+from hil.pictures.workspace import edge_path, section
+from pkxyz_ctrl.config.files import ConfigError
 from pkxyz_ctrl.mechanics.workspace import geometric_volume, voltage_needed_v
 from pkxyz_ctrl.stage import Stage
 
@@ -138,7 +138,7 @@ def test_the_theory_draws_nothing_and_imports_no_matplotlib() -> None:
     code = (
         "import sys, pkgutil, importlib, pkxyz_ctrl.mechanics as m\n"
         "[importlib.import_module('pkxyz_ctrl.mechanics.' + i.name) for i in pkgutil.iter_modules(m.__path__)]\n"
-        "import hil.mechanics_cli\n"
+        "import hil.commands.mechanics\n"
         "sys.exit('matplotlib' in sys.modules)"
     )
     assert subprocess.run([sys.executable, "-c", code], check=False).returncode == 0

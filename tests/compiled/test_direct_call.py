@@ -4,9 +4,9 @@ import numpy as np
 import pytest
 from numba import njit
 
-from hil.scenario import load_scenario
-from pkxyz_ctrl.controller import Controller
-from pkxyz_ctrl.direct_call import direct
+from hil.runs.scenario import load_scenario
+from pkxyz_ctrl.compiled.direct_call import direct
+from pkxyz_ctrl.loop.controller import Controller
 
 ROW = np.dtype([("a", "f8"), ("n", "i4", (3,))], align=True)
 

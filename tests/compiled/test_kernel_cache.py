@@ -4,7 +4,7 @@ import os
 import time
 from pathlib import Path
 
-from pkxyz_ctrl import kernel_cache
+from pkxyz_ctrl.compiled import kernel_cache
 
 
 def test_old_folders_go_unless_they_are_the_last_or_somebody_may_be_using_them(tmp_path: Path) -> None:

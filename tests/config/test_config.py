@@ -8,8 +8,9 @@ import tomlkit
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from pkxyz_ctrl.bus_config import BusConfig
-from pkxyz_ctrl.config import (
+from pkxyz_ctrl.config.bus import BusConfig
+from pkxyz_ctrl.config.controller import ControllerConfig
+from pkxyz_ctrl.config.files import (
     ConfigError,
     digest,
     find,
@@ -21,8 +22,7 @@ from pkxyz_ctrl.config import (
     require_finite,
     write_toml,
 )
-from pkxyz_ctrl.controller_config import ControllerConfig
-from pkxyz_ctrl.stage_config import StageConfig
+from pkxyz_ctrl.config.stage import StageConfig
 
 MODELS = {"stages": StageConfig, "controllers": ControllerConfig, "buses": BusConfig}
 SHIPPED = [(kind, name) for kind in MODELS for name in names(kind)]

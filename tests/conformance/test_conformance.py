@@ -4,20 +4,20 @@ import can
 import pytest
 from conformance_defects import DEFECTS, NoHeartbeatConsumer, Silent, StillPlant
 
-from hil.clock import Lockstep
+from hil.bus.clock import Lockstep
+from hil.bus.published_wires import publish
+from hil.bus.wire import Wire
 from hil.conformance import report
 from hil.conformance.eds import read_eds
 from hil.conformance.run import CHECKS, run_all
 from hil.conformance.simulated import EDS, simulated_talker
 from hil.conformance.talker import Talker
 from hil.conformance.verdict import Line, Verdict
-from hil.node import AmplifierNode
-from hil.published_wires import publish
-from hil.wire import Wire
-from pkxyz_ctrl.bus_config import BusConfig
+from hil.node.amplifier import AmplifierNode
 from pkxyz_ctrl.can.codec import ProcessCodec
 from pkxyz_ctrl.can.frame import Frame
-from pkxyz_ctrl.config import ConfigError, load
+from pkxyz_ctrl.config.bus import BusConfig
+from pkxyz_ctrl.config.files import ConfigError, load
 from pkxyz_ctrl.io.can_port import to_frame, to_message
 
 BUS = load("buses", "fd_5k", BusConfig)

@@ -15,9 +15,9 @@ from pathlib import Path
 import pytest
 
 from hil.conformance.run import CHECKS
-from pkxyz_ctrl.config import CONFIG_DIR
+from pkxyz_ctrl.config.files import CONFIG_DIR
 
-ROOT = Path(__file__).parent.parent
+ROOT = Path(__file__).parents[2]
 ABOUT_TIME = {
     "boot-up and NMT: boot-up",
     "heartbeat: heartbeat period",

@@ -14,19 +14,19 @@ from loop_rig import MIDDLE, bus, controller, rows_of, stage
 from sim_truth import truth_about
 from typer.testing import CliRunner
 
-from hil.calibrated_stage import calibration_of, write_calibrated_stage
 from hil.cli import app
-from hil.identification import identify
-from hil.scenario import load_scenario
-from hil.setup import bare_setup
-from pkxyz_ctrl.calibration_config import Calibration
-from pkxyz_ctrl.config import CONFIG_DIR, ConfigError, load, plain
+from hil.lanes.setup import bare_setup
+from hil.runs.scenario import load_scenario
+from hil.studies.identify.calibrated_stage import calibration_of, write_calibrated_stage
+from hil.studies.identify.identification import identify
+from pkxyz_ctrl.config.calibration import Calibration
+from pkxyz_ctrl.config.files import CONFIG_DIR, ConfigError, load, plain
+from pkxyz_ctrl.config.stage import StageConfig
 from pkxyz_ctrl.core import tick
-from pkxyz_ctrl.design.calibrate import SenseGain, calibrate, gains
+from pkxyz_ctrl.design.identification.calibrate import SenseGain, calibrate, gains
+from pkxyz_ctrl.design.identification.modal_fit import FitError, ModalFit
 from pkxyz_ctrl.design.law import design_law
-from pkxyz_ctrl.design.modal_fit import FitError, ModalFit
 from pkxyz_ctrl.stage import Stage, StageDomainError
-from pkxyz_ctrl.stage_config import StageConfig
 from pkxyz_ctrl.trajectory import Hold, Move, Trajectory, TrajectoryError
 from pkxyz_ctrl.trajectory.check import check_against, comb_forces
 from sim.config import Device, PlantConfig

@@ -9,10 +9,10 @@ from hypothesis import strategies as st
 from loop_rig import MIDDLE, bus, stage
 from pydantic import ValidationError
 
-from pkxyz_ctrl.design import glover_mcfarlane as gm
-from pkxyz_ctrl.design.discrete_law import LawError, response
-from pkxyz_ctrl.design.loop_plant import Perturbation, loop_plant
-from pkxyz_ctrl.design.margins import margins, spectral_radius
+from pkxyz_ctrl.design.laws import glover_mcfarlane as gm
+from pkxyz_ctrl.design.margins.margins import margins, spectral_radius
+from pkxyz_ctrl.design.model.discrete_law import LawError, response
+from pkxyz_ctrl.design.model.loop_plant import Perturbation, loop_plant
 
 POINTS = 1j * np.r_[-np.geomspace(1e-3, 1e4, 400)[::-1], 0.0, np.geomspace(1e-3, 1e4, 400)]
 

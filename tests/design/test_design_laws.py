@@ -8,13 +8,13 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from loop_rig import MIDDLE, bus, stage
 
-from pkxyz_ctrl.design import irc as irc_design
-from pkxyz_ctrl.design.discrete_law import DiscreteLaw, LawError, discretise, response, stack
-from pkxyz_ctrl.design.irc import Irc, irc
-from pkxyz_ctrl.design.loop_plant import loop_plant
-from pkxyz_ctrl.design.margins import margins, spectral_radius
-from pkxyz_ctrl.design.pi_notch import PiNotch, mode_frequencies_hz, pi_notch
-from pkxyz_ctrl.design.user_law import UnstableLawError, discrete_law, user_law
+from pkxyz_ctrl.design.laws import irc as irc_design
+from pkxyz_ctrl.design.laws.irc import Irc, irc
+from pkxyz_ctrl.design.laws.pi_notch import PiNotch, mode_frequencies_hz, pi_notch
+from pkxyz_ctrl.design.laws.user_law import UnstableLawError, discrete_law, user_law
+from pkxyz_ctrl.design.margins.margins import margins, spectral_radius
+from pkxyz_ctrl.design.model.discrete_law import DiscreteLaw, LawError, discretise, response, stack
+from pkxyz_ctrl.design.model.loop_plant import loop_plant
 
 PERIOD = 200e-6
 MASS = stage().config.dynamics.mass_kg

@@ -11,14 +11,13 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from loop_rig import MIDDLE, bus, controller, law, new_tick_memory, rows_of, setup, stage
 
-from pkxyz_ctrl.config import load
+from pkxyz_ctrl.config.files import load
 from pkxyz_ctrl.core import tick
-from pkxyz_ctrl.design.discrete_law import DiscreteLaw, LawError
 from pkxyz_ctrl.design.hold_noise import hold_noise_m
 from pkxyz_ctrl.design.law import design_law
-from pkxyz_ctrl.design.loop_plant import NOMINAL, Perturbation, held_force_softening, loop_plant
+from pkxyz_ctrl.design.laws.pi_notch import PiNotch, pi_notch
 from pkxyz_ctrl.design.lqg_equivalent import lqg_equivalent
-from pkxyz_ctrl.design.margins import (
+from pkxyz_ctrl.design.margins.margins import (
     HALF_POWER,
     axis_margins,
     frequency_grid_hz,
@@ -28,9 +27,10 @@ from pkxyz_ctrl.design.margins import (
     spectral_radius,
     structured_norm,
 )
-from pkxyz_ctrl.design.pi_notch import PiNotch, pi_notch
-from pkxyz_ctrl.design.sensitivity import Sensitivity, closed_loop
-from pkxyz_ctrl.design.tolerances import Tolerances
+from pkxyz_ctrl.design.margins.sensitivity import Sensitivity, closed_loop
+from pkxyz_ctrl.design.margins.tolerances import Tolerances
+from pkxyz_ctrl.design.model.discrete_law import DiscreteLaw, LawError
+from pkxyz_ctrl.design.model.loop_plant import NOMINAL, Perturbation, held_force_softening, loop_plant
 
 OFF_CENTRE = np.array([7e-6, 15e-6, 11e-6])
 MASS = stage().config.dynamics.mass_kg

@@ -6,19 +6,19 @@ import numpy as np
 import pytest
 from loop_rig import MIDDLE, bus, law, stage
 
-from hil.loop_margins import Loop, over_changed_plants
-from pkxyz_ctrl.config import load
-from pkxyz_ctrl.controller_config import ControllerConfig
-from pkxyz_ctrl.design.discrete_law import LawError, response
+from hil.studies.margins.loop import Loop, over_changed_plants
+from pkxyz_ctrl.config.controller import ControllerConfig
+from pkxyz_ctrl.config.files import load
 from pkxyz_ctrl.design.hold_noise import hold_noise_m
 from pkxyz_ctrl.design.law import design_law
 from pkxyz_ctrl.design.law_about import law_about
-from pkxyz_ctrl.design.loop_plant import LoopPlant, Perturbation, loop_plant
+from pkxyz_ctrl.design.laws.minimax import AxisLaw, Bounds, _Problem, axis_law, minimax
 from pkxyz_ctrl.design.lqg_equivalent import lqg_equivalent
-from pkxyz_ctrl.design.margins import frequency_grid_hz, loop_response
-from pkxyz_ctrl.design.minimax import AxisLaw, Bounds, _Problem, axis_law, minimax
-from pkxyz_ctrl.design.sensitivity import closed_loop
-from pkxyz_ctrl.design.tolerances import Case, Tolerances
+from pkxyz_ctrl.design.margins.margins import frequency_grid_hz, loop_response
+from pkxyz_ctrl.design.margins.sensitivity import closed_loop
+from pkxyz_ctrl.design.margins.tolerances import Case, Tolerances
+from pkxyz_ctrl.design.model.discrete_law import LawError, response
+from pkxyz_ctrl.design.model.loop_plant import LoopPlant, Perturbation, loop_plant
 
 
 def shipped(name, bus_name):

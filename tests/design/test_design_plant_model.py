@@ -9,7 +9,7 @@ from scipy.integrate import solve_ivp
 from sim_rig import config, plant
 
 from pkxyz_ctrl.design.law import amplifier_time_constant_s
-from pkxyz_ctrl.design.plant_model import linearise, sample
+from pkxyz_ctrl.design.model.plant_model import linearise, sample
 from sim.mechanics import acceleration
 
 TAU_S = amplifier_time_constant_s(stage())

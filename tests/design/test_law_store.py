@@ -7,11 +7,11 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from hil.scenario import load_scenario
-from pkxyz_ctrl import law_store
-from pkxyz_ctrl.config import ConfigError
+from hil.runs.scenario import load_scenario
+from pkxyz_ctrl.config.files import ConfigError
 from pkxyz_ctrl.design import law as design
-from pkxyz_ctrl.law_store import law_of
+from pkxyz_ctrl.design import law_store
+from pkxyz_ctrl.design.law_store import law_of
 from pkxyz_ctrl.stage import Stage
 
 SETUP = load_scenario("raster").setup()
@@ -63,9 +63,9 @@ def test_a_program_of_other_sources_designs_anew(
     folder: Path, designs: list[object], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     sources = tmp_path / "sources"
-    sources.mkdir()
+    (sources / "design").mkdir(parents=True)
     (sources / "a.py").write_text("GAIN = 1.0")
-    monkeypatch.setattr(law_store, "__file__", str(sources / "law_store.py"))
+    monkeypatch.setattr(law_store, "__file__", str(sources / "design" / "law_store.py"))
     law_store._program.cache_clear()  # a process looks at its sources once
     law_of(*PARTS, autostart=True)
     law_of(*PARTS, autostart=True)
@@ -115,7 +115,8 @@ def test_without_a_folder_it_is_designed_each_time(
 def test_the_second_run_needs_no_design_tools() -> None:
     """Their import is half of the time that a first run spends before it starts."""
     program = (
-        "import sys; from hil.scenario import load_scenario; import hil.lanes; load_scenario('raster').setup().law;"
+        "import sys; from hil.runs.scenario import load_scenario; import hil.lanes.either;"
+        "load_scenario('raster').setup().law;"
         "print([m for m in ('control', 'filterpy', 'scipy.stats', 'scipy.integrate', 'osqp') if m in sys.modules])"
     )
     said = [subprocess.run([sys.executable, "-c", program], capture_output=True, text=True).stdout for _ in range(2)]

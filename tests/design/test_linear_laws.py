@@ -11,14 +11,14 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from loop_rig import bus, controller, first_difference, rows_of, setup, shortened, stage
 
-from pkxyz_ctrl.config import CONFIG_DIR, ConfigError, load, parse, plain, read_toml, write_toml
-from pkxyz_ctrl.controller_config import ControllerConfig
+from pkxyz_ctrl.config.controller import ControllerConfig
+from pkxyz_ctrl.config.files import CONFIG_DIR, ConfigError, load, parse, plain, read_toml, write_toml
 from pkxyz_ctrl.core import linear_law
 from pkxyz_ctrl.core.tick import LINEAR
-from pkxyz_ctrl.design.chosen_law import at_authority, chosen_law, unwinding, with_law
-from pkxyz_ctrl.design.discrete_law import DiscreteLaw, LawError
 from pkxyz_ctrl.design.law import design_law
-from pkxyz_ctrl.design.loop_plant import loop_plant
+from pkxyz_ctrl.design.laws.chosen_law import at_authority, chosen_law, unwinding, with_law
+from pkxyz_ctrl.design.model.discrete_law import DiscreteLaw, LawError
+from pkxyz_ctrl.design.model.loop_plant import loop_plant
 from pkxyz_ctrl.safety.modes import Mode
 
 SHIPPED = ("pi_notch", "irc", "hinf")

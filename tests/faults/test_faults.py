@@ -11,9 +11,9 @@ from loop_rig import bus, setup
 from hil.faults.catalogue import KINDS, PARTS, targets
 from hil.faults.fault import Fault, parse
 from hil.faults.plant import FaultyPlant
-from hil.scenario import load_scenario, resolve
-from hil.sil import require_bus
-from pkxyz_ctrl.config import CONFIG_DIR, ConfigError
+from hil.runs.in_process import require_bus
+from hil.runs.scenario import load_scenario, resolve
+from pkxyz_ctrl.config.files import CONFIG_DIR, ConfigError
 
 PAIRS = [
     (target, kind)

@@ -12,10 +12,11 @@ import time
 from collections.abc import Callable
 from pathlib import Path
 
+sys.path.append(str(Path(__file__).parents[1] / "rigs"))  # where pytest has not put it
 from conformance_defects import StillPlant
 
-from hil.clock import Lockstep
-from hil.node import AmplifierNode, NmtState
+from hil.bus.clock import Lockstep
+from hil.node.amplifier import AmplifierNode, NmtState
 from pkxyz_ctrl.can.codec import ProcessCodec
 from pkxyz_ctrl.can.driver import AmplifierDriver, DriverState
 from pkxyz_ctrl.can.driver_config import DriverConfig
@@ -26,10 +27,10 @@ from pkxyz_ctrl.can.startup import configuration_steps, identity_steps
 from pkxyz_ctrl.safety.gate import GateConfig, TransmitGate
 from pkxyz_ctrl.safety.modes import Mode
 
-EDS = Path(__file__).parents[1] / "configs" / "comb_amplifier.eds"
+EDS = Path(__file__).parents[2] / "configs" / "comb_amplifier.eds"
 SESSION_FRAMES = 2000  # then a new node, driver or gate: states that need a fresh start are met again and again
 DRIVE, SENSE = ProcessCodec(0x30A, True), ProcessCodec(0x28A, True)
-# Objects that may change what drives the combs are left to tests/test_hil_node_sdo.py: with them anything is allowed.
+# Objects that may change what drives the combs are left to tests/node/test_node_sdo.py: with them anything is allowed.
 _CHANGE_THE_DRIVE = (0x1401, 0x1601, 0x6443, 0x6444)
 _LENGTHS = (0, 1, 2, 3, 4, 5, 6, 7, 8, 8, 8, 8, 12, 16, 20, 24, 32, 48, 64)
 

@@ -10,11 +10,11 @@ from typing import Any
 
 from pydantic import BaseModel
 
-from hil.scenario import ScenarioConfig, load_scenario
-from pkxyz_ctrl.bus_config import BusConfig
-from pkxyz_ctrl.config import CONFIG_DIR, ConfigError, parse, read_toml
-from pkxyz_ctrl.controller_config import ControllerConfig
-from pkxyz_ctrl.stage_config import StageConfig
+from hil.runs.scenario import ScenarioConfig, load_scenario
+from pkxyz_ctrl.config.bus import BusConfig
+from pkxyz_ctrl.config.controller import ControllerConfig
+from pkxyz_ctrl.config.files import CONFIG_DIR, ConfigError, parse, read_toml
+from pkxyz_ctrl.config.stage import StageConfig
 from sim.config import Device, PlantConfig
 
 MODELS: dict[str, tuple[type[BaseModel], ...]] = {

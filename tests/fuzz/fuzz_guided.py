@@ -1,4 +1,4 @@
-"""The fuzzing of tests/fuzz.py, guided by coverage: ``python tests/fuzz_guided.py node guided -max_total_time=60``.
+"""The fuzzing of fuzz.py, guided by coverage: ``python tests/fuzz/fuzz_guided.py node guided -max_total_time=60``.
 
 atheris records which branches of our code an input takes and bends those inputs further that took a new one. An input
 is read as the random numbers of a session, so that every input is a session of frames and the generators stay in charge

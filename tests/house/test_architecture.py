@@ -8,7 +8,7 @@ from pathlib import Path
 
 import pytest
 
-ROOT = Path(__file__).parent.parent
+ROOT = Path(__file__).parents[2]
 PACKAGES = ("pkxyz_ctrl", "hil", "sim")
 FILES = {
     ".".join(path.relative_to(ROOT).with_suffix("").parts).removesuffix(".__init__"): path
@@ -20,30 +20,30 @@ FILES = {
 NUMBERS = ("math", "numpy", "numba")
 VALUES = ("enum", "typing", "dataclasses", "struct", "collections", "functools")
 ALLOWED: dict[str, tuple[str, ...]] = {
-    "pkxyz_ctrl.core": ("pkxyz_ctrl.stage_config", *NUMBERS),
+    "pkxyz_ctrl.core": ("pkxyz_ctrl.config.stage", *NUMBERS),
     "pkxyz_ctrl.safety": ("pkxyz_ctrl.can.frame", "numpy", "numba", *VALUES),
     "pkxyz_ctrl.can.dbc": ("pkxyz_ctrl.can", "canopen", "cantools", "pathlib", "re", "sys", *VALUES),
     "pkxyz_ctrl.can.wire_doc": ("canopen", "sys", *VALUES),
     "pkxyz_ctrl.can": ("pydantic", *VALUES),
-    "pkxyz_ctrl.cycle": ("pkxyz_ctrl.core", "pkxyz_ctrl.safety", "pkxyz_ctrl.row", *NUMBERS, "typing"),
-    "pkxyz_ctrl.row": ("numpy",),
-    "pkxyz_ctrl.runtime": ("pkxyz_ctrl.controller", "pkxyz_ctrl.can.frame", "numpy", *VALUES),
-    "pkxyz_ctrl.controller": (
+    "pkxyz_ctrl.loop.cycle": ("pkxyz_ctrl.core", "pkxyz_ctrl.safety", "pkxyz_ctrl.loop.row", *NUMBERS, "typing"),
+    "pkxyz_ctrl.loop.row": ("numpy",),
+    "pkxyz_ctrl.loop.runtime": ("pkxyz_ctrl.loop.controller", "pkxyz_ctrl.can.frame", "numpy", *VALUES),
+    "pkxyz_ctrl.loop.controller": (
         *(
-            "pkxyz_ctrl.cycle",
-            "pkxyz_ctrl.period",
-            "pkxyz_ctrl.row",
-            "pkxyz_ctrl.bus_config",
+            "pkxyz_ctrl.loop.cycle",
+            "pkxyz_ctrl.loop.period",
+            "pkxyz_ctrl.loop.row",
+            "pkxyz_ctrl.config.bus",
             "pkxyz_ctrl.can",
             "pkxyz_ctrl.safety",
         ),
-        "pkxyz_ctrl.direct_call",
+        "pkxyz_ctrl.compiled.direct_call",
         *("numpy", *VALUES),
     ),
     "sim": (*NUMBERS, *VALUES, "scipy", "pydantic", "tomllib", "pathlib"),
 }
-PURE = ("pkxyz_ctrl.core", "pkxyz_ctrl.safety", "pkxyz_ctrl.cycle", "pkxyz_ctrl.row", "sim.kernels")
-SANS_IO = (*PURE, "pkxyz_ctrl.can", "pkxyz_ctrl.controller", "pkxyz_ctrl.runtime", "sim")
+PURE = ("pkxyz_ctrl.core", "pkxyz_ctrl.safety", "pkxyz_ctrl.loop.cycle", "pkxyz_ctrl.loop.row", "sim.kernels")
+SANS_IO = (*PURE, "pkxyz_ctrl.can", "pkxyz_ctrl.loop.controller", "pkxyz_ctrl.loop.runtime", "sim")
 CLOCKS_AND_DICE = ("time", "datetime", "random", "secrets", "logging", "os", "socket", "threading", "asyncio", "uuid")
 
 
@@ -93,10 +93,10 @@ def test_the_reader_of_imports_reads_them_all():
         "pkxyz_ctrl.core.tick"
     )
     assert "pkxyz_ctrl.can.frame" in imports("pkxyz_ctrl.can.driver")
-    assert "hil.wire" in imports("hil.endpoint")
-    assert "hil.wire" not in imports("hil.endpoint", at_import_only=True)
-    assert "hil.report" in imports("hil.sil")
-    assert "hil.report" not in imports("hil.sil", at_import_only=True)
+    assert "hil.bus.wire" in imports("hil.bus.endpoint")
+    assert "hil.bus.wire" not in imports("hil.bus.endpoint", at_import_only=True)
+    assert "hil.pictures.report" in imports("hil.runs.in_process")
+    assert "hil.pictures.report" not in imports("hil.runs.in_process", at_import_only=True)
     assert len(FILES) > 80
 
 
@@ -112,7 +112,9 @@ def test_arrows_run_one_way(module):
     if is_in(module, "pkxyz_ctrl"):
         assert not {m for m in mine if is_in(m, "sim")}, f"{module} imports the plant"
     if is_in(module, "pkxyz_ctrl.io"):
-        inner = {m for m in mine if is_in_any(m, ("pkxyz_ctrl.runtime", "pkxyz_ctrl.cycle", "pkxyz_ctrl.core"))}
+        inner = {
+            m for m in mine if is_in_any(m, ("pkxyz_ctrl.loop.runtime", "pkxyz_ctrl.loop.cycle", "pkxyz_ctrl.core"))
+        }
         assert not inner, f"{module} knows of the loop that it serves: {sorted(inner)}"
     if not is_in_any(module, ("pkxyz_ctrl.io", "hil")):
         assert not {m for m in mine if is_in(m, "can")}, f"{module} imports python-can"
@@ -148,7 +150,7 @@ def test_no_module_imports_itself_by_a_detour():
 def test_what_runs_on_the_target_loads_no_harness_and_no_python_can():
     """The loop with all that it needs, imported in a fresh interpreter."""
     code = (
-        "import sys, pkxyz_ctrl.runtime, pkxyz_ctrl.cycle\n"
+        "import sys, pkxyz_ctrl.loop.runtime, pkxyz_ctrl.loop.cycle\n"
         "print(sorted({m.partition('.')[0] for m in sys.modules} & {'can', 'canopen', 'cantools', 'hil', 'sim',"
         " 'control', 'filterpy', 'osqp', 'matplotlib', 'pyarrow', 'rich', 'typer', 'ruckig'}))"
     )

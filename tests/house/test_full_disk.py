@@ -8,13 +8,13 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from hil.recording import Recording, RecordingError
-from hil.run_folder import FRAMES, PICTURE, SUMMARY, RunFolder
-from hil.scenario import load_scenario
-from hil.sil import draw, run_into
-from pkxyz_ctrl.config import ConfigError
+from hil.recording.recording import Recording, RecordingError
+from hil.runs.in_process import draw, run_into
+from hil.runs.run_folder import FRAMES, PICTURE, SUMMARY, RunFolder
+from hil.runs.scenario import load_scenario
+from pkxyz_ctrl.config.files import ConfigError
 
-ROOT = Path(__file__).parent.parent
+ROOT = Path(__file__).parents[2]
 
 
 def pkxyz(*words, file_limit_bytes=None):

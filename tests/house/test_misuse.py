@@ -16,11 +16,11 @@ from rich.console import Console
 from rich.table import Table
 
 from hil import cli
-from hil.outputs import what_to_do
-from hil.tables import print_whole
-from pkxyz_ctrl.config import CONFIG_DIR
+from hil.screen.outputs import what_to_do
+from hil.screen.tables import print_whole
+from pkxyz_ctrl.config.files import CONFIG_DIR
 
-ROOT = Path(__file__).parent.parent
+ROOT = Path(__file__).parents[2]
 
 
 def refused(capsys, monkeypatch, *words):

@@ -9,17 +9,18 @@ import numpy as np
 import pytest
 from scripted_ticks import from_rest, in_the_middle
 
-from pkxyz_ctrl.row import ROW
+from pkxyz_ctrl.loop.row import ROW
 from pkxyz_ctrl.safety.modes import Mode
 from pkxyz_ctrl.safety.trips import Trip
 
-TESTS = Path(__file__).parent
+ROOT = Path(__file__).parents[2]
+RIGS = ROOT / "tests" / "rigs"
 
 
 def without_compiler(*arguments: str) -> subprocess.CompletedProcess[str]:
-    environment = os.environ | {"NUMBA_DISABLE_JIT": "1", "PYTHONPATH": str(TESTS)}
+    environment = os.environ | {"NUMBA_DISABLE_JIT": "1", "PYTHONPATH": str(RIGS)}
     return subprocess.run(
-        [sys.executable, *arguments], capture_output=True, text=True, cwd=TESTS.parent, env=environment, check=False
+        [sys.executable, *arguments], capture_output=True, text=True, cwd=ROOT, env=environment, check=False
     )
 
 
@@ -42,7 +43,7 @@ def test_the_stories_tell_something(compiled):
 
 def test_140_ticks_agree_to_a_billionth(compiled, tmp_path):
     """Counts, modes and events exactly, everything else to 1e-9 of the largest value of its field."""
-    done = without_compiler(str(TESTS / "scripted_ticks.py"), str(tmp_path / "rows.npy"))
+    done = without_compiler(str(RIGS / "scripted_ticks.py"), str(tmp_path / "rows.npy"))
     assert done.returncode == 0, done.stderr
     interpreted = np.load(tmp_path / "rows.npy")
     assert interpreted.dtype == ROW
@@ -57,6 +58,6 @@ def test_140_ticks_agree_to_a_billionth(compiled, tmp_path):
 
 def test_tests_of_the_core_pass():
     """Kinematics, measuring, 0 V, allocation: their own tests, interpreted."""
-    done = without_compiler("-m", "pytest", "-q", "-p", "no:cacheprovider", "tests/test_core_tick.py")
+    done = without_compiler("-m", "pytest", "-q", "-p", "no:cacheprovider", "tests/core/test_core_tick.py")
     assert done.returncode == 0, done.stdout[-3000:]
     assert " passed" in done.stdout or "[100%]" in done.stdout

@@ -14,10 +14,10 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from hil.unix_bus import UnixBus, folder_of
-from pkxyz_ctrl.bus_config import BusConfig, CanConfig
+from hil.bus.unix_bus import UnixBus, folder_of
 from pkxyz_ctrl.can.frame import Frame
-from pkxyz_ctrl.config import ConfigError, load
+from pkxyz_ctrl.config.bus import BusConfig, CanConfig
+from pkxyz_ctrl.config.files import ConfigError, load
 from pkxyz_ctrl.io.can_port import CanPort, open_bus, to_frame, to_message
 from pkxyz_ctrl.io.clocks import WallClock
 
@@ -124,7 +124,7 @@ def test_what_waits_can_be_forgotten_and_goes_out_before_its_sender_leaves(tmp_p
 
 def test_what_a_killed_process_leaves_behind_is_cleared_away(tmp_path):
     channel = f"{tmp_path}/bus"
-    script = "import os, sys; from hil.unix_bus import UnixBus; bus = UnixBus(sys.argv[1]); os.kill(os.getpid(), 9)"
+    script = "import os, sys; from hil.bus.unix_bus import UnixBus; bus = UnixBus(sys.argv[1]); os.kill(os.getpid(), 9)"
     done = subprocess.run([sys.executable, "-c", script, channel], check=False, env=os.environ)
     assert done.returncode == -9
     with UnixBus(channel) as bus, UnixBus(channel) as other:

@@ -8,7 +8,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from loop_rig import first_difference, rows_of, setup, shortened
 
-from hil.excitation import SETTLE_PERIODS, excitation, tones
+from hil.lanes.excitation import SETTLE_PERIODS, excitation, tones
 
 
 def an_excitation(kind="multisine", amplitude_m=5e-9, periods=2, first_tick=40):

@@ -8,16 +8,16 @@ import numpy as np
 import pytest
 from loop_rig import bus, first_difference, rows_of, setup, shortened
 
-import hil.blocks
-from hil import lanes
-from hil.blocks import Blocks
-from hil.lockstep import LockstepRig
-from hil.published_wires import publish
-from hil.sim_bus import to_frame, to_message
+import hil.lanes.blocks
+from hil.bus.published_wires import publish
+from hil.bus.sim_bus import to_frame, to_message
+from hil.lanes import either as lanes
+from hil.lanes.blocks import Blocks
+from hil.lanes.lockstep import LockstepRig
 from pkxyz_ctrl.can.frame import Frame
-from pkxyz_ctrl.config import ConfigError
-from pkxyz_ctrl.controller import StartUpError
-from pkxyz_ctrl.row import ROW
+from pkxyz_ctrl.config.files import ConfigError
+from pkxyz_ctrl.loop.controller import StartUpError
+from pkxyz_ctrl.loop.row import ROW
 from pkxyz_ctrl.safety.gate import TransmitGate
 from pkxyz_ctrl.safety.modes import Mode
 
@@ -97,7 +97,7 @@ def test_the_ends_of_blocks_do_not_show(lane, length, monkeypatch):
     """1300 ticks whole, and in blocks of a length that cuts homing, enabling and the move anywhere."""
     short = shortened(setup("mild"), 1300)
     whole, _ = rows_of(short, lane)
-    monkeypatch.setattr(hil.blocks, "BLOCK_TICKS", length)
+    monkeypatch.setattr(hil.lanes.blocks, "BLOCK_TICKS", length)
     sizes, done = [], []
     blocks = []
 

@@ -7,10 +7,10 @@ import numpy as np
 import pytest
 from loop_rig import controller, controller_with, first_difference, rows_of, setup, shortened
 
-from hil.blocks import Blocks
-from hil.disturbance import DROPPED
-from hil.lockstep import LockstepRig
-from hil.metrics import Metrics
+from hil.bus.disturbance import DROPPED
+from hil.lanes.blocks import Blocks
+from hil.lanes.lockstep import LockstepRig
+from hil.runs.metrics import Metrics
 from pkxyz_ctrl.can.frame import Frame
 from pkxyz_ctrl.safety.modes import Mode
 from pkxyz_ctrl.safety.trips import Trip

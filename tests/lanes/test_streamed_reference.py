@@ -7,10 +7,10 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from hil.blocks import PREVIEW_ROWS
-from hil.scenario import load_scenario
-from hil.streamed_reference import BLOCK_ROWS, PIECE_ROWS, StreamedReference
-from pkxyz_ctrl.cycle import new_memory
+from hil.lanes.blocks import PREVIEW_ROWS
+from hil.lanes.streamed_reference import BLOCK_ROWS, PIECE_ROWS, StreamedReference
+from hil.runs.scenario import load_scenario
+from pkxyz_ctrl.loop.cycle import new_memory
 from pkxyz_ctrl.trajectory import Trajectory
 
 

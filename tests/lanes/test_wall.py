@@ -18,15 +18,16 @@ import can
 import numpy as np
 import pytest
 
-from hil import lanes, run_cli
-from hil.recording import Recording
-from hil.scenario import load_scenario
-from hil.unix_bus import UnixBus
-from hil.wall_plant import TRUTH
-from pkxyz_ctrl.config import CONFIG_DIR, ConfigError
+from hil.bus.unix_bus import UnixBus
+from hil.commands import run as run_cli
+from hil.lanes import either as lanes
+from hil.lanes.wall_plant import TRUTH
+from hil.recording.recording import Recording
+from hil.runs.scenario import load_scenario
+from pkxyz_ctrl.config.files import CONFIG_DIR, ConfigError
 from pkxyz_ctrl.safety.modes import Mode
 
-ROOT = Path(__file__).parent.parent
+ROOT = Path(__file__).parents[2]
 PERIOD_US = 1000
 NODE_TIMEOUT_US, HEARTBEAT_US = 50_000, 20_000
 EMCY, SDO_REPLY, SDO_REQUEST = 0x08A, 0x58A, 0x60A

@@ -10,8 +10,8 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from learning_rig import LINES, PERIOD, setup, trajectory
 
-from hil.learning_run import belongs
-from pkxyz_ctrl.config import ConfigError, parse
+from hil.runs.learning import belongs
+from pkxyz_ctrl.config.files import ConfigError, parse
 from pkxyz_ctrl.learning import LearningConfig, LearningError, timetable
 from pkxyz_ctrl.learning.harmonics import count_up_to, fade, harmonics, noise, period_rows, weighted
 from pkxyz_ctrl.learning.store import Stored, load, require_same, save

@@ -7,7 +7,7 @@ import pytest
 from loop_rig import MIDDLE, Cycle, bus, controller_with, counts_at, law, rows_of, setup, stage
 from numpy.typing import NDArray
 
-from hil.metrics import Metrics
+from hil.runs.metrics import Metrics
 from pkxyz_ctrl.design.law import design_law
 from pkxyz_ctrl.safety.modes import Event, Mode
 from pkxyz_ctrl.safety.monitors import NodeEvent, SenseStatus

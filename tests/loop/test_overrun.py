@@ -8,9 +8,9 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from loop_rig import controller, controller_with, setup, shortened
 
-from hil.blocks import Blocks
-from hil.lockstep import LockstepRig
-from hil.setup import Setup
+from hil.lanes.blocks import Blocks
+from hil.lanes.lockstep import LockstepRig
+from hil.lanes.setup import Setup
 from pkxyz_ctrl.design.law import design_law
 from pkxyz_ctrl.safety.modes import Mode
 from pkxyz_ctrl.safety.trips import Trip

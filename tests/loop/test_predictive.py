@@ -12,20 +12,20 @@ from loop_rig import bus, controller, first_difference, rows_of, setup, shortene
 from typer.testing import CliRunner
 
 from hil.cli import app
-from hil.excitation import excitation, tones
-from hil.fast_lane import run_block, run_block_in_steps
-from hil.loop_margins import Loop, agreement
-from hil.measured_loop import at_point, measure
-from pkxyz_ctrl import cycle as cycling
-from pkxyz_ctrl import predictive_cycle
-from pkxyz_ctrl.config import ConfigError, load, parse, plain
-from pkxyz_ctrl.controller_config import ControllerConfig
+from hil.lanes.excitation import excitation, tones
+from hil.lanes.fast import run_block, run_block_in_steps
+from hil.studies.margins.loop import Loop, agreement
+from hil.studies.margins.measured import at_point, measure
+from pkxyz_ctrl.config.controller import ControllerConfig
+from pkxyz_ctrl.config.files import ConfigError, load, parse, plain
 from pkxyz_ctrl.core import predictive
 from pkxyz_ctrl.design.law import design_law
-from pkxyz_ctrl.design.loop_plant import held_force_softening
-from pkxyz_ctrl.design.predictive_problem import FORCE_UNIT_N, STROKE_UNIT_M, Problem
-from pkxyz_ctrl.predictive_cycle import PredictiveCycle
-from pkxyz_ctrl.row import ROW
+from pkxyz_ctrl.design.model.loop_plant import held_force_softening
+from pkxyz_ctrl.loop import cycle as cycling
+from pkxyz_ctrl.loop import predictive_cycle
+from pkxyz_ctrl.loop.predictive_cycle import PredictiveCycle
+from pkxyz_ctrl.loop.predictive_problem import FORCE_UNIT_N, STROKE_UNIT_M, Problem
+from pkxyz_ctrl.loop.row import ROW
 from pkxyz_ctrl.safety.modes import Mode
 from pkxyz_ctrl.safety.trips import Trip
 from pkxyz_ctrl.trajectory import Hold, Move, Steps, Trajectory

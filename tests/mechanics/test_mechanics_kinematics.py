@@ -11,7 +11,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from stage_strategies import any_stage, positions, stage_with
 
-from pkxyz_ctrl.mechanics.errors import GeometryError, require_positive
+from pkxyz_ctrl.elements.errors import GeometryError, require_positive
 from pkxyz_ctrl.mechanics.jacobians import exact_jacobians, joint_angles, nominal_jacobians, stroke_curvature_per_m
 from pkxyz_ctrl.mechanics.sextic import (
     appendix_coefficients,

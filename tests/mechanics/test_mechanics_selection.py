@@ -5,13 +5,13 @@ import math
 import numpy as np
 import pytest
 
-from pkxyz_ctrl.config import load, parse, plain
-from pkxyz_ctrl.mechanics.errors import GeometryError, InfeasibleDesignError
+from pkxyz_ctrl.config.files import load, parse, plain
+from pkxyz_ctrl.config.stage import StageConfig
+from pkxyz_ctrl.elements.errors import GeometryError, InfeasibleDesignError
 from pkxyz_ctrl.mechanics.inscribed import inscribed_cube
 from pkxyz_ctrl.mechanics.modes import modes
 from pkxyz_ctrl.mechanics.selection import MARGINS, Requirements, linear_standing_cube_m, margins, select
 from pkxyz_ctrl.stage import Stage
-from pkxyz_ctrl.stage_config import StageConfig
 
 
 @pytest.fixture(scope="module")

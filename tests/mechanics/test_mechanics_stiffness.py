@@ -9,8 +9,8 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from stage_strategies import SHIPPED, any_stage, positions
 
-from pkxyz_ctrl.mechanics import combs, flexures
-from pkxyz_ctrl.mechanics.errors import GeometryError
+from pkxyz_ctrl.elements import combs, flexures
+from pkxyz_ctrl.elements.errors import GeometryError
 from pkxyz_ctrl.mechanics.jacobians import nominal_jacobians
 from pkxyz_ctrl.mechanics.modes import effective_mass_kg, modes, sag_m
 from pkxyz_ctrl.mechanics.stiffness import (

@@ -10,7 +10,7 @@ from finite_differences import seeded_points
 from hypothesis import given, settings
 from stage_strategies import SHIPPED, any_stage, stage_with
 
-from pkxyz_ctrl.mechanics.errors import GeometryError
+from pkxyz_ctrl.elements.errors import GeometryError
 from pkxyz_ctrl.mechanics.inscribed import inscribed_cube, standing_cube_m
 from pkxyz_ctrl.mechanics.linearisation import linearisation_study, newton_corrected_m
 from pkxyz_ctrl.mechanics.workspace import geometric_volume, held_volume, stroke_box, voltage_needed_v, workspace

@@ -1,4 +1,4 @@
-"""Mutation testing of what stands between a mistake and 200 V: ``make mutate``, or ``python tests/mutate.py --help``.
+"""Mutation testing of what stands between a mistake and 200 V: ``make mutate``; options: ``mutate.py --help``.
 
 Every outcome is written to runs/ at once, so that a run that was stopped goes on where it was: what was killed is known
 as long as the module stays as it is, what survived as long as its tests do as well. Survivors that are equivalent, with
@@ -22,24 +22,24 @@ from pathlib import Path
 from mutants import Mutant, mutants
 from mutation_run import ROOT, TESTS, BaselineError, Subject, preload, run_mutants
 
-SURVIVORS = TESTS / "mutation_survivors.toml"
+SURVIVORS = TESTS / "mutation" / "mutation_survivors.toml"
 REPORT = ROOT / "docs" / "mutation.md"
 STATE = ROOT / "runs" / "mutation.jsonl"
 SEED = 1
 FEW = 8  # mutants, for which it does not pay to measure the tests beforehand
 
 # The modules, and the tests that are about them. Before each come numbers that are contracts: fast, and soon imported.
-PINNED = "test_safety_pinned.py"
+PINNED = "safety/test_safety_pinned.py"
 TARGETS = {
-    "pkxyz_ctrl.safety.gate": ("test_safety_gate.py", "test_safety_gate_sweep.py"),
-    "pkxyz_ctrl.safety.sdo_rules": ("test_safety_gate.py", "test_safety_gate_sweep.py"),
-    "pkxyz_ctrl.safety.modes": ("test_safety_modes.py",),
-    "pkxyz_ctrl.safety.monitors": ("test_safety_monitors.py",),
-    "pkxyz_ctrl.safety.thresholds": ("test_safety_monitors.py",),
-    "pkxyz_ctrl.safety.trips": ("test_safety_monitors.py", "test_safety_modes.py"),
-    "pkxyz_ctrl.core.voltage": ("test_core_voltage.py",),
-    "pkxyz_ctrl.core.allocation": ("test_core_allocation.py",),
-    "pkxyz_ctrl.can.codec": ("test_can_codec.py",),
+    "pkxyz_ctrl.safety.gate": ("safety/test_safety_gate.py", "safety/test_safety_gate_sweep.py"),
+    "pkxyz_ctrl.safety.sdo_rules": ("safety/test_safety_gate.py", "safety/test_safety_gate_sweep.py"),
+    "pkxyz_ctrl.safety.modes": ("safety/test_safety_modes.py",),
+    "pkxyz_ctrl.safety.monitors": ("safety/test_safety_monitors.py",),
+    "pkxyz_ctrl.safety.thresholds": ("safety/test_safety_monitors.py",),
+    "pkxyz_ctrl.safety.trips": ("safety/test_safety_monitors.py", "safety/test_safety_modes.py"),
+    "pkxyz_ctrl.core.voltage": ("core/test_core_voltage.py",),
+    "pkxyz_ctrl.core.allocation": ("core/test_core_allocation.py",),
+    "pkxyz_ctrl.can.codec": ("can/test_can_codec.py",),
 }
 
 
@@ -122,7 +122,7 @@ def _name(job: Job) -> str:
 
 
 def _name_with_tests(job: Job) -> str:
-    helpers = [path for path in TESTS.glob("*.py") if not path.name.startswith(("test_", "mut"))]
+    helpers = [TESTS / "conftest.py", *(TESTS / "rigs").glob("*.py")]
     return f"{_name(job)} {_digest(*sorted(helpers), *(TESTS / name for name in subject_of(job.module).files))}"
 
 
@@ -178,9 +178,10 @@ def report(jobs: list[Job], outcomes: dict[Job, str]) -> tuple[str, int]:
 
 `make mutate` changes one thing at a time in the code that stands between a mistake and 200 V, and asks whether a test
 notices: comparisons, arithmetic, `and` / `or` / `not`, conditions, `min` / `max`, numbers, what is returned, statements
-left out. `tests/mutants.py` makes the mutants; `tests/mutation_run.py` runs each in a forked process, compiler off,
-nothing on disk changed, against those tests that call its function, the fastest first, until one fails. It ends with
-exit code 1 if a survivor has no reason in `tests/mutation_survivors.toml`. A run that was stopped goes on where it was.
+left out. In `tests/mutation/`, `mutants.py` makes the mutants and `mutation_run.py` runs each in a forked process,
+compiler off, nothing on disk changed, against those tests that call its function, the fastest first, until one fails.
+It ends with exit code 1 if a survivor has no reason in `mutation_survivors.toml`. A run that was stopped goes on where
+it was.
 
 Last result: **{len(outcomes)} of {len(jobs)} mutants tried, {killed} killed, {len(outcomes) - killed} survived,
 {unexplained} of them without a reason.**

@@ -34,7 +34,7 @@ import hypothesis
 import pytest
 from mutants import Mutant, mutated
 
-TESTS = Path(__file__).parent
+TESTS = Path(__file__).parents[1]
 ROOT = TESTS.parent
 _OURS = tuple(str(ROOT / folder) + os.sep for folder in ("pkxyz_ctrl", "hil", "sim", "tests"))
 ENDLESS_S = 10.0  # more than four times what the tests take without a mutant

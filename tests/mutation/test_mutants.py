@@ -10,7 +10,7 @@ from mutants import mutants, mutated
 from mutate import TARGETS
 from mutation_run import BaselineError, Subject, run_mutants
 
-ROOT = Path(__file__).parents[1]
+ROOT = Path(__file__).parents[2]
 
 
 def changes(source: str) -> list[str]:

@@ -5,10 +5,10 @@ from pathlib import Path
 import pytest
 from node_rig import EDS, NODE_ID, SENSE, RecordingPlant
 
-from hil.clock import Lockstep
-from hil.node import AmplifierNode, NmtState
-from hil.node_sense import Plant
-from hil.wire import Wire
+from hil.bus.clock import Lockstep
+from hil.bus.wire import Wire
+from hil.node.amplifier import AmplifierNode, NmtState
+from hil.node.sense import Plant
 from pkxyz_ctrl.can.driver import AmplifierDriver, DriverState
 from pkxyz_ctrl.can.driver_config import DriverConfig
 from pkxyz_ctrl.can.frame import Frame
@@ -16,7 +16,7 @@ from sim.config import PlantConfig
 from sim.device import Device
 from sim.plant import Plant as SimPlant
 
-CONFIGS = Path(__file__).parents[1] / "configs"
+CONFIGS = Path(__file__).parents[2] / "configs"
 VOLT_PER_COUNT = 200 / 32767
 TURNAROUND_US = 2
 

@@ -6,7 +6,7 @@ from hypothesis import event, given, settings
 from hypothesis import strategies as st
 from node_rig import CONTROLLER, DRIVE, NODE_ID, REQUEST, SYNC, RecordingPlant, Rig, protected
 
-from hil.node import NmtState
+from hil.node.amplifier import NmtState
 from pkxyz_ctrl.can.frame import UNUSUAL, Frame
 
 ZERO = (0, 0, 0)

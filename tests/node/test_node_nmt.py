@@ -8,7 +8,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from node_rig import CONTROLLER, DRIVE, EMCY, HEARTBEAT, NODE_ID, REPLY, REQUEST, SENSE, Rig, master, protected
 
-from hil.node import BOOT_US, NmtState
+from hil.node.amplifier import BOOT_US, NmtState
 from pkxyz_ctrl.can.frame import Frame
 
 START, STOP, PRE_OPERATIONAL, RESET_NODE, RESET_COMMUNICATION = 1, 2, 128, 129, 130

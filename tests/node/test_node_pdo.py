@@ -5,8 +5,8 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from node_rig import DRIVE, EMCY, SENSE, SYNC, TURNAROUND_US, Crc8H2F, Rig, protected, sample_at
 
-from hil.node import NmtState
-from hil.node_crc import WORDS, crc8h2f, last_byte_table
+from hil.node.amplifier import NmtState
+from hil.node.crc import WORDS, crc8h2f, last_byte_table
 from pkxyz_ctrl.can.codec import ProcessCodec
 
 COUNTS = st.tuples(*[st.integers(0, 32767)] * 3)

@@ -6,12 +6,12 @@ import numpy as np
 import pytest
 from synthetic_rows import START_TICKS, default_scenario, metadata, tracking_rows
 
-from hil.bus_trace import read_bus_trace
-from hil.frame_time import frame_duration_ns
-from hil.metrics import Metrics
-from hil.recording import Recording, RecordingWriter
-from hil.report import bound_words, draw_report, read_signals
-from hil.run_folder import summarise
+from hil.bus.frame_time import frame_duration_ns
+from hil.bus.load_trace import read_bus_trace
+from hil.pictures.report import bound_words, draw_report, read_signals
+from hil.recording.recording import Recording, RecordingWriter
+from hil.runs.metrics import Metrics
+from hil.runs.run_folder import summarise
 from pkxyz_ctrl.can.frame import Frame
 
 

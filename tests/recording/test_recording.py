@@ -16,10 +16,10 @@ import pytest
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
-from hil.recording import COLUMNS, Recording, RecordingError, RecordingWriter, journal_of, recover
-from pkxyz_ctrl.row import ROW, columns
+from hil.recording.recording import COLUMNS, Recording, RecordingError, RecordingWriter, journal_of, recover
+from pkxyz_ctrl.loop.row import ROW, columns
 
-ROOT = Path(__file__).parent.parent
+ROOT = Path(__file__).parents[2]
 
 
 def random_rows(count, seed=0):
@@ -75,9 +75,9 @@ def test_a_killed_program_loses_only_the_batch_in_hand(tmp_path):
     path = tmp_path / "r.parquet"
     program = f"""
         import os, signal, sys
-        sys.path[:0] = [{str(ROOT)!r}, {str(ROOT / "tests")!r}]
-        from hil.recording import RecordingWriter
-        from test_hil_recording import random_rows
+        sys.path[:0] = [{str(ROOT)!r}, *{[str(ROOT / "tests" / room) for room in ("rigs", "recording")]!r}]
+        from hil.recording.recording import RecordingWriter
+        from test_recording import random_rows
         writer = RecordingWriter({str(path)!r}, {{"seed": 7}})
         writer.write(random_rows(10_000))
         os.kill(os.getpid(), signal.SIGKILL)
@@ -150,9 +150,9 @@ def test_a_disk_that_fills_up_during_the_run_keeps_what_fits(tmp_path):
     path = tmp_path / "r.parquet"
     program = f"""
         import resource, signal, sys
-        sys.path[:0] = [{str(ROOT)!r}, {str(ROOT / "tests")!r}]
-        from hil.recording import RecordingError, RecordingWriter
-        from test_hil_recording import random_rows
+        sys.path[:0] = [{str(ROOT)!r}, *{[str(ROOT / "tests" / room) for room in ("rigs", "recording")]!r}]
+        from hil.recording.recording import RecordingError, RecordingWriter
+        from test_recording import random_rows
         signal.signal(signal.SIGXFSZ, signal.SIG_IGN)
         resource.setrlimit(resource.RLIMIT_FSIZE, (3_000_000, 3_000_000))
         try:
@@ -200,9 +200,9 @@ def peak_mb(path, ticks):
     """Peak memory in MB of a program that records ``ticks`` ticks and closes the recording."""
     program = f"""
         import sys
-        sys.path[:0] = [{str(ROOT)!r}, {str(ROOT / "tests")!r}]
-        from hil.recording import RecordingWriter
-        from test_hil_recording import random_rows
+        sys.path[:0] = [{str(ROOT)!r}, *{[str(ROOT / "tests" / room) for room in ("rigs", "recording")]!r}]
+        from hil.recording.recording import RecordingWriter
+        from test_recording import random_rows
         block = random_rows(4096)
         with RecordingWriter({str(path)!r}, {{}}) as writer:
             for _ in range({ticks} // 4096):

@@ -11,21 +11,21 @@ import can
 import numpy as np
 import pytest
 
-from hil import latency
-from hil.ending import Ending
-from hil.frame_log import FrameLog
-from hil.latency import measure, read_cyclictest
-from hil.recording import Recording, RecordingError
-from hil.run_folder import RunFolder, metadata_of
-from hil.scenario import load_scenario, resolve
-from hil.wall import WallRig
-from hil.wall_recorder import WallRecorder
+from hil.bus.frame_log import FrameLog
+from hil.lanes.ending import Ending
+from hil.lanes.wall import WallRig
+from hil.recording.recording import Recording, RecordingError
+from hil.recording.wall_recorder import WallRecorder
+from hil.runs.run_folder import RunFolder, metadata_of
+from hil.runs.scenario import load_scenario, resolve
+from hil.studies import latency
+from hil.studies.latency import measure, read_cyclictest
 from pkxyz_ctrl.can.frame import Frame
-from pkxyz_ctrl.config import CONFIG_DIR, ConfigError
-from pkxyz_ctrl.row import ROW
+from pkxyz_ctrl.config.files import CONFIG_DIR, ConfigError
+from pkxyz_ctrl.loop.row import ROW
 from pkxyz_ctrl.safety.modes import Mode
 
-ROOT = Path(__file__).parent.parent
+ROOT = Path(__file__).parents[2]
 
 
 @pytest.fixture
@@ -91,8 +91,8 @@ def test_a_writer_that_fails_says_why_and_stops_the_loop(folder):
 
 def test_rows_survive_a_kill_of_the_loop(tmp_path):
     script = (
-        "import os, sys; from pathlib import Path; sys.path.insert(0, 'tests')\n"
-        "import numpy as np; from test_hil_wall_recorder import *\n"
+        "import os, sys; from pathlib import Path; sys.path[:0] = ['tests/rigs', 'tests/recording']\n"
+        "import numpy as np; from test_wall_recorder import *\n"
         "recorder = WallRecorder(RunFolder(Path(sys.argv[1])), metadata(), 'bus'); rows = random_rows(300)\n"
         "for index in range(300): recorder.row(rows[index : index + 1].view(np.uint8).data)\n"
         "os.kill(os.getpid(), 9)\n"

@@ -2,8 +2,8 @@
 
 from typing import Any
 
-from hil.node import AmplifierNode, NmtState
-from hil.object_dictionary import Abort, SdoAbortError
+from hil.node.amplifier import AmplifierNode, NmtState
+from hil.node.object_dictionary import Abort, SdoAbortError
 from pkxyz_ctrl.can.codec import ProcessCodec
 from pkxyz_ctrl.can.frame import EXTENDED, Frame
 

@@ -6,8 +6,8 @@ from functools import cache
 import numpy as np
 from loop_rig import bus, controller, rows_of
 
-from hil.period_errors import PeriodErrors
-from hil.setup import Setup, bare_setup
+from hil.lanes.setup import Setup, bare_setup
+from hil.runs.period_errors import PeriodErrors
 from pkxyz_ctrl.learning import LearningConfig
 from pkxyz_ctrl.trajectory import Hold, Move, Raster, Trajectory
 

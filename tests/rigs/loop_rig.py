@@ -7,16 +7,16 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from hil import lanes
-from hil.scenario import load_scenario
-from hil.setup import Setup
-from pkxyz_ctrl import cycle as cycling
-from pkxyz_ctrl.bus_config import BusConfig
-from pkxyz_ctrl.config import load, plain
-from pkxyz_ctrl.controller_config import ControllerConfig
+from hil.lanes import either as lanes
+from hil.lanes.setup import Setup
+from hil.runs.scenario import load_scenario
+from pkxyz_ctrl.config.bus import BusConfig
+from pkxyz_ctrl.config.controller import ControllerConfig
+from pkxyz_ctrl.config.files import load, plain
 from pkxyz_ctrl.core import tick
 from pkxyz_ctrl.design.law import design_law
-from pkxyz_ctrl.row import ROW
+from pkxyz_ctrl.loop import cycle as cycling
+from pkxyz_ctrl.loop.row import ROW
 from pkxyz_ctrl.safety.modes import Event, Mode
 from pkxyz_ctrl.stage import Stage
 

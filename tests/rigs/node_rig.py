@@ -6,11 +6,11 @@ from pathlib import Path
 import canopen
 from crccheck.crc import Crc8Base
 
-from hil.clock import Lockstep
-from hil.node import AmplifierNode
+from hil.bus.clock import Lockstep
+from hil.node.amplifier import AmplifierNode
 from pkxyz_ctrl.can.frame import Frame
 
-EDS = Path(__file__).parents[1] / "configs" / "comb_amplifier.eds"
+EDS = Path(__file__).parents[2] / "configs" / "comb_amplifier.eds"
 NODE_ID = 10
 NMT, SYNC, EMCY, SENSE, DRIVE, REPLY, REQUEST, HEARTBEAT = 0x000, 0x080, 0x08A, 0x28A, 0x30A, 0x58A, 0x60A, 0x70A
 CONTROLLER = 0x77F

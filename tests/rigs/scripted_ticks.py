@@ -5,10 +5,10 @@ import sys
 import numpy as np
 from loop_rig import MIDDLE, Cycle, Rows, bus, controller_with, counts_at, law, setup, stage
 
-from hil.fast_lane import run_block
-from pkxyz_ctrl.cycle import new_memory
+from hil.lanes.fast import run_block
 from pkxyz_ctrl.design.law import design_law
-from pkxyz_ctrl.row import ROW
+from pkxyz_ctrl.loop.cycle import new_memory
+from pkxyz_ctrl.loop.row import ROW
 from pkxyz_ctrl.safety.modes import Event, Mode
 from pkxyz_ctrl.trajectory import Move, Trajectory
 

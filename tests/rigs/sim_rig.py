@@ -7,7 +7,7 @@ import numpy as np
 from sim.config import Device, PlantConfig
 from sim.plant import Plant
 
-CONFIGS = Path(__file__).parent.parent / "configs"
+CONFIGS = Path(__file__).parents[2] / "configs"
 DEVICE = Device.load(CONFIGS / "stages" / "reconstructed.toml")
 VOLT_PER_COUNT = 200 / 32767
 GRADIENT_F_PER_M = 2 * 360 * 8.8541878128e-12 * 100e-6 / 5e-6

@@ -6,9 +6,9 @@ import numpy as np
 from hypothesis import strategies as st
 from numpy.typing import NDArray
 
-from pkxyz_ctrl.config import load, plain
+from pkxyz_ctrl.config.files import load, plain
+from pkxyz_ctrl.config.stage import StageConfig
 from pkxyz_ctrl.stage import Stage
-from pkxyz_ctrl.stage_config import StageConfig
 
 Array = NDArray[np.float64]
 

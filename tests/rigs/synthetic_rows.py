@@ -4,9 +4,9 @@ import functools
 
 import numpy as np
 
-from hil.run_folder import metadata_of
-from hil.scenario import load_scenario, resolve
-from pkxyz_ctrl.row import ROW
+from hil.runs.run_folder import metadata_of
+from hil.runs.scenario import load_scenario, resolve
+from pkxyz_ctrl.loop.row import ROW
 from pkxyz_ctrl.safety.modes import Mode
 
 START_TICKS = 300

@@ -5,13 +5,13 @@ import json
 import pytest
 from learning_rig import LINES
 
-from hil.learning_figure import draw_learning
-from hil.replay import replay
-from hil.run_cli import learning_of
-from hil.run_folder import RunFolder
-from hil.scenario import load_scenario
-from hil.sil import run_into
-from pkxyz_ctrl.config import ConfigError
+from hil.commands.run import learning_of
+from hil.pictures.learning import draw_learning
+from hil.runs.in_process import run_into
+from hil.runs.replay import replay
+from hil.runs.run_folder import RunFolder
+from hil.runs.scenario import load_scenario
+from pkxyz_ctrl.config.files import ConfigError
 from pkxyz_ctrl.learning import LearningError
 from pkxyz_ctrl.learning.store import load
 

@@ -7,16 +7,16 @@ import pytest
 from learning_rig import PERIOD, errors_of, setup
 from loop_rig import first_difference
 
-from hil.fast_lane import run_block
-from hil.lanes import _sample_us
-from hil.learning_run import belongs
-from hil.period_errors import PeriodErrors
-from hil.wall_learning import LiveReference
-from pkxyz_ctrl.cycle import new_memory
+from hil.lanes.either import _sample_us
+from hil.lanes.fast import run_block
+from hil.lanes.live_reference import LiveReference
+from hil.runs.learning import belongs
+from hil.runs.period_errors import PeriodErrors
 from pkxyz_ctrl.learning import LearningConfig
 from pkxyz_ctrl.learning.store import Stored
 from pkxyz_ctrl.learning.timetable import FADE_TICKS
-from pkxyz_ctrl.row import ROW
+from pkxyz_ctrl.loop.cycle import new_memory
+from pkxyz_ctrl.loop.row import ROW
 from pkxyz_ctrl.safety.modes import Mode
 
 

@@ -6,8 +6,8 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from synthetic_rows import START_TICKS, default_scenario, tracking_rows
 
-from hil.metrics import METRICS, Metrics, evaluate
-from hil.scenario import Bound
+from hil.runs.metrics import METRICS, Metrics, evaluate
+from hil.runs.scenario import Bound
 from pkxyz_ctrl.safety.modes import Mode
 
 PERIOD_US = 200

@@ -5,21 +5,21 @@ import json
 
 import numpy as np
 import pytest
+from command_line import pkxyz
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 from loop_rig import Cycle, counts_at
-from test_hil_cli import pkxyz
 from typer.testing import CliRunner
 
 from hil.cli import app
-from hil.recording import Recording, RecordingError, RecordingWriter, journal_of
-from hil.replay import replay
-from hil.run_folder import RunFolder, metadata_of
-from hil.scenario import load_scenario, resolve, restore
-from hil.sil import run_into
-from pkxyz_ctrl.config import load, names
-from pkxyz_ctrl.controller_config import ControllerConfig
-from pkxyz_ctrl.row import CONTROLLER_FIELDS, ROW, columns
+from hil.recording.recording import Recording, RecordingError, RecordingWriter, journal_of
+from hil.runs.in_process import run_into
+from hil.runs.replay import replay
+from hil.runs.run_folder import RunFolder, metadata_of
+from hil.runs.scenario import load_scenario, resolve, restore
+from pkxyz_ctrl.config.controller import ControllerConfig
+from pkxyz_ctrl.config.files import load, names
+from pkxyz_ctrl.loop.row import CONTROLLER_FIELDS, ROW, columns
 from pkxyz_ctrl.safety.modes import Event, Mode
 
 INPUTS = {"request", "sense_status", "node_events", "overrun", "outside_trips", "sense_count"}

@@ -5,8 +5,8 @@ import re
 import pytest
 from synthetic_rows import default_scenario
 
-from hil.scenario import load_scenario, resolve
-from pkxyz_ctrl.config import CONFIG_DIR, ConfigError, digest
+from hil.runs.scenario import load_scenario, resolve
+from pkxyz_ctrl.config.files import CONFIG_DIR, ConfigError, digest
 
 DEFAULT = (CONFIG_DIR / "scenarios" / "raster.toml").read_text(encoding="utf-8")
 

@@ -10,7 +10,7 @@ from pkxyz_ctrl.safety.gate import PERMITTED, FrameKind
 from pkxyz_ctrl.safety.modes import TRANSITIONS, Mode
 from pkxyz_ctrl.safety.monitors import default_limits
 
-DOCS = Path(__file__).parents[1] / "docs"
+DOCS = Path(__file__).parents[2] / "docs"
 
 
 @pytest.fixture(scope="module")

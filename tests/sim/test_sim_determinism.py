@@ -68,7 +68,7 @@ def test_a_seed_is_a_run(name):
 
 
 PROGRAM = """
-import sys; sys.path.insert(0, "tests")
+import sys; sys.path[:0] = ["tests/rigs", "tests/sim"]
 from sim_rig import plant
 from test_sim_determinism import by_object, load
 import hashlib

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 from sim_rig import config, counts, plant
 
-from hil.bench.reference_motion import reference_motion
+from hil.bench.rigs.reference_motion import reference_motion
 
 PM = 1e-12
 

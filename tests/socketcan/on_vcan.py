@@ -29,12 +29,12 @@ import pyarrow.parquet  # noqa: F401
 import pytest
 
 from hil.cli import main
-from hil.recording import Recording
-from hil.replay import replay
-from hil.scenario import load_scenario
-from hil.wall_figure import draw_wall  # noqa: F401
-from hil.wall_plant import TRUTH
-from pkxyz_ctrl.config import CONFIG_DIR
+from hil.lanes.wall_plant import TRUTH
+from hil.pictures.wall import draw_wall  # noqa: F401
+from hil.recording.recording import Recording
+from hil.runs.replay import replay
+from hil.runs.scenario import load_scenario
+from pkxyz_ctrl.config.files import CONFIG_DIR
 from pkxyz_ctrl.safety.modes import Mode
 
 PERIOD_US = 10_000

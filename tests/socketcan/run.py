@@ -23,8 +23,8 @@ from pathlib import Path
 
 import matplotlib.font_manager  # noqa: F401  makes its list of fonts in the cache, which takes a guest a minute
 
-from hil import lanes
-from hil.scenario import load_scenario
+from hil.lanes import either as lanes
+from hil.runs.scenario import load_scenario
 
 ROOT = Path(__file__).parent.parent.parent
 SCRATCH = ROOT / ".uml"

@@ -5,7 +5,7 @@ import subprocess
 import sys
 from functools import cache
 
-from hil.compare import compare
+from hil.studies.compare import compare
 
 SCENARIO = "raster"
 
@@ -29,7 +29,7 @@ def test_feedback_is_better_than_none_and_the_traces_are_those_of_the_figures():
 def test_the_command_refuses_one_law_and_runs_the_others(tmp_path):
     """irc does not damp at 2 kHz: its reason stands in the table, and the exit code says that not all ran."""
     text = tmp_path / "slow.toml"
-    from pkxyz_ctrl.config import CONFIG_DIR
+    from pkxyz_ctrl.config.files import CONFIG_DIR
 
     source = (CONFIG_DIR / "scenarios" / "raster.toml").read_text(encoding="utf-8")
     text.write_text(source.replace('bus = "fd_5k"', 'bus = "classic_2k"'), encoding="utf-8")

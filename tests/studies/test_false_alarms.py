@@ -12,9 +12,9 @@ import pytest
 from loop_rig import rows_of, stage
 
 from hil.faults.fault import parse
-from hil.scenario import load_scenario
-from pkxyz_ctrl.config import load
-from pkxyz_ctrl.controller_config import MonitorConfig
+from hil.runs.scenario import load_scenario
+from pkxyz_ctrl.config.controller import MonitorConfig
+from pkxyz_ctrl.config.files import load
 from pkxyz_ctrl.safety.modes import LOOP_CLOSED, Mode
 from pkxyz_ctrl.safety.monitors import default_limits
 from pkxyz_ctrl.safety.trips import Trip

@@ -7,9 +7,9 @@ import pytest
 from loop_rig import first_difference, rows_of
 
 from hil.faults.catalogue import KINDS
-from hil.faults.matrix import CASES, CLEAR_S, ONSET_S
-from hil.faults.outcome import run_case, setup_for
-from pkxyz_ctrl.controller import StartUpError
+from hil.studies.faults.matrix import CASES, CLEAR_S, ONSET_S
+from hil.studies.faults.outcome import run_case, setup_for
+from pkxyz_ctrl.loop.controller import StartUpError
 from pkxyz_ctrl.safety.modes import LOOP_CLOSED, Mode
 from pkxyz_ctrl.safety.monitors import default_limits
 from pkxyz_ctrl.safety.trips import Trip

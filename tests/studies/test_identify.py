@@ -14,14 +14,14 @@ from sim_truth import truth_about
 from typer.testing import CliRunner
 
 from hil.cli import app
-from hil.excitation import Passage, excitation, tones
-from hil.identification import as_data, exciting, identify, modes_hz
-from hil.measured_loop import at_point
-from hil.outside_scale import outside_scale, read_points
-from hil.plant_response import _spectra, measure_plant
-from hil.setup import bare_setup
-from pkxyz_ctrl.config import ConfigError
-from pkxyz_ctrl.design.modal_fit import FitError, fit_modes
+from hil.lanes.excitation import Passage, excitation, tones
+from hil.lanes.setup import bare_setup
+from hil.studies.identify.identification import as_data, exciting, identify, modes_hz
+from hil.studies.identify.outside_scale import outside_scale, read_points
+from hil.studies.identify.plant_response import _spectra, measure_plant
+from hil.studies.margins.measured import at_point
+from pkxyz_ctrl.config.files import ConfigError
+from pkxyz_ctrl.design.identification.modal_fit import FitError, fit_modes
 from sim.geometry import strokes
 
 CHAINS = range(3)

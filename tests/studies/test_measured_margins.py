@@ -12,15 +12,15 @@ from loop_rig import MIDDLE, bus, law, setup, stage
 from typer.testing import CliRunner
 
 from hil.cli import app
-from hil.excitation import excitation, tones
-from hil.loop_margins import Loop, agreement, as_data, over_changed_plants
-from hil.measured_loop import MeasurementError, at_point, measure, sampled_margins
-from pkxyz_ctrl.config import ConfigError, load, parse, plain
+from hil.lanes.excitation import excitation, tones
+from hil.studies.margins.loop import Loop, agreement, as_data, over_changed_plants
+from hil.studies.margins.measured import MeasurementError, at_point, measure, sampled_margins
+from pkxyz_ctrl.config.files import ConfigError, load, parse, plain
 from pkxyz_ctrl.core.tick import LINEAR
 from pkxyz_ctrl.design.law_about import law_about
-from pkxyz_ctrl.design.loop_plant import NOMINAL, Perturbation, loop_plant
-from pkxyz_ctrl.design.margins import frequency_grid_hz, margins, peak_sensitivity
-from pkxyz_ctrl.design.tolerances import Tolerances
+from pkxyz_ctrl.design.margins.margins import frequency_grid_hz, margins, peak_sensitivity
+from pkxyz_ctrl.design.margins.tolerances import Tolerances
+from pkxyz_ctrl.design.model.loop_plant import NOMINAL, Perturbation, loop_plant
 from sim.config import PlantConfig
 
 OFF_CENTRE = np.array([7e-6, 15e-6, 11e-6])
@@ -198,7 +198,7 @@ def test_the_command_prints_what_was_computed_and_writes_pictures(tmp_path):
     done = run_command("--controller", "lqg_wide", "--json", "--out", str(tmp_path / "new"))
     assert done.exit_code == 0, done.output
     data = json.loads(done.stdout)
-    from pkxyz_ctrl.controller_config import ControllerConfig
+    from pkxyz_ctrl.config.controller import ControllerConfig
     from pkxyz_ctrl.design.law import design_law
 
     wide_law = design_law(stage(), load("controllers", "lqg_wide", ControllerConfig), bus(), autostart=True)

@@ -7,12 +7,12 @@ from loop_rig import setup
 from typer.testing import CliRunner
 
 from hil.cli import app
-from hil.montecarlo import Result, Results, Study, changed_plant, draw, run_one, run_study, summary, worst
-from hil.recording import Recording
-from hil.scenario import load_scenario
-from pkxyz_ctrl.config import ConfigError, load
-from pkxyz_ctrl.design.loop_plant import Perturbation
-from pkxyz_ctrl.design.tolerances import Tolerances
+from hil.recording.recording import Recording
+from hil.runs.scenario import load_scenario
+from hil.studies.montecarlo import Result, Results, Study, changed_plant, draw, run_one, run_study, summary, worst
+from pkxyz_ctrl.config.files import ConfigError, load
+from pkxyz_ctrl.design.margins.tolerances import Tolerances
+from pkxyz_ctrl.design.model.loop_plant import Perturbation
 
 
 def a_study(controller="lqg"):

@@ -3,12 +3,12 @@
 import numpy as np
 import pytest
 
-from hil.endpoint import Endpoint
+from hil.bus.endpoint import Endpoint
 from hil.faults.catalogue import KINDS
-from hil.node_drive import DriveReceiver
-from hil.recording import Recording
-from hil.scenario import load_scenario
-from hil.soak import random_faults, soak
+from hil.node.drive import DriveReceiver
+from hil.recording.recording import Recording
+from hil.runs.scenario import load_scenario
+from hil.studies.soak import random_faults, soak
 
 
 @pytest.fixture(scope="module")

@@ -8,14 +8,14 @@ from loop_rig import MIDDLE, bus, rows_of, setup, stage
 from typer.testing import CliRunner
 
 from hil.cli import app
-from hil.loop_margins import Loop, over_changed_plants
-from hil.search import UNUSABLE, evaluate, load_problem
-from hil.tuning import best, draw, nearest, open_study, rounded, search, write_controller
-from hil.workers import as_done, hands
-from pkxyz_ctrl.config import CONFIG_DIR, ConfigError, load, names
-from pkxyz_ctrl.controller_config import ControllerConfig
+from hil.studies.margins.loop import Loop, over_changed_plants
+from hil.studies.spread.workers import as_done, hands
+from hil.studies.tune.search import UNUSABLE, evaluate, load_problem
+from hil.studies.tune.tuning import best, draw, nearest, open_study, rounded, search, write_controller
+from pkxyz_ctrl.config.controller import ControllerConfig
+from pkxyz_ctrl.config.files import CONFIG_DIR, ConfigError, load, names
 from pkxyz_ctrl.design.law import design_law
-from pkxyz_ctrl.design.tolerances import Tolerances
+from pkxyz_ctrl.design.margins.tolerances import Tolerances
 
 LQG = (CONFIG_DIR / "searches" / "lqg.toml").read_text(encoding="utf-8")
 

@@ -5,7 +5,7 @@ import pytest
 from hypothesis import assume, given, settings
 from hypothesis import strategies as st
 
-from pkxyz_ctrl.config import CONFIG_DIR, FrozenModel, parse, read_toml
+from pkxyz_ctrl.config.files import CONFIG_DIR, FrozenModel, parse, read_toml
 from pkxyz_ctrl.stage import Stage
 from pkxyz_ctrl.trajectory import Hold, Move, Raster, Segment, Trajectory, TrajectoryError
 from pkxyz_ctrl.trajectory.check import check_against

@@ -3,8 +3,8 @@
 import numpy as np
 import pytest
 
-from hil.scenario import load_scenario
-from pkxyz_ctrl.config import names
+from hil.runs.scenario import load_scenario
+from pkxyz_ctrl.config.files import names
 from pkxyz_ctrl.stage import Stage
 from pkxyz_ctrl.trajectory import Circle, Hold, Move, Sine, Steps, Trajectory, TrajectoryError
 from pkxyz_ctrl.trajectory.check import DriveLimits, check_against, comb_forces

@@ -9,8 +9,8 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from scipy.interpolate import CubicSpline
 
-from hil.scenario import load_scenario, resolve
-from pkxyz_ctrl.config import CONFIG_DIR
+from hil.runs.scenario import load_scenario, resolve
+from pkxyz_ctrl.config.files import CONFIG_DIR
 from pkxyz_ctrl.trajectory import Hold, Move, Table, Trajectory, TrajectoryError
 from pkxyz_ctrl.trajectory.table import in_folder
 

@@ -6,12 +6,12 @@ from functools import cache
 import numpy as np
 from numpy.typing import NDArray
 
-from hil.blocks import PREVIEW_ROWS
-from hil.fast_lane import run_block
-from hil.scenario import load_scenario
-from hil.setup import Setup
-from pkxyz_ctrl.cycle import new_memory
-from pkxyz_ctrl.row import ROW
+from hil.lanes.blocks import PREVIEW_ROWS
+from hil.lanes.fast import run_block
+from hil.lanes.setup import Setup
+from hil.runs.scenario import load_scenario
+from pkxyz_ctrl.loop.cycle import new_memory
+from pkxyz_ctrl.loop.row import ROW
 from pkxyz_ctrl.safety.modes import Mode
 from sim.plant import Plant
 

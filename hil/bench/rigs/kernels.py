@@ -4,7 +4,7 @@ import numpy as np
 from numba import njit
 from numpy.typing import NDArray
 
-from pkxyz_ctrl.cycle import cycle
+from pkxyz_ctrl.loop.cycle import cycle
 from sim import kernels
 
 

@@ -7,10 +7,10 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from hil import lanes
-from hil.scenario import load_scenario
-from hil.setup import Setup
-from pkxyz_ctrl.config import ConfigError
+from hil.lanes import either as lanes
+from hil.lanes.setup import Setup
+from hil.runs.scenario import load_scenario
+from pkxyz_ctrl.config.files import ConfigError
 from pkxyz_ctrl.trajectory import Hold, Move, TimedSegment, Trajectory
 
 MIDDLE_M = 19.2495e-6

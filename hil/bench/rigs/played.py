@@ -5,13 +5,13 @@ from time import perf_counter_ns
 
 import numpy as np
 
-from hil.blocks import PREVIEW_ROWS, Blocks
-from hil.lockstep import LockstepRig
-from hil.setup import Setup
+from hil.lanes.blocks import PREVIEW_ROWS, Blocks
+from hil.lanes.lockstep import LockstepRig
+from hil.lanes.setup import Setup
 from pkxyz_ctrl.can import cob_id
 from pkxyz_ctrl.can.frame import Frame
-from pkxyz_ctrl.controller import Controller
-from pkxyz_ctrl.runtime import run, start
+from pkxyz_ctrl.loop.controller import Controller
+from pkxyz_ctrl.loop.runtime import run, start
 
 Stamped = tuple[Frame, int]
 

@@ -7,12 +7,12 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from hil.blocks import Blocks
-from hil.faults.matrix import CLEAR_S, Case
-from hil.lockstep import LockstepRig
-from hil.scenario import load_scenario
-from hil.setup import Setup
-from pkxyz_ctrl.controller import StartUpError
+from hil.lanes.blocks import Blocks
+from hil.lanes.lockstep import LockstepRig
+from hil.lanes.setup import Setup
+from hil.runs.scenario import load_scenario
+from hil.studies.faults.matrix import CLEAR_S, Case
+from pkxyz_ctrl.loop.controller import StartUpError
 from pkxyz_ctrl.safety.modes import LOOP_CLOSED, Mode
 from pkxyz_ctrl.safety.trips import Trip
 

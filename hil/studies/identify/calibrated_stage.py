@@ -8,9 +8,9 @@ from typing import Any
 import tomlkit
 from tomlkit.items import Table
 
-from hil.identification import KNOWN, Identification, provenance
-from pkxyz_ctrl.calibration_config import Calibration, MeasuredBy
-from pkxyz_ctrl.config import ConfigError, plain
+from hil.studies.identify.identification import KNOWN, Identification, provenance
+from pkxyz_ctrl.config.calibration import Calibration, MeasuredBy
+from pkxyz_ctrl.config.files import ConfigError, plain
 
 SUFFIX = "_calibrated"
 

@@ -9,16 +9,16 @@ from typing import Any, Literal
 import numpy as np
 from numpy.typing import NDArray
 
-from hil.excitation import Excitation, excitation, tones
-from hil.measured_loop import at_point
-from hil.outside_scale import OutsideScale
-from hil.plant_response import PlantResponse, measure_plant
-from hil.setup import Setup
-from pkxyz_ctrl.calibration_config import Calibration, SenseScale
-from pkxyz_ctrl.config import digest, plain
-from pkxyz_ctrl.design.calibrate import Calibrated, SenseGain, calibrate
-from pkxyz_ctrl.design.loop_plant import loop_plant
-from pkxyz_ctrl.design.modal_fit import MODES, ModalFit, fit_modes
+from hil.lanes.excitation import Excitation, excitation, tones
+from hil.lanes.setup import Setup
+from hil.studies.identify.outside_scale import OutsideScale
+from hil.studies.identify.plant_response import PlantResponse, measure_plant
+from hil.studies.margins.measured import at_point
+from pkxyz_ctrl.config.calibration import Calibration, SenseScale
+from pkxyz_ctrl.config.files import digest, plain
+from pkxyz_ctrl.design.identification.calibrate import Calibrated, SenseGain, calibrate
+from pkxyz_ctrl.design.identification.modal_fit import MODES, ModalFit, fit_modes
+from pkxyz_ctrl.design.model.loop_plant import loop_plant
 from pkxyz_ctrl.stage import Stage
 
 Array = NDArray[np.float64]

@@ -14,7 +14,7 @@ import numpy as np
 import scipy.optimize
 from numpy.typing import NDArray
 
-from pkxyz_ctrl.config import ConfigError
+from pkxyz_ctrl.config.files import ConfigError
 from pkxyz_ctrl.stage import Stage, StageDomainError
 
 Array = NDArray[np.float64]

@@ -14,10 +14,10 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from hil import lanes
-from hil.excitation import Excitation, Passage
-from hil.measured_loop import MeasurementError
-from hil.setup import Setup
+from hil.lanes import either as lanes
+from hil.lanes.excitation import Excitation, Passage
+from hil.lanes.setup import Setup
+from hil.studies.margins.measured import MeasurementError
 from pkxyz_ctrl.safety.modes import Mode
 
 Array = NDArray[np.float64]

@@ -9,12 +9,12 @@ import numpy as np
 import scipy.stats
 from numpy.typing import NDArray
 
-from hil.measured_loop import MeasuredLoop
-from pkxyz_ctrl.bus_config import BusConfig
+from hil.studies.margins.measured import MeasuredLoop
+from pkxyz_ctrl.config.bus import BusConfig
 from pkxyz_ctrl.design.law_about import law_about
-from pkxyz_ctrl.design.loop_plant import NOMINAL, Perturbation, loop_plant
-from pkxyz_ctrl.design.margins import LoopResponse, Margins, loop_response, margins, peak_sensitivity
-from pkxyz_ctrl.design.tolerances import Case
+from pkxyz_ctrl.design.margins.margins import LoopResponse, Margins, loop_response, margins, peak_sensitivity
+from pkxyz_ctrl.design.margins.tolerances import Case
+from pkxyz_ctrl.design.model.loop_plant import NOMINAL, Perturbation, loop_plant
 from pkxyz_ctrl.stage import Stage
 
 Array = NDArray[np.float64]

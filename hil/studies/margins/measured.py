@@ -12,10 +12,10 @@ import numpy as np
 import scipy.interpolate
 from numpy.typing import NDArray
 
-from hil import lanes
-from hil.excitation import Excitation
-from hil.setup import Setup
-from pkxyz_ctrl.design.margins import LoopResponse, Margins, margins_of_response
+from hil.lanes import either as lanes
+from hil.lanes.excitation import Excitation
+from hil.lanes.setup import Setup
+from pkxyz_ctrl.design.margins.margins import LoopResponse, Margins, margins_of_response
 from pkxyz_ctrl.stage import Stage
 from pkxyz_ctrl.trajectory import Hold, Move, Trajectory
 

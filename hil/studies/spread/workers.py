@@ -12,8 +12,8 @@ from contextlib import contextmanager
 from functools import lru_cache, partial
 from typing import Any, TypeVar, cast
 
-from hil.processes import processes
-from pkxyz_ctrl.config import ConfigError
+from hil.studies.spread.processes import processes
+from pkxyz_ctrl.config.files import ConfigError
 
 Item = TypeVar("Item")
 Result = TypeVar("Result")

@@ -14,22 +14,22 @@ from typing import TYPE_CHECKING, Annotated, Any, Literal, Self
 import numpy as np
 from pydantic import Field, model_validator
 
-from pkxyz_ctrl import config
-from pkxyz_ctrl.bus_config import BusConfig
-from pkxyz_ctrl.config import ConfigError, FrozenModel
-from pkxyz_ctrl.controller_config import ControllerConfig
-from pkxyz_ctrl.design.design_error import DesignError
-from pkxyz_ctrl.design.discrete_law import LawError
+from pkxyz_ctrl.config import files as config
+from pkxyz_ctrl.config.bus import BusConfig
+from pkxyz_ctrl.config.controller import ControllerConfig
+from pkxyz_ctrl.config.files import ConfigError, FrozenModel
 from pkxyz_ctrl.design.hold_noise import hold_noise_m
 from pkxyz_ctrl.design.law import design_law
 from pkxyz_ctrl.design.law_about import law_about
-from pkxyz_ctrl.design.loop_plant import loop_plant
-from pkxyz_ctrl.design.margins import margins, peak_sensitivity
-from pkxyz_ctrl.design.tolerances import Case, Tolerances
+from pkxyz_ctrl.design.margins.margins import margins, peak_sensitivity
+from pkxyz_ctrl.design.margins.tolerances import Case, Tolerances
+from pkxyz_ctrl.design.model.design_error import DesignError
+from pkxyz_ctrl.design.model.discrete_law import LawError
+from pkxyz_ctrl.design.model.loop_plant import loop_plant
 from pkxyz_ctrl.stage import Stage
 
 if TYPE_CHECKING:
-    from hil.setup import Setup
+    from hil.lanes.setup import Setup
 
 Text = Annotated[str, Field(min_length=1)]
 Positive = Annotated[float, Field(gt=0)]
@@ -235,8 +235,8 @@ def _beyond(goals: Goals, figures: dict[str, float]) -> dict[str, float]:
 
 def _run(search: SearchConfig, controller: ControllerConfig, plant: str) -> float:
     """RMS error in nm of the worst axis while scanning; NaN after a fault."""
-    from hil import lanes
-    from hil.metrics import Metrics
+    from hil.lanes import either as lanes
+    from hil.runs.metrics import Metrics
 
     setup = replace(_setup(search.scenario, search.stage, plant, search.bus), controller=controller)
     metrics = Metrics(setup.trajectory, setup.bus.period_us)
@@ -248,6 +248,6 @@ def _run(search: SearchConfig, controller: ControllerConfig, plant: str) -> floa
 @cache
 def _setup(scenario: str, stage: str, plant: str, bus: str) -> "Setup":
     """Read and checked once in a process; trials differ by their controller."""
-    from hil.scenario import load_scenario
+    from hil.runs.scenario import load_scenario
 
     return load_scenario(scenario, stage=stage, plant=plant, bus=bus).setup()

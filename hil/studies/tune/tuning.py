@@ -14,9 +14,9 @@ import numpy as np
 import optuna
 import tomlkit
 
-from hil.search import Problem, Worth, evaluate, put
-from hil.workers import as_done, given, hands
-from pkxyz_ctrl.config import ConfigError
+from hil.studies.spread.workers import as_done, given, hands
+from hil.studies.tune.search import Problem, Worth, evaluate, put
+from pkxyz_ctrl.config.files import ConfigError
 
 _DIGITS = 4
 """Significant digits of a tried number: what is tried is what the file will say."""

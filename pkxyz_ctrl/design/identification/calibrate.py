@@ -21,11 +21,11 @@ import scipy.optimize
 from numpy.typing import NDArray
 from pydantic import ValidationError
 
-from pkxyz_ctrl.calibration_config import Calibration, StandardErrors
-from pkxyz_ctrl.design.loop_plant import held_force_softening
-from pkxyz_ctrl.design.modal_fit import FitError, ModalFit, combined
+from pkxyz_ctrl.config.calibration import Calibration, StandardErrors
+from pkxyz_ctrl.config.stage import StageConfig
+from pkxyz_ctrl.design.identification.modal_fit import FitError, ModalFit, combined
+from pkxyz_ctrl.design.model.loop_plant import held_force_softening
 from pkxyz_ctrl.stage import Stage
-from pkxyz_ctrl.stage_config import StageConfig
 
 Array = NDArray[np.float64]
 

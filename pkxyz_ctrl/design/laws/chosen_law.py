@@ -9,16 +9,16 @@ import numpy as np
 import scipy.linalg
 from numpy.typing import NDArray
 
-from pkxyz_ctrl.bus_config import BusConfig
-from pkxyz_ctrl.controller_config import ControllerConfig
-from pkxyz_ctrl.design.discrete_law import DiscreteLaw, LawError, discretise, siso, stack
-from pkxyz_ctrl.design.glover_mcfarlane import hinf
-from pkxyz_ctrl.design.irc import irc
-from pkxyz_ctrl.design.loop_plant import LoopPlant, loop_plant
-from pkxyz_ctrl.design.margins import Margins, spectral_radius
-from pkxyz_ctrl.design.pi_notch import pi_notch
-from pkxyz_ctrl.design.user_law import UnstableLawError, discrete_law, require_robust, state_space
-from pkxyz_ctrl.law_config import SECTIONS, Linear, Matrices, Transfer
+from pkxyz_ctrl.config.bus import BusConfig
+from pkxyz_ctrl.config.controller import ControllerConfig
+from pkxyz_ctrl.config.laws import SECTIONS, Linear, Matrices, Transfer
+from pkxyz_ctrl.design.laws.glover_mcfarlane import hinf
+from pkxyz_ctrl.design.laws.irc import irc
+from pkxyz_ctrl.design.laws.pi_notch import pi_notch
+from pkxyz_ctrl.design.laws.user_law import UnstableLawError, discrete_law, require_robust, state_space
+from pkxyz_ctrl.design.margins.margins import Margins, spectral_radius
+from pkxyz_ctrl.design.model.discrete_law import DiscreteLaw, LawError, discretise, siso, stack
+from pkxyz_ctrl.design.model.loop_plant import LoopPlant, loop_plant
 from pkxyz_ctrl.stage import Stage
 
 Array = NDArray[np.float64]

@@ -12,10 +12,10 @@ from filterpy.common import van_loan_discretization
 from filterpy.kalman import KalmanFilter
 from numpy.typing import NDArray
 
-from pkxyz_ctrl.bus_config import BusConfig
-from pkxyz_ctrl.controller_config import EstimatorConfig
-from pkxyz_ctrl.design.design_error import DesignError
-from pkxyz_ctrl.design.plant_model import LinearStage, SampledStage
+from pkxyz_ctrl.config.bus import BusConfig
+from pkxyz_ctrl.config.controller import EstimatorConfig
+from pkxyz_ctrl.design.model.design_error import DesignError
+from pkxyz_ctrl.design.model.plant_model import LinearStage, SampledStage
 from pkxyz_ctrl.stage import Stage
 
 Array = NDArray[np.float64]

@@ -19,9 +19,9 @@ import numpy as np
 import scipy.linalg
 from numpy.typing import NDArray
 
-from pkxyz_ctrl.design.discrete_law import DiscreteLaw, LawError, discretise, siso, stack
-from pkxyz_ctrl.design.loop_plant import LoopPlant
-from pkxyz_ctrl.law_config import ShapingWeight
+from pkxyz_ctrl.config.laws import ShapingWeight
+from pkxyz_ctrl.design.model.discrete_law import DiscreteLaw, LawError, discretise, siso, stack
+from pkxyz_ctrl.design.model.loop_plant import LoopPlant
 
 Array = NDArray[np.float64]
 

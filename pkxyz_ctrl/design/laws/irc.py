@@ -18,10 +18,10 @@ import numpy as np
 import scipy.optimize
 from numpy.typing import NDArray
 
-from pkxyz_ctrl.design.discrete_law import DiscreteLaw, LawError, discretise, siso, stack
-from pkxyz_ctrl.design.gain_margin import radius
-from pkxyz_ctrl.design.loop_plant import LoopPlant
-from pkxyz_ctrl.law_config import Irc
+from pkxyz_ctrl.config.laws import Irc
+from pkxyz_ctrl.design.margins.gain_margin import radius
+from pkxyz_ctrl.design.model.discrete_law import DiscreteLaw, LawError, discretise, siso, stack
+from pkxyz_ctrl.design.model.loop_plant import LoopPlant
 
 Array = NDArray[np.float64]
 

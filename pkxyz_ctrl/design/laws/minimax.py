@@ -23,9 +23,9 @@ import scipy.optimize
 import scipy.signal
 from numpy.typing import NDArray
 
-from pkxyz_ctrl.design.discrete_law import DiscreteLaw, LawError, response
-from pkxyz_ctrl.design.loop_plant import LoopPlant
-from pkxyz_ctrl.design.margins import HALF_POWER
+from pkxyz_ctrl.design.margins.margins import HALF_POWER
+from pkxyz_ctrl.design.model.discrete_law import DiscreteLaw, LawError, response
+from pkxyz_ctrl.design.model.loop_plant import LoopPlant
 
 Array = NDArray[np.float64]
 Complex = NDArray[np.complex128]

@@ -12,10 +12,10 @@ import control
 import numpy as np
 from numpy.typing import NDArray
 
-from pkxyz_ctrl.design.discrete_law import DiscreteLaw, LawError, discretise, siso, stack
-from pkxyz_ctrl.design.gain_margin import gain_for_margin
-from pkxyz_ctrl.design.loop_plant import LoopPlant
-from pkxyz_ctrl.law_config import PiNotch
+from pkxyz_ctrl.config.laws import PiNotch
+from pkxyz_ctrl.design.margins.gain_margin import gain_for_margin
+from pkxyz_ctrl.design.model.discrete_law import DiscreteLaw, LawError, discretise, siso, stack
+from pkxyz_ctrl.design.model.loop_plant import LoopPlant
 
 Array = NDArray[np.float64]
 

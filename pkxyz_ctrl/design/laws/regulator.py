@@ -5,9 +5,9 @@ import numpy as np
 import scipy.linalg
 from numpy.typing import NDArray
 
-from pkxyz_ctrl.controller_config import RegulatorConfig
-from pkxyz_ctrl.design.design_error import DesignError
-from pkxyz_ctrl.design.plant_model import SampledStage
+from pkxyz_ctrl.config.controller import RegulatorConfig
+from pkxyz_ctrl.design.model.design_error import DesignError
+from pkxyz_ctrl.design.model.plant_model import SampledStage
 
 Array = NDArray[np.float64]
 

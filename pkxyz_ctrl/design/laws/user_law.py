@@ -6,9 +6,9 @@ import control
 import numpy as np
 import scipy.linalg
 
-from pkxyz_ctrl.design.discrete_law import DiscreteLaw, LawError, discretise, siso, stack
-from pkxyz_ctrl.design.loop_plant import LoopPlant
-from pkxyz_ctrl.design.margins import Margins, margins
+from pkxyz_ctrl.design.margins.margins import Margins, margins
+from pkxyz_ctrl.design.model.discrete_law import DiscreteLaw, LawError, discretise, siso, stack
+from pkxyz_ctrl.design.model.loop_plant import LoopPlant
 
 
 class UnstableLawError(LawError):

@@ -7,8 +7,8 @@ import numpy as np
 import scipy.optimize
 from numpy.typing import NDArray
 
-from pkxyz_ctrl.design.discrete_law import LawError
-from pkxyz_ctrl.design.loop_plant import LoopPlant
+from pkxyz_ctrl.design.model.discrete_law import LawError
+from pkxyz_ctrl.design.model.loop_plant import LoopPlant
 
 Array = NDArray[np.float64]
 

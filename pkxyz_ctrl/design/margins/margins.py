@@ -18,10 +18,10 @@ import numpy as np
 from numba import njit
 from numpy.typing import NDArray
 
-from pkxyz_ctrl.design.discrete_law import DiscreteLaw, response
-from pkxyz_ctrl.design.loop_plant import LoopPlant
-from pkxyz_ctrl.design.refine import crossings, first_above, peak
-from pkxyz_ctrl.design.sensitivity import Sensitivity, closed_loop
+from pkxyz_ctrl.design.margins.refine import crossings, first_above, peak
+from pkxyz_ctrl.design.margins.sensitivity import Sensitivity, closed_loop
+from pkxyz_ctrl.design.model.discrete_law import DiscreteLaw, response
+from pkxyz_ctrl.design.model.loop_plant import LoopPlant
 
 Array = NDArray[np.float64]
 Complex = NDArray[np.complex128]

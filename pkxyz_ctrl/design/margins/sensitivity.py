@@ -11,8 +11,8 @@ import scipy.linalg
 from numba import njit
 from numpy.typing import NDArray
 
-from pkxyz_ctrl.design.discrete_law import DiscreteLaw, LawError
-from pkxyz_ctrl.design.loop_plant import LoopPlant
+from pkxyz_ctrl.design.model.discrete_law import DiscreteLaw, LawError
+from pkxyz_ctrl.design.model.loop_plant import LoopPlant
 
 Array = NDArray[np.float64]
 Complex = NDArray[np.complex128]

@@ -8,8 +8,8 @@ import numpy as np
 from numpy.typing import NDArray
 from pydantic import Field, model_validator
 
-from pkxyz_ctrl.config import FrozenModel
-from pkxyz_ctrl.design.loop_plant import NOMINAL, Perturbation
+from pkxyz_ctrl.config.files import FrozenModel
+from pkxyz_ctrl.design.model.loop_plant import NOMINAL, Perturbation
 
 Array = NDArray[np.float64]
 Relative = Annotated[float, Field(ge=0, lt=1)]

@@ -15,8 +15,8 @@ import numpy as np
 import scipy.linalg
 from numpy.typing import ArrayLike, NDArray
 
-from pkxyz_ctrl.bus_config import BusConfig
-from pkxyz_ctrl.design.plant_model import linearise
+from pkxyz_ctrl.config.bus import BusConfig
+from pkxyz_ctrl.design.model.plant_model import linearise
 from pkxyz_ctrl.stage import Stage
 
 Array = NDArray[np.float64]

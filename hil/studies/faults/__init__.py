@@ -1,0 +1,1 @@
+"""Everything broken once, under every law, and what has to hold then."""

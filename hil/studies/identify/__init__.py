@@ -1,0 +1,1 @@
+"""What this very stage is, measured in the running loop."""

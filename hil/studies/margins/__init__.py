@@ -1,0 +1,1 @@
+"""How far a loop is from instability, computed and measured."""

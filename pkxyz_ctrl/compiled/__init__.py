@@ -1,0 +1,1 @@
+"""Where compiled kernels are kept, and how they are called without detours."""

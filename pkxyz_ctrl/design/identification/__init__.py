@@ -1,0 +1,1 @@
+"""From measured responses to modes, gains and springs."""

@@ -1,0 +1,1 @@
+"""Sensitivities, margins, and the changed plants over which they have to hold."""

@@ -1,0 +1,1 @@
+"""One period, from frames to frames: where core, safety and CAN meet."""
