@@ -1,4 +1,4 @@
-"""Takes every measurement anew, or those named, keeps it in benchmarks/results.json and redraws docs/performance.md.
+"""Takes every measurement anew, or those named, keeps it in benchmarks/results.json and redraws performance.md.
 
     python benchmarks/refresh.py [NAME ...]
 

@@ -1,4 +1,4 @@
-"""Writes docs/figures/bus_timing.png, one cycle on the simulated wire, and the generated tables of docs/bus.md.
+"""Writes docs/figures/bus_timing.png, one cycle on the simulated wire, and the generated tables of bus.md.
 
     python docs/figures/bus_timing.py
 
@@ -16,7 +16,7 @@ from hil.bus.frame_time import INTERFRAME_BITS, frame_bit_counts, frame_duration
 from hil.bus.wire import Wire
 from pkxyz_ctrl.can.frame import Frame
 
-PAGE = Path(__file__).parents[1] / "bus.md"
+PAGE = Path(__file__).parents[1] / "understand" / "bus.md"
 PICTURE = Path(__file__).with_suffix(".png")
 NOMINAL, FAST = 1_000_000, 5_000_000
 PERIOD_US, TURNAROUND_US, COMPUTE_US = 200, 2, 8  # configs/buses/fd_5k.toml

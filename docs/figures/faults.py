@@ -1,4 +1,4 @@
-"""Draws the matrix of faults, and fills in the tables of docs/faults.md. The matrix takes a minute or two.
+"""Draws the matrix of faults, and fills in the tables of docs/lookup/faults.md. The matrix takes a minute or two.
 
     python docs/figures/faults.py [SOAK.JSON]
 
@@ -20,7 +20,7 @@ from hil.studies.faults.outcome import Outcome
 from pkxyz_ctrl.config.files import names
 
 HERE = Path(__file__).parent
-PAGE = HERE.parent / "faults.md"
+PAGE = HERE.parent / "lookup" / "faults.md"
 
 
 def kinds() -> str:
@@ -63,7 +63,7 @@ def soaked(path: Path) -> str:
         f"time, {s['recorded_ticks']} of them read back; {s['faults']} faults, {s['decisions']} decisions, "
         f"{s['returns']} times back to tracking; memory {s['memory_mb'][1]:.0f} MB after two minutes and "
         f"{s['memory_mb'][-1]:.0f} MB at the end; damaged: {'yes' if s['damaged'] else 'no'}. The most frequent "
-        f"reasons: {reasons}.\n\n![memory, faults, decisions and returns, minute by minute](figures/soak.png)"
+        f"reasons: {reasons}.\n\n![memory, faults, decisions and returns, minute by minute](../figures/soak.png)"
     )
 
 

@@ -1,4 +1,4 @@
-"""Writes docs/figures/margins.png and the table of docs/margins.md: the shipped laws on ``fd_5k`` at mid-workspace, and
+"""Writes docs/figures/margins.png and the table of margins.md: the shipped laws on ``fd_5k`` at mid-workspace, and
 over the changed and the drawn plants.
 """
 
@@ -113,7 +113,7 @@ def main() -> None:
     """Draw the picture and put the table into its page."""
     all_loops = loops(Stage.load("reconstructed"), load("buses", "fd_5k", BusConfig))
     draw(all_loops).savefig(Path(__file__).with_suffix(".png"))
-    page = Path(__file__).parents[1] / "margins.md"
+    page = Path(__file__).parents[1] / "understand" / "margins.md"
     before, rest = page.read_text().split(BEGIN)
     page.write_text(before + BEGIN + table(all_loops) + END + rest.split(END)[1])
 

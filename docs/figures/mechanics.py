@@ -1,4 +1,4 @@
-"""Writes the figures of docs/mechanics.md, and its generated table.
+"""Writes the figures of docs/understand/mechanics.md, and its generated table.
 
     python docs/figures/mechanics.py
 
@@ -19,7 +19,7 @@ from pkxyz_ctrl.mechanics.selection import Requirements, select
 from pkxyz_ctrl.stage import Stage
 
 HERE = Path(__file__).parent
-PAGE = HERE.parent / "mechanics.md"
+PAGE = HERE.parent / "understand" / "mechanics.md"
 
 
 def numbers_table() -> str:

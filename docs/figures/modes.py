@@ -1,4 +1,4 @@
-"""Writes the generated parts of docs/safety.md: the mode diagram and the tables, each from the data that the code runs.
+"""Writes the generated parts of safety.md: the mode diagram and the tables, each from the data that the code runs.
 
     python docs/figures/modes.py
 
@@ -13,7 +13,7 @@ from pkxyz_ctrl.safety.modes import EVENT_MEANING, MODE_FACTS, TRANSITIONS, Even
 from pkxyz_ctrl.safety.sdo_rules import WRITE_RULES
 from pkxyz_ctrl.safety.trips import EXPLANATIONS
 
-PAGE = Path(__file__).parents[1] / "safety.md"
+PAGE = Path(__file__).parents[1] / "understand" / "safety.md"
 
 Rows = list[list[str]]
 

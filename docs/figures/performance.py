@@ -1,4 +1,4 @@
-"""Writes the generated tables of docs/performance.md and docs/figures/performance.png from benchmarks/results.json.
+"""Writes the generated tables of performance.md and docs/figures/performance.png from benchmarks/results.json.
 
     python docs/figures/performance.py
 
@@ -17,7 +17,7 @@ from hil.bench.figure import Figure
 from hil.commands.bench import bound_of, in_digits
 
 ROOT = Path(__file__).parents[2]
-PAGE = ROOT / "docs" / "performance.md"
+PAGE = ROOT / "docs" / "lookup" / "performance.md"
 PICTURE = Path(__file__).with_suffix(".png")
 RESULTS = ROOT / "benchmarks" / "results.json"
 

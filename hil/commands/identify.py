@@ -50,7 +50,9 @@ def identify(
     seed: Annotated[int, typer.Option(min=0, help="Of the noise and of the tones' phases.")] = 1,
     reference: Annotated[
         Path | None,
-        typer.Option(help="CSV of what an instrument outside saw (docs/identification.md): fixes the scale."),
+        typer.Option(
+            help="CSV of what an instrument outside saw (docs/understand/identification.md): fixes the scale."
+        ),
     ] = None,
     out: Annotated[
         Path | None, typer.Option(help="Folder to write; default: runs/identify_<plant>-<lane>-<n>.")

@@ -1,4 +1,4 @@
-"""The tables of docs/wire.md, made from the EDS; a test compares them with the page.
+"""The tables of docs/lookup/wire.md, made from the EDS; a test compares them with the page.
 
 ``python -m pkxyz_ctrl.can.wire_doc comb_amplifier.eds`` prints them.
 """

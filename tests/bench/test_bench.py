@@ -173,7 +173,7 @@ def test_imports_are_summed_by_package() -> None:
 
 def test_the_page_shows_the_committed_results() -> None:
     results = json.loads((ROOT / "benchmarks" / "results.json").read_text(encoding="utf-8"))
-    page = (ROOT / "docs" / "performance.md").read_text(encoding="utf-8")
+    page = (ROOT / "docs" / "lookup" / "performance.md").read_text(encoding="utf-8")
     assert drawing["rewritten"](page, results) == page
     measured = {f["name"].partition(".")[0] for f in results["figures"]}
     assert measured == set(suite.MEASUREMENTS)

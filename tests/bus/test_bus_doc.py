@@ -1,4 +1,4 @@
-"""The tables of docs/bus.md against the code that they describe, and its figure against the frame times."""
+"""The tables of docs/understand/bus.md against the code that they describe, and its figure against the frame times."""
 
 import runpy
 from pathlib import Path

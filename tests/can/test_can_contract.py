@@ -20,7 +20,7 @@ from pkxyz_ctrl.can.wire_doc import object_table, pdo_table
 ROOT = Path(__file__).resolve().parents[2]
 EDS = ROOT / "configs" / "comb_amplifier.eds"
 DBC = ROOT / "configs" / "comb_amplifier.dbc"
-WIRE_DOC = ROOT / "docs" / "wire.md"
+WIRE_DOC = ROOT / "docs" / "lookup" / "wire.md"
 
 counts = st.integers(-32768, 32767)
 drive_counts = st.integers(0, 32767)

@@ -135,7 +135,7 @@ def test_the_default_weights_bear_a_changed_stage_and_the_widest_do_not_bear_the
     ],
 )
 def test_weights_on_the_default_bus(weights, low_hz, high_hz):
-    """Order 24 is all the room there is; the margins are those of docs/margins.md."""
+    """Order 24 is all the room there is; the margins are those of docs/understand/margins.md."""
     plant = loop_plant(stage(), bus(), MIDDLE)
     law = gm.hinf(plant, weights).law
     found = margins(plant, law)

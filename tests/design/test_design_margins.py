@@ -283,7 +283,7 @@ def test_the_linear_equivalent_is_what_the_tick_does(delay_periods, strokes_m):
 
 
 def test_the_default_laws_margins():
-    """As shipped, on the default bus; docs/margins.md has these figures."""
+    """As shipped, on the default bus; docs/understand/margins.md has these figures."""
     found = margins(plant(), lqg())
     assert found.mimo.peak_s < 2.0
     assert found.mimo.disk_margin > 0.6

@@ -23,7 +23,7 @@ from mutants import Mutant, mutants
 from mutation_run import ROOT, TESTS, BaselineError, Subject, preload, run_mutants
 
 SURVIVORS = TESTS / "mutation" / "mutation_survivors.toml"
-REPORT = ROOT / "docs" / "mutation.md"
+REPORT = ROOT / "docs" / "lookup" / "mutation.md"
 STATE = ROOT / "runs" / "mutation.jsonl"
 SEED = 1
 FEW = 8  # mutants, for which it does not pay to measure the tests beforehand
@@ -152,7 +152,7 @@ def key_of(job: Job) -> tuple[str, str, str]:
 
 
 def report(jobs: list[Job], outcomes: dict[Job, str]) -> tuple[str, int]:
-    """The text of docs/mutation.md, and how many survivors have no reason."""
+    """The text of docs/lookup/mutation.md, and how many survivors have no reason."""
     reasons = known_survivors()
     met: Counter[tuple[str, str, str]] = Counter()
     rows, survivors, unexplained = [], [], 0
@@ -211,7 +211,7 @@ def main() -> int:
         help="only mutants with this in line or change, or as line number",
     )
     parser.add_argument("--fresh", action="store_true", help="forget what earlier runs found")
-    parser.add_argument("--report", action="store_true", help="write docs/mutation.md")
+    parser.add_argument("--report", action="store_true", help="write docs/lookup/mutation.md")
     arguments = parser.parse_args()
     begin_s = time.monotonic()
     modules = arguments.module or list(TARGETS)

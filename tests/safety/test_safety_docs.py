@@ -1,4 +1,4 @@
-"""docs/safety.md shows the tables that run, and every default that it explains."""
+"""docs/understand/safety.md shows the tables that run, and every default that it explains."""
 
 import importlib.util
 from pathlib import Path
@@ -24,7 +24,7 @@ def figures() -> ModuleType:
 
 
 def test_page_holds_the_current_tables(figures: ModuleType) -> None:
-    page = (DOCS / "safety.md").read_text(encoding="utf-8")
+    page = (DOCS / "understand" / "safety.md").read_text(encoding="utf-8")
     assert all(f"<!-- generated: {part} -->" in page for part in figures.PARTS)
     assert figures.filled_in(page) == page, "run: python docs/figures/modes.py"
 
@@ -71,6 +71,6 @@ def test_gate_table_reads_back(figures: ModuleType) -> None:
     ],
 )
 def test_defaults_are_as_explained(limit: str, fields: dict[str, float]) -> None:
-    assert limit in (DOCS / "safety.md").read_text(encoding="utf-8")
+    assert limit in (DOCS / "understand" / "safety.md").read_text(encoding="utf-8")
     for name, value in fields.items():
         assert (default_limits()[name] == value).all()

@@ -64,7 +64,7 @@ def test_bits_of_what_was_wrong_with_a_frame_and_a_node() -> None:
 
 
 # What may be written to the amplifier (node 10, controller 127, at most 1000 ms): objects, sub-indices, bytes, a value
-# that is permitted, and values that are not. docs/safety.md, CiA 301 and 401.
+# that is permitted, and values that are not. docs/understand/safety.md, CiA 301 and 401.
 OFF = 1 << 31
 WRITES = (
     (0x1005, 0x1005, 0, 0, 4, 0x80, (0x81, 0x40000080, 0)),
