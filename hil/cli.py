@@ -17,6 +17,7 @@ from rich.table import Table
 from hil.commands import bench as bench_cli
 from hil.commands import check_amplifier as check_amplifier_cli
 from hil.commands import compare as compare_cli
+from hil.commands import dbc as dbc_cli
 from hil.commands import faults as faults_cli
 from hil.commands import identify as identify_cli
 from hil.commands import latency as latency_cli
@@ -187,6 +188,7 @@ _COMMANDS: tuple[tuple[str, Callable[..., None], str], ...] = (
     ("run", run_cli.run, "Control an amplifier at rate."),
     ("plant", run_cli.plant, "Serve amplifier and plant for run."),
     ("check-amplifier", check_amplifier_cli.check_amplifier, "May this amplifier be enabled?"),
+    ("dbc", dbc_cli.dbc, "The DBC of a bus, for CAN tools."),
     ("latency", latency_cli.latency, "How late this machine wakes up."),
     ("paper", mechanics_cli.paper, "The paper's numbers beside ours."),
     ("workspace", mechanics_cli.workspace, "What the platform reaches and can hold."),

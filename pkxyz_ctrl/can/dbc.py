@@ -1,10 +1,6 @@
-"""The DBC of the bus, generated from the EDS, for cantools, python-can's viewer and everything else that reads DBCs.
-
-``python -m pkxyz_ctrl.can.dbc comb_amplifier.eds comb_amplifier.dbc`` writes it anew.
-"""
+"""The DBC of a bus, generated from the EDS, for cantools, python-can's viewer and everything else that reads DBCs."""
 
 import re
-import sys
 from collections import OrderedDict
 from pathlib import Path
 
@@ -14,33 +10,31 @@ from cantools.database.conversion import BaseConversion
 
 from . import cob_id
 from .cob_id import NmtCommand, NmtState
-from .codec import DRIVE_SCALE, AnalogScale
+from .codec import AnalogScale
+from .driver_config import DriverConfig
 
 CONTROLLER = "Controller"
 AMPLIFIER = "Amplifier"
-
-# The sense combs have 1.275e-7 F/m and 20 um of overlap at rest, so strokes of -2..27 um are 2.30..5.99 pF;
-# 16 bits over 2.15..6.15 pF are 2^-14 pF, about half a nanometre, a count.
-DEFAULT_SENSE_SCALE = AnalogScale(scale=2**-14 * 1e-12, offset=4.15e-12)
+GENERATED = "generated from "
+"""How the version of every DBC begins that was written here."""
 
 _DRIVE_INDEX = 0x6411
 _SENSE_INDEX = 0x6401
+_PROTECTION = (0x2000, 0x2001)  # alive counter and CRC-8 of both process PDOs
 _SIGNED_TYPES = canopen.objectdictionary.datatypes.SIGNED_TYPES
 _FEMTO = 1e15
 
 
 def database_from_eds(
-    eds_path: Path,
-    node_id: int = 10,
-    controller_node_id: int = 127,
-    drive_scale: AnalogScale = DRIVE_SCALE,
-    sense_scale: AnalogScale = DEFAULT_SENSE_SCALE,
+    eds_path: Path, driver: DriverConfig, drive_scale: AnalogScale, sense_scale: AnalogScale, origin: str
 ) -> Database:
-    """Every frame between controller and amplifier as the EDS's default values describe it.
+    """Every frame between the controller that ``driver`` configures and the amplifier of the EDS.
 
-    PDO signals follow the mapping entries; drive combs are scaled to V with ``drive_scale`` (V per count), sense combs
-    to fF with ``sense_scale`` (F per count, F). Raw values are the counts.
+    PDO signals follow the EDS's mapping, without alive counter and CRC if the driver has no protection; drive combs are
+    scaled to V with ``drive_scale`` (V per count), sense combs to fF with ``sense_scale`` (F per count, F). Raw values
+    are the counts. ``origin``, one line, tells a reader of the file where it is from.
     """
+    node_id = driver.node_id
     dictionary = canopen.import_od(str(eds_path), node_id)
     conversions = {
         _DRIVE_INDEX: ("V", _conversion(drive_scale, 1.0)),
@@ -55,17 +49,17 @@ def database_from_eds(
         _message(dictionary[0x1200][1].default, "SDO_request", CONTROLLER, _sdo_signals("SDO_request")),
         _message(dictionary[0x1200][2].default, "SDO_response", AMPLIFIER, _sdo_signals("SDO_response")),
         _heartbeat(AMPLIFIER, node_id),
-        _heartbeat(CONTROLLER, controller_node_id),
+        _heartbeat(CONTROLLER, driver.controller_node_id),
     ]
     for index in dictionary:
         if 0x1400 <= index < 0x1600:
-            messages.append(_pdo(dictionary, index, CONTROLLER, conversions))
+            messages.append(_pdo(dictionary, index, CONTROLLER, conversions, protected=driver.protection))
         elif 0x1800 <= index < 0x1A00:
-            messages.append(_pdo(dictionary, index, AMPLIFIER, conversions))
+            messages.append(_pdo(dictionary, index, AMPLIFIER, conversions, protected=driver.protection))
     return Database(
         messages=sorted(messages, key=lambda message: message.frame_id),
         nodes=[Node(CONTROLLER, "pkxyz_ctrl, the CANopen master"), Node(AMPLIFIER, f"comb amplifier, node {node_id}")],
-        version=f"generated from {eds_path.name}, node {node_id}",
+        version=f"{GENERATED}{origin}",
     )
 
 
@@ -79,6 +73,8 @@ def _pdo(
     index: int,
     sender: str,
     conversions: dict[int, tuple[str, BaseConversion]],
+    *,
+    protected: bool,
 ) -> Message:
     communication, entries = dictionary[index], dictionary[index + 0x200]
     signals = []
@@ -86,6 +82,8 @@ def _pdo(
     for place in range(1, entries[0].default + 1):
         entry = entries[place].default
         mapped_index, subindex, length = entry >> 16, entry >> 8 & 0xFF, entry & 0xFF
+        if mapped_index in _PROTECTION and not protected:
+            continue
         variable = dictionary.get_variable(mapped_index, subindex)
         unit, conversion = conversions.get(mapped_index, (None, BaseConversion.factory()))
         is_signed = variable.data_type in _SIGNED_TYPES
@@ -173,8 +171,3 @@ def _other(sender: str) -> str:
 
 def _identifier(name: str) -> str:
     return re.sub(r"\W+", "_", name)
-
-
-if __name__ == "__main__":
-    source, target = Path(sys.argv[1]), Path(sys.argv[2])
-    target.write_text(dbc_text(database_from_eds(source)), encoding="utf-8", newline="\n")

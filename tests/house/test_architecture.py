@@ -22,7 +22,7 @@ VALUES = ("enum", "typing", "dataclasses", "struct", "collections", "functools")
 ALLOWED: dict[str, tuple[str, ...]] = {
     "pkxyz_ctrl.core": ("pkxyz_ctrl.config.stage", *NUMBERS),
     "pkxyz_ctrl.safety": ("pkxyz_ctrl.can.frame", "numpy", "numba", *VALUES),
-    "pkxyz_ctrl.can.dbc": ("pkxyz_ctrl.can", "canopen", "cantools", "pathlib", "re", "sys", *VALUES),
+    "pkxyz_ctrl.can.dbc": ("pkxyz_ctrl.can", "canopen", "cantools", "pathlib", "re", *VALUES),
     "pkxyz_ctrl.can.wire_doc": ("canopen", "sys", *VALUES),
     "pkxyz_ctrl.can": ("pydantic", *VALUES),
     "pkxyz_ctrl.loop.cycle": ("pkxyz_ctrl.core", "pkxyz_ctrl.safety", "pkxyz_ctrl.loop.row", *NUMBERS, "typing"),
