@@ -5,10 +5,11 @@
 # make mutate change one thing at a time in gate, modes, monitors, comb law and codec: does a test notice? SECONDS=1200
 # make fuzz   hostile frames and broken documents: FRAMES=1000000 DOCUMENTS=10000
 # make docs   draw every figure of docs/ and fill in the generated tables
+# make docs-site  build the documentation into site/: open site/index.html
 PYTHON ?= python3
 BIN := .venv/bin
 
-.PHONY: sil test test-socketcan bench docs wheel clean mutate fuzz
+.PHONY: sil test test-socketcan bench docs docs-site wheel clean mutate fuzz
 
 sil: .venv/.ready
 	$(BIN)/pkxyz sil
@@ -37,6 +38,10 @@ fuzz: .venv/.ready
 docs: .venv/.ready
 	$(BIN)/python docs/build.py
 
+docs-site: .venv/.ready
+	NO_MKDOCS_2_WARNING=1 $(BIN)/mkdocs build --quiet
+	@echo "Open site/index.html"
+
 wheel: .venv/.ready
 	$(BIN)/pip wheel --quiet --no-deps --wheel-dir dist .
 
@@ -44,9 +49,9 @@ wheel: .venv/.ready
 .venv/.ready: pyproject.toml constraints.txt
 	@echo "Building the environment in .venv (a minute or two) ..."
 	$(PYTHON) -m venv .venv
-	$(BIN)/python -m pip install --quiet --disable-pip-version-check --constraint constraints.txt --editable ".[test]"
+	$(BIN)/python -m pip install --quiet --disable-pip-version-check --constraint constraints.txt --editable ".[test,docs]"
 	$(BIN)/python -m compileall -q pkxyz_ctrl hil sim
 	@touch $@
 
 clean:
-	rm -rf .venv dist runs
+	rm -rf .venv dist runs site

@@ -11,7 +11,7 @@ _VECTOR = ("f8", (3,))
 
 CONTROLLER_FIELDS = [
     ("t_us", "i8"),  # start of the tick since tick 0, us
-    ("tick", "i8"),
+    ("tick", "i8"),  # number of the tick, 0 for the first
     ("reference_tick", "i8"),  # index into the trajectory, -1 before tracking
     ("mode", "i4"),  # safety.modes.Mode after this tick
     ("request", "i4"),  # safety.modes.Event that was asked for from outside
@@ -19,17 +19,17 @@ CONTROLLER_FIELDS = [
     ("trips", "i8"),  # safety.monitors.Trip bits raised in this tick
     ("outside_trips", "i8"),  # those of them that came from outside the cycle: the gate, an operator
     ("sense_status", "i4"),  # bits of the driver about the sense frame of this tick
-    ("node_events", "i4"),
+    ("node_events", "i4"),  # bits of the driver: what the supervision of the node saw
     ("overrun", "i4"),  # ticks skipped before this one
     ("saturated", "i4"),  # 1 where a comb force met a bound
-    ("active_set_steps", "i4"),
+    ("active_set_steps", "i4"),  # active sets that the allocation tried; 1: no limit met, 0: no allocation
     ("solver_iterations", "i4"),  # of the predictive law's solver; 0 without one, negative if its answer was not used
-    ("sense_count", "i4", (3,)),
+    ("sense_count", "i4", (3,)),  # of the sense frame, as it was believed
     ("drive_count", "i4", (3,)),  # goes to the combs at the next SYNC
     ("reference_m", *_VECTOR),  # set-point at the sample of this tick
     ("measurement_m", *_VECTOR),  # position from this tick's sense frame alone, and the excitation, if there is one
     ("estimate_m", *_VECTOR),  # filtered position at the sample of this tick
-    ("estimate_m_per_s", *_VECTOR),
+    ("estimate_m_per_s", *_VECTOR),  # filtered velocity at the sample of this tick
     ("disturbance_n", *_VECTOR),  # estimated disturbance force at the platform
     ("innovation_m", *_VECTOR),  # measurement less its prediction
     ("demand_n", *_VECTOR),  # force at the platform that the law asks for
@@ -41,7 +41,7 @@ CONTROLLER_FIELDS = [
 
 TRUTH_FIELDS = [
     ("position_m", *_VECTOR),  # true position at the sample of this tick
-    ("stroke_m", *_VECTOR),
+    ("stroke_m", *_VECTOR),  # true strokes at the sample of this tick
     ("comb_voltage_v", *_VECTOR),  # true voltage at the combs at the sample, before the new drive acts
 ]
 

@@ -1,0 +1,89 @@
+"""The documentation's site: it builds without a warning, offline, and no page loads or names another host."""
+
+import re
+from html.parser import HTMLParser
+from pathlib import Path
+
+import pytest
+from generated_pages import commands, field_meanings
+from mkdocs.commands.build import build
+from mkdocs.config import load_config
+
+from pkxyz_ctrl.loop.row import ROW, columns
+
+ROOT = Path(__file__).parents[2]
+NAMESPACES = {"http://www.w3.org/2000/svg", "http://www.w3.org/1999/xlink", "http://www.w3.org/1999/xhtml"}
+
+
+@pytest.fixture(scope="module")
+def site(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    out = tmp_path_factory.mktemp("site")
+    build(load_config(str(ROOT / "mkdocs.yml"), site_dir=str(out)))  # strict: a warning, as of a dead link, is an error
+    return out
+
+
+class Addresses(HTMLParser):
+    """What a browser would fetch or follow, and the classes of all elements."""
+
+    def __init__(self, text: str) -> None:
+        super().__init__()
+        self.found: list[str] = []
+        self.classes: set[str] = set()
+        self.feed(text)
+
+    def handle_starttag(self, tag: str, attrs: list[tuple[str, str | None]]) -> None:
+        given = {name: value or "" for name, value in attrs}
+        self.found += [given[name] for name in ("src", "href", "srcset", "data", "action", "poster") if name in given]
+        self.classes.update(given.get("class", "").split())
+
+
+def test_no_page_names_another_host(site: Path) -> None:
+    pages = sorted(site.rglob("*.html"))
+    assert len(pages) > 20
+    for page in pages:
+        read = Addresses(page.read_text(encoding="utf-8"))
+        elsewhere = [a for a in read.found if re.match(r"(\w+:)?//", a)]
+        assert not elsewhere, f"{page.name}: {elsewhere}"
+        assert "mermaid" not in read.classes, f"{page.name}: the theme would fetch a renderer for this diagram"
+
+
+def test_styles_and_drawings_fetch_nothing(site: Path) -> None:
+    for path in [*site.rglob("*.css"), *site.rglob("*.svg")]:
+        text = path.read_text(encoding="utf-8")
+        fetched = re.findall(r"(?:url\(|@import|href=)\s*[\"']?((?:https?:)?//[^\"')\s]+)", text)
+        assert not set(fetched) - NAMESPACES, path.name
+
+
+def test_an_address_of_another_host_would_be_seen() -> None:
+    read = Addresses('<link href="https://fonts.example/x.css"><img src="//cdn.example/y.png"><a href="page.html">')
+    assert [a for a in read.found if re.match(r"(\w+:)?//", a)] == read.found[:2]
+
+
+def test_every_link_to_a_picture_or_page_has_its_file(site: Path) -> None:
+    for page in site.rglob("*.html"):
+        if page.name == "404.html":
+            continue  # is served from anywhere, so it has absolute addresses
+        for address in Addresses(page.read_text(encoding="utf-8")).found:
+            path = address.partition("#")[0].partition("?")[0]
+            if path and not re.match(r"(\w+:)", path) and not path.startswith("__"):
+                assert (page.parent / path).exists(), f"{page.relative_to(site)}: {address}"
+
+
+def test_every_command_and_its_options_are_on_the_page(site: Path) -> None:
+    text = (site / "lookup" / "commands.html").read_text(encoding="utf-8")
+    listed = dict(commands())
+    assert {"sil", "run", "plant", "check-amplifier", "configs"} <= set(listed)
+    for name, command in listed.items():
+        assert f"pkxyz {name}" in text
+        for parameter in command.params:
+            for option in parameter.opts:
+                assert getattr(parameter, "hidden", False) or not option.startswith("--") or option in text
+
+
+def test_every_column_is_on_the_page_with_its_meaning(site: Path) -> None:
+    meanings = field_meanings()
+    assert tuple(meanings) == ROW.names
+    assert all(len(words) > 3 for words in meanings.values()), [n for n, words in meanings.items() if len(words) <= 3]
+    text = (site / "lookup" / "recording.html").read_text(encoding="utf-8")
+    for field in meanings:
+        assert all(f"<code>{column}</code>" in text for column in columns(field))
