@@ -5,7 +5,8 @@ from types import TracebackType
 from typing import Self
 
 from hil.bus.endpoint import Endpoint
-from hil.bus.wire import ERROR_BUS, Wire
+from hil.bus.fault_confinement import ERROR_BUS
+from hil.bus.wire import Wire
 from pkxyz_ctrl.can.frame import BIT_RATE_SWITCH, ERROR, EXTENDED, FD, REMOTE, Frame
 
 BLOCK_FRAMES = 512  # formatted and written together: few enough to stay in the cache, 35 ms of a busy wire

@@ -123,6 +123,11 @@ def duration_ns_kernel(nominal_bitrate: int, data_bitrate: int, can_id: int, dat
     return int(nominal_ns + ((counts >> 16) * 1_000_000_000 + data_bitrate // 2) // data_bitrate)
 
 
+def bits_ns(n_bits: int, bitrate: int) -> int:
+    """Duration of ``n_bits`` at ``bitrate`` bit/s, to the nearest ns."""
+    return (n_bits * 1_000_000_000 + bitrate // 2) // bitrate
+
+
 def frame_flags(frame: Frame, error_passive: bool = False) -> int:
     """The flags of ``duration_ns_kernel``. Raises FrameFormatError for an error frame."""
     flags = frame.flags

@@ -8,23 +8,21 @@ in which the start of frame lies.
 
 from collections.abc import Callable
 from functools import partial
-from heapq import heapify, heappop
+from heapq import heappush
 from typing import NamedTuple
 
+from hil.bus.arbitration import Entry, arbitration_key, dominance, unqueue
 from hil.bus.clock import Lockstep
 from hil.bus.disturbance import Disturbance
-from hil.bus.endpoint import Endpoint, Entry, Listener, dominance
-from hil.bus.frame_time import INTERFRAME_BITS, duration_ns_kernel
+from hil.bus.endpoint import Endpoint, Kind, Listener
+from hil.bus.fault_confinement import ERROR_ACK, ERROR_PROTOCOL, FaultConfinement
+from hil.bus.frame_time import INTERFRAME_BITS, FrameFormatError, bits_ns, duration_ns_kernel, frame_duration_ns
 from pkxyz_ctrl.can.frame import Frame
 from pkxyz_ctrl.compiled.direct_call import direct
 
 ERROR_DELIMITER_BITS = 8  # the error flags themselves, 6 + 1 bits, lie where the frame's EOF would have been
-SUSPEND_BITS = 8  # an error-passive sender waits so long after its own frame
-RECOVERY_RUNS = 128  # of 11 recessive bits each
-RECESSIVE_RUN_BITS = 11  # also what ends every frame and error frame: delimiter or ACK delimiter and EOF, and 3 bits
-
-# classes of an error frame, as in linux/can/error.h
-ERROR_ACK, ERROR_PROTOCOL, ERROR_BUS_OFF, ERROR_BUS, ERROR_RESTARTED = 0x020, 0x008, 0x040, 0x080, 0x100
+_REMEMBERED = 1024  # identifiers, and durations of each
+_UNSEEN: Kind = (-1, 0, {})
 
 _duration_ns = direct(duration_ns_kernel, 0, 0, 0, b"", 0)
 
@@ -55,9 +53,12 @@ class Wire:
         self.disturbance = Disturbance(seed, self._look_closely)
         self._bitrates = nominal_bitrate, data_bitrate or nominal_bitrate
         self._duration_ns = partial(_duration_ns, *self._bitrates)
-        self._to_end_ns = 999 - self._bits_ns(INTERFRAME_BITS)  # to where the EOF ends, rounded up to a microsecond
+        self._error_delimiter_ns = bits_ns(ERROR_DELIMITER_BITS, nominal_bitrate)
+        self._to_end_ns = 999 - bits_ns(
+            INTERFRAME_BITS, nominal_bitrate
+        )  # to where the EOF ends, rounded up to a microsecond
+        self._confinement = FaultConfinement(clock, nominal_bitrate, self._idle_ns)
         self._endpoints: tuple[Endpoint, ...] = ()
-        self._nodes = 0  # endpoints that acknowledge
         self._order = 0
         self._frames = 0
         self._error_frames = 0
@@ -70,11 +71,9 @@ class Wire:
         self._start_ns = 0
         self._end_us = -1  # end of EOF; -1: idle, and what follows from the last frame is done
         self._free_ns = 0  # end of the latest interframe space
-        self._recovering: list[Endpoint] = []
         self._is_ordinary = False  # at least two nodes, and no error counted anywhere: a frame takes the short way
         self._has_queue = False  # somebody may have a frame to send besides the one on its way
         self._is_calm = False  # ordinary, idle and nothing queued: a frame that is sent has no rival
-        self._runs = 0  # of 11 recessive bits, counted while an endpoint recovers
         self._call_at, self._completion = clock.call_at, self._complete
 
     # -- endpoints ---------------------------------------------------------------------------------------------------
@@ -103,25 +102,24 @@ class Wire:
         endpoint = Endpoint(
             self, name, on_frame, queue_limit, on_full, on_sent, listen_only, error_frames, auto_recover
         )
-        self._nodes += not listen_only
         self._endpoints = (*self._endpoints, endpoint)
-        self._introduce()
+        self.introduce()
         return endpoint
 
-    def _introduce(self) -> None:
+    def introduce(self) -> None:
         """Tell every endpoint who is to get its frames."""
+        self._confinement.endpoints = self._endpoints
         for endpoint in self._endpoints:
             others = [e for e in self._endpoints if e is not endpoint]
             endpoint._listeners = tuple(e for e in others if e.on_frame is not None)
             endpoint._queues = tuple((e._received, e.queue_limit, e) for e in others if e.on_frame is None)
 
-    def _detach(self, endpoint: Endpoint) -> None:
+    def detach(self, endpoint: Endpoint) -> None:
+        """Unplug ``endpoint``; a frame of its that is on its way is cut off."""
         self._is_ordinary = self._is_calm = False
-        self._nodes -= not (endpoint.listen_only or endpoint.bus_off)
-        if endpoint in self._recovering:
-            self._recovering.remove(endpoint)
+        self._confinement.forget(endpoint)
         self._endpoints = tuple(e for e in self._endpoints if e is not endpoint)
-        self._introduce()
+        self.introduce()
         endpoint._unplug()
         if self._end_us >= 0 and not self._has_started():
             self._arbitrate()
@@ -139,6 +137,78 @@ class Wire:
         """Fraction of the time since ``since`` (None: since the wire was made) in which the wire was taken, 0..1."""
         now, then = self.statistics(), since or self._first
         return (now.busy_ns - then.busy_ns) / max(1, (now.t_us - then.t_us) * 1000)
+
+    # -- queues ------------------------------------------------------------------------------------------------------
+
+    def way_in(self, sender: Endpoint) -> Callable[[Frame], bool]:
+        """What ``Endpoint.send`` is: a function that holds its endpoint; another call would be felt in every tick."""
+        kinds, to_send = sender._kinds, sender._to_send
+
+        def send(frame: Frame) -> bool:
+            if self._is_calm and sender._medium is self:
+                # The short way, for speed: a frame of a kind that was sent before, with nothing else on its way.
+                can_id, data, flags = frame
+                known_flags, key, known_ns = kinds.get(can_id, _UNSEEN)
+                if flags == known_flags:
+                    duration_ns = (known_ns and known_ns.get(data)) or self._duration_ns(can_id, data, flags)
+                    if duration_ns > 0:
+                        self._is_calm = False
+                        self._sender = sender
+                        self._entry = entry = key, 0, frame, duration_ns
+                        to_send.append(entry)
+                        start_ns = self.clock.now_us * 1000
+                        if start_ns < self._free_ns:
+                            start_ns = self._free_ns
+                        self._start_ns = start_ns
+                        self._end_us = end_us = (start_ns + duration_ns + self._to_end_ns) // 1000
+                        self._call_at(end_us, self._completion)
+                        return True
+            return self._queue(sender, frame)
+
+        return send
+
+    def _queue(self, sender: Endpoint, frame: Frame) -> bool:
+        if sender._medium is not self or sender.listen_only:
+            raise RuntimeError(f"endpoint {sender.name!r} is {'listen-only' if sender._medium else 'detached'}")
+        is_passive = sender.is_passive
+        duration_ns = frame_duration_ns(frame, *self._bitrates, is_passive)
+        if frame.is_fd and self.data_bitrate is None:
+            raise FrameFormatError("a CAN FD frame on a classic wire (no data bit rate)")
+        if sender.bus_off or len(sender._to_send) >= sender.queue_limit:
+            sender.send_drops += 1
+            return False
+        key = arbitration_key(frame)
+        if not is_passive:
+            self._remember(sender._kinds, frame, key, duration_ns)
+        self._has_queue = True
+        self._order = order = self._order + 1
+        heappush(sender._to_send, (key, order, frame, duration_ns))
+        if not self._has_started():
+            self._arbitrate()
+        return True
+
+    @staticmethod
+    def _remember(kinds: dict[int, Kind], frame: Frame, key: int, duration_ns: int) -> None:
+        can_id, data, flags = frame
+        if can_id not in kinds and len(kinds) >= _REMEMBERED:
+            return
+        kind = kinds.get(can_id, _UNSEEN)
+        if kind[0] != flags:
+            kind = kinds[can_id] = flags, key, {}
+        if len(data) < 3 and len(kind[2]) < _REMEMBERED:  # SYNC and heartbeats recur; process data hardly ever does
+            kind[2][data] = duration_ns
+
+    def flush(self, endpoint: Endpoint) -> None:
+        """Discard what ``endpoint`` has queued, but not the frame on the wire."""
+        kept = [e for e in endpoint._to_send if self._has_started() and e is self._entry]
+        endpoint.send_drops += len(endpoint._to_send) - len(kept)
+        endpoint._to_send[:] = kept
+        if self._end_us >= 0 and not self._has_started() and self._sender is endpoint:
+            self._arbitrate()
+
+    def recover(self, endpoint: Endpoint) -> None:
+        """Bring ``endpoint`` back from bus-off."""
+        self._confinement.begin_recovery(endpoint)
 
     # -- transmission ------------------------------------------------------------------------------------------------
 
@@ -196,7 +266,7 @@ class Wire:
         self._busy_ns += duration_ns
         self._frames += 1
         if self._has_queue:
-            self._unqueue(sender, entry)
+            unqueue(sender._to_send, entry)
         else:
             sender._to_send.clear()
         try:
@@ -231,8 +301,7 @@ class Wire:
 
     def _complete_out_of_the_ordinary(self, t_us: int) -> None:
         sender, entry = self._sender, self._entry
-        if self._recovering:
-            self._runs += 1 + (self._start_ns - self._free_ns) // self._bits_ns(RECESSIVE_RUN_BITS)
+        self._confinement.count_runs(self._start_ns - self._free_ns)
         self._free_ns = self._start_ns + entry[3]
         self._busy_ns += entry[3]
         self._has_queue = True  # what was destroyed is sent again
@@ -243,68 +312,50 @@ class Wire:
             self._go_on()
 
     def _judge(self, sender: Endpoint, entry: Entry, t_us: int) -> None:
-        if self.disturbance.armed or self._nodes < 2 or self._rivals or sender._wire is None:
+        if self.disturbance.armed or self._confinement.is_alone() or self._rivals or sender._medium is None:
             self._complete_under_faults(sender, entry, t_us)
         else:
             self._confirm(sender, entry, t_us)
             self._deliver(entry[2], t_us, sender)
         self._is_ordinary = (
-            self._nodes >= 2
-            and not self.disturbance.armed
-            and not any(
-                e.transmit_errors or e.receive_errors or e.bus_off or e._earliest_ns > self._free_ns
-                for e in self._endpoints
-            )
+            not self.disturbance.armed
+            and not self._confinement.is_alone()
+            and self._confinement.is_everybody_well(self._free_ns)
         )
 
-    @staticmethod
-    def _unqueue(sender: Endpoint, entry: Entry) -> None:
-        to_send = sender._to_send
-        if to_send[0] is entry:
-            heappop(to_send)
-        else:
-            to_send.remove(entry)
-            heapify(to_send)
-
     def _confirm(self, sender: Endpoint, entry: Entry, t_us: int) -> None:
-        self._unqueue(sender, entry)
+        unqueue(sender._to_send, entry)
         self._frames += 1
-        if sender.transmit_errors or sender.receive_errors:
-            sender.transmit_errors = max(0, sender.transmit_errors - 1)
-            if sender._is_passive():
-                sender._earliest_ns = self._free_ns + self._bits_ns(SUSPEND_BITS)
+        self._confinement.sent(sender, self._free_ns)
         if sender.on_sent is not None:
             sender.on_sent(entry[2], t_us)
 
     def _deliver(self, frame: Frame, t_us: int, *senders: Endpoint) -> None:
         for endpoint in self._endpoints:
-            if endpoint in senders or endpoint.bus_off:
-                continue
-            if endpoint.receive_errors:
-                # a passive receiver returns to 119..127 (ISO 11898-1, 12.1.4.2 h): the upper end
-                endpoint.receive_errors = min(endpoint.receive_errors, 128) - 1
-            endpoint._take(frame, t_us)
+            if endpoint not in senders and not endpoint.bus_off:
+                self._confinement.received(endpoint)
+                endpoint._take(frame, t_us)
 
     # -- faults ------------------------------------------------------------------------------------------------------
 
     def _complete_under_faults(self, sender: Endpoint, entry: Entry, t_us: int) -> None:
         frame = entry[2]
-        rivals = [(e, its) for e, its in self._rivals if e._wire is not None]
+        rivals = [(e, its) for e, its in self._rivals if e._medium is not None]
         self._rivals = []
         involved = [sender, *(e for e, _ in rivals)]
         twins = [(sender, entry), *((e, its) for e, its in rivals if its[2] == frame)]  # the same bits: nobody notices
         losers = [e for e, its in rivals if its[2] != frame]
-        if sender._wire is None:  # unplugged in the middle
-            return self._count_error([], ERROR_PROTOCOL)
-        if any(not e._is_passive() for e in losers):
-            return self._count_error(involved, ERROR_PROTOCOL)
-        if self._nodes < 2:
-            return self._count_error([sender], ERROR_ACK)
+        if sender._medium is None:  # unplugged in the middle
+            return self._destroy([], ERROR_PROTOCOL)
+        if any(not e.is_passive for e in losers):
+            return self._destroy(involved, ERROR_PROTOCOL)
+        if self._confinement.is_alone():
+            return self._destroy([sender], ERROR_ACK)
         outcome = self.disturbance.judge(frame, sender.name, t_us) if self.disturbance.armed else None
         if outcome is not None and outcome.corrupt:
-            return self._count_error(involved, ERROR_PROTOCOL)
+            return self._destroy(involved, ERROR_PROTOCOL)
         for loser in losers:  # their passive error flags disturb nobody
-            self._count_transmit_error(loser, ERROR_PROTOCOL)
+            self._confinement.failed(loser, ERROR_PROTOCOL, self._free_ns)
         for twin, its in twins:
             self._confirm(twin, its, t_us)
         senders = [e for e, _ in twins]
@@ -317,79 +368,19 @@ class Wire:
     def _deliver_late(self, frame: Frame, *senders: Endpoint) -> None:
         self._deliver(frame, self.clock.now_us, *senders)
 
-    # -- fault confinement (ISO 11898-1, 12.1.4) ---------------------------------------------------------------------
-
-    def _count_error(self, senders: list[Endpoint], kind: int) -> None:
-        """Destroy the frame that just ended: error frame, counters, and its retransmission when the wire is free."""
-        self._is_ordinary = False
-        delimiter_ns = self._bits_ns(ERROR_DELIMITER_BITS)
-        self._free_ns += delimiter_ns
-        self._busy_ns += delimiter_ns
+    def _destroy(self, senders: list[Endpoint], kind: int) -> None:
+        """The frame that just ended is followed by an error frame, and sent again when the wire is free."""
+        self._free_ns += self._error_delimiter_ns
+        self._busy_ns += self._error_delimiter_ns
         self._error_frames += 1
-        for endpoint in senders:
-            self._count_transmit_error(endpoint, kind)
-        for endpoint in self._endpoints:
-            if endpoint not in senders and not endpoint.listen_only and not endpoint.bus_off:
-                endpoint.receive_errors = min(endpoint.receive_errors + 1, 128)
-        self._announce(kind | ERROR_BUS, senders[0] if senders else None)
+        self._confinement.destroyed(senders, kind, self._free_ns)
 
-    def _count_transmit_error(self, endpoint: Endpoint, kind: int) -> None:
-        self._is_ordinary = False
-        if kind != ERROR_ACK or not endpoint._is_passive():  # a node alone on its bus does not go bus-off
-            endpoint.transmit_errors += 8
-        if endpoint._is_passive():
-            endpoint._earliest_ns = self._free_ns + self._bits_ns(SUSPEND_BITS)
-        if endpoint.transmit_errors < 256:
-            return
-        endpoint.bus_off = True
-        endpoint.send_drops += len(endpoint._to_send)
-        endpoint._to_send.clear()  # what has waited so long would come as a surprise
-        self._nodes -= 1
-        self._announce(ERROR_BUS_OFF, endpoint)
-        if endpoint.auto_recover:
-            self._begin_recovery(endpoint)
-
-    def _begin_recovery(self, endpoint: Endpoint) -> None:
-        if endpoint in self._recovering:
-            return
-        self._recovering.append(endpoint)
-        endpoint._recovery_runs = self._recessive_runs() + RECOVERY_RUNS
-        self._await_recovery(endpoint)
-
-    def _recessive_runs(self) -> int:
-        """Runs of 11 recessive bits so far: one ends every frame, the others are the idle time."""
-        idle_until_ns = self.clock.now_us * 1000
-        if self._end_us >= 0:
-            idle_until_ns = min(idle_until_ns, self._start_ns)
-        return self._runs + max(0, idle_until_ns - self._free_ns) // self._bits_ns(RECESSIVE_RUN_BITS)
-
-    def _await_recovery(self, endpoint: Endpoint) -> None:
-        if endpoint not in self._recovering:
-            return
-        missing = endpoint._recovery_runs - self._recessive_runs()
-        if missing > 0:  # as early as it can be: while the wire is busy the runs come more slowly
-            idle_from_ns = max(self.clock.now_us * 1000, self._free_ns)
-            ready_ns = idle_from_ns + missing * self._bits_ns(RECESSIVE_RUN_BITS)
-            self.clock.call_at(-(-ready_ns // 1000), partial(self._await_recovery, endpoint))
-            return
-        self._recovering.remove(endpoint)
-        endpoint.bus_off = False
-        endpoint.transmit_errors = endpoint.receive_errors = 0
-        self._nodes += 1
-        self._announce(ERROR_RESTARTED, endpoint)
-
-    def _announce(self, kind: int, endpoint: Endpoint | None) -> None:
-        """Tell those who asked for error frames; bytes 6 and 7 are the endpoint's counters, as in linux/can/error.h."""
-        counters = (min(endpoint.transmit_errors, 255), endpoint.receive_errors) if endpoint is not None else (0, 0)
-        frame = Frame(kind, bytes((0, 0, 0, 0, 0, 0, *counters)), is_error=True)
-        for listener in self._endpoints:
-            if listener.error_frames:
-                listener._take(frame, self.clock.now_us)
-
-    # -- small change ------------------------------------------------------------------------------------------------
-
-    def _bits_ns(self, n_bits: int) -> int:
-        return (n_bits * 1_000_000_000 + self.nominal_bitrate // 2) // self.nominal_bitrate
+    # -- the time ----------------------------------------------------------------------------------------------------
 
     def _has_started(self) -> bool:
         return self._end_us >= 0 and self.clock.now_us * 1000 > self._start_ns
+
+    def _idle_ns(self) -> tuple[int, int]:
+        """From when to when the wire has been idle so far: until a transmission starts, or until now."""
+        now_ns = self.clock.now_us * 1000
+        return self._free_ns, min(now_ns, self._start_ns) if self._end_us >= 0 else now_ns

@@ -89,7 +89,7 @@ def test_frames_queued_at_any_time_follow_the_reference_schedule(
 
     What was sent before takes a shorter way through the code, and must not take a shorter one through time.
     """
-    clock, _, _, ends = wire_with("0", "1", "2")
+    clock, wire, _, ends = wire_with("0", "1", "2")
     if sent_before:
         for _, sender, frame in plan:
             ends[sender].send(frame)
@@ -97,7 +97,7 @@ def test_frames_queued_at_any_time_follow_the_reference_schedule(
     log: Seen = []
     begin_us = clock.now_us
     plan = [(begin_us + t_us, sender, frame) for t_us, sender, frame in plan]
-    listener = ends[0]._wire.attach("log", lambda frame, t_us: log.append((t_us, frame)), listen_only=True)
+    listener = wire.attach("log", lambda frame, t_us: log.append((t_us, frame)), listen_only=True)
     for t_us, sender, frame in plan:
         clock.call_at(t_us, lambda sender=sender, frame=frame: ends[sender].send(frame))
     clock.run_until(begin_us + 20_000)
@@ -256,6 +256,19 @@ def test_endpoints_come_and_go() -> None:
     listener = wire.attach("listener", listen_only=True)
     with pytest.raises(RuntimeError, match="listen-only"):
         listener.send(Frame(1, b""))
+
+
+def test_a_send_that_was_kept_from_before_is_refused_after_detaching() -> None:
+    """As a port keeps it; also where the short way would be open: calm wire, frame of a kind that was sent before."""
+    clock, _, seen, (_, b, _) = wire_with("a", "b", "c")
+    send, frame = b.send, Frame(1, b"")
+    for _ in range(3):
+        assert send(frame)
+        clock.run_until(clock.now_us + 1000)
+    b.detach()
+    with pytest.raises(RuntimeError, match="detached"):
+        send(frame)
+    assert [len(seen[name]) for name in "abc"] == [3, 0, 3]
 
 
 def test_flush_leaves_the_frame_on_the_wire_alone() -> None:

@@ -7,8 +7,9 @@ from hypothesis import strategies as st
 from hil.bus.clock import Lockstep
 from hil.bus.disturbance import CORRUPTED, DROPPED, Outcome
 from hil.bus.endpoint import ErrorState
+from hil.bus.fault_confinement import ERROR_ACK, ERROR_BUS, ERROR_BUS_OFF, ERROR_PROTOCOL, ERROR_RESTARTED
 from hil.bus.frame_time import frame_duration_ns
-from hil.bus.wire import ERROR_ACK, ERROR_BUS, ERROR_BUS_OFF, ERROR_PROTOCOL, ERROR_RESTARTED, Wire
+from hil.bus.wire import Wire
 from pkxyz_ctrl.can.frame import Frame
 
 BITRATE = 1_000_000
