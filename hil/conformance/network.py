@@ -2,8 +2,9 @@
 
 from itertools import pairwise
 
+from hil.conformance.deviation import DeviationError, NotTestedError, deviate_if
 from hil.conformance.talker import SETTLE_US, ZERO, Talker
-from hil.conformance.verdict import Check, DeviationError, NotTestedError, deviate_if
+from hil.conformance.verdict import Check
 from pkxyz_ctrl.can import cob_id
 from pkxyz_ctrl.can.cob_id import NmtCommand, NmtState
 

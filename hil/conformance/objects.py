@@ -2,10 +2,11 @@
 
 from collections.abc import Iterator
 
+from hil.conformance.deviation import DeviationError, NotTestedError, deviate_if
 from hil.conformance.eds import Variable
 from hil.conformance.sdo_client import Outcome, upload_request
 from hil.conformance.talker import Talker
-from hil.conformance.verdict import Check, DeviationError, NotTestedError, deviate_if
+from hil.conformance.verdict import Check
 from pkxyz_ctrl.can.sdo import abort_text
 from pkxyz_ctrl.can.startup import configuration_steps, identity_steps
 

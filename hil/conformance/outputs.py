@@ -2,9 +2,10 @@
 
 from collections.abc import Callable
 
+from hil.conformance.deviation import DeviationError, NotTestedError, deviate_if
 from hil.conformance.process import TEST_COUNTS
 from hil.conformance.talker import SETTLE_US, ZERO, Talker
-from hil.conformance.verdict import Check, DeviationError, NotTestedError, deviate_if
+from hil.conformance.verdict import Check
 from pkxyz_ctrl.can.cob_id import NmtCommand
 from pkxyz_ctrl.can.codec import Counts
 

@@ -4,8 +4,9 @@ from collections.abc import Iterator
 from itertools import pairwise
 from statistics import median
 
+from hil.conformance.deviation import DeviationError, NotTestedError, deviate_if
 from hil.conformance.talker import SETTLE_US, ZERO, Talker
-from hil.conformance.verdict import Check, DeviationError, NotTestedError, deviate_if
+from hil.conformance.verdict import Check
 from pkxyz_ctrl.can import cob_id
 from pkxyz_ctrl.can.codec import Counts
 from pkxyz_ctrl.can.emergency import code_text

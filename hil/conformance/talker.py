@@ -3,9 +3,9 @@
 from collections.abc import Callable
 
 from hil.conformance import sdo_client
+from hil.conformance.deviation import DeviationError
 from hil.conformance.eds import Variable
 from hil.conformance.sdo_client import Outcome
-from hil.conformance.verdict import DeviationError
 from pkxyz_ctrl.can import cob_id
 from pkxyz_ctrl.can.cob_id import NmtCommand
 from pkxyz_ctrl.can.codec import Counts, ProcessCodec

@@ -3,10 +3,9 @@
 from collections.abc import Callable
 from dataclasses import dataclass
 from enum import StrEnum
-from typing import TYPE_CHECKING
 
-if TYPE_CHECKING:
-    from hil.conformance.talker import Talker
+from hil.conformance.deviation import DeviationError, NotTestedError
+from hil.conformance.talker import Talker
 
 
 class Verdict(StrEnum):
@@ -15,22 +14,14 @@ class Verdict(StrEnum):
     NOT_TESTED = "NOT TESTED"
 
 
-class DeviationError(Exception):
-    """The node did something else than expected; the text says what came."""
-
-
-class NotTestedError(Exception):
-    """The check could not be made; the text says why. Not a verdict on the node."""
-
-
 @dataclass(frozen=True)
 class Check:
-    """One line. ``perform`` returns what came, or raises one of the two above."""
+    """One line. ``perform`` returns what came, or raises ``DeviationError`` or ``NotTestedError``."""
 
     group: str
     name: str
     expected: str
-    perform: "Callable[[Talker], str]"
+    perform: Callable[[Talker], str]
 
 
 @dataclass(frozen=True)
@@ -44,7 +35,7 @@ class Line:
     got: str
 
 
-def judge(check: Check, talker: "Talker") -> Line:
+def judge(check: Check, talker: Talker) -> Line:
     """Make one check."""
     try:
         verdict, got = Verdict.PASS, check.perform(talker)
@@ -53,15 +44,3 @@ def judge(check: Check, talker: "Talker") -> Line:
     except NotTestedError as reason:
         verdict, got = Verdict.NOT_TESTED, str(reason)
     return Line(check.group, check.name, verdict, check.expected, got)
-
-
-def first_few(deviations: list[str], limit: int = 6) -> str:
-    """A list for one line of a report."""
-    more = len(deviations) - limit
-    return "; ".join(deviations[:limit]) + (f"; and {more} more" if more > 0 else "")
-
-
-def deviate_if(deviations: list[str]) -> None:
-    """Raise ``DeviationError`` if there is anything in the list."""
-    if deviations:
-        raise DeviationError(first_few(deviations))
