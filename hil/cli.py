@@ -24,6 +24,7 @@ from hil.commands import latency as latency_cli
 from hil.commands import margins as margins_cli
 from hil.commands import mechanics as mechanics_cli
 from hil.commands import montecarlo as montecarlo_cli
+from hil.commands import new as new_cli
 from hil.commands import replay as replay_cli
 from hil.commands import run as run_cli
 from hil.commands import soak as soak_cli
@@ -31,6 +32,7 @@ from hil.commands import tune as tune_cli
 from hil.screen.choices import Lane
 from hil.screen.first_run import say_if_compiling
 from hil.screen.outputs import what_to_do
+from hil.screen.tables import error_lines, print_whole
 from pkxyz_ctrl.config.files import CONFIG_DIR, ConfigError, find, names
 
 app = typer.Typer(
@@ -39,6 +41,7 @@ app = typer.Typer(
     add_completion=False,
     pretty_exceptions_enable=False,
     rich_markup_mode=None,
+    context_settings={"help_option_names": ["-h", "--help"]},
 )
 _screen = Console(highlight=False)
 _notes = Console(stderr=True, highlight=False)
@@ -162,17 +165,17 @@ def sil(
 
 
 def configs(as_json: Annotated[bool, typer.Option("--json", help="Print JSON.")] = False) -> None:
-    """List the shipped configurations."""
+    """List the shipped configurations, with the folder of each kind: NAME is the file NAME.toml in it."""
     found = {kind: {name: _description(CONFIG_DIR / kind / f"{name}.toml") for name in names(kind)} for kind in KINDS}
     if as_json:
         print(json.dumps(found))
         return
     table = Table(box=None, pad_edge=False, show_header=False)
     for kind, entries in found.items():
-        table.add_row(f"[bold]{kind}[/]")
+        table.add_row(f"[bold]{kind}[/]", f"[dim]{CONFIG_DIR / kind}/[/]")
         for name, words in entries.items():
             table.add_row(f"  {name}", words)
-    _screen.print(table)
+    print_whole(_screen, table)
 
 
 _COMMANDS: tuple[tuple[str, Callable[..., None], str], ...] = (
@@ -194,7 +197,8 @@ _COMMANDS: tuple[tuple[str, Callable[..., None], str], ...] = (
     ("workspace", mechanics_cli.workspace, "What the platform reaches and can hold."),
     ("design", mechanics_cli.design, "Dimensions from requirements."),
     ("linearisation", mechanics_cli.linearisation, "What one constant Jacobian costs."),
-    ("configs", configs, "What is shipped."),
+    ("configs", configs, "What is shipped, and where."),
+    ("new", new_cli.new, "A commented file to start from."),
     ("bench", bench_cli.bench, "What is promised, measured."),
 )
 for _name, _command, _words in _COMMANDS:
@@ -235,6 +239,8 @@ def _show(summary: dict[str, Any], folder: Path) -> None:
         f"{summary['scenario']}, {summary['lane']} lane, seed {summary['seed']}: {summary['ticks']} ticks{pace}"
     )
     _screen.print(table)
+    for line in error_lines(summary):
+        _screen.print(line)
     for fault in summary.get("faults") or []:
         _screen.print(f"[red]fault[/]: {fault}", markup=True)
     if summary["interrupted"]:

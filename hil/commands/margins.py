@@ -161,7 +161,7 @@ def _write(
 
 _WHILE_FREE = "while no plan meets a limit"
 
-_COLUMNS = ("", "Ms", "Mt", "disk", "-3 dB (Hz)", "gain", "phase (deg)", "delay (us)")
+_COLUMNS = ("", "Ms", "Mt", "disk", "-3 dB (Hz)", "gain (dB)", "phase (deg)", "delay (us)")
 """Peaks of S and T, disk margin, where |S| passes -3 dB, and the margins of gain, phase and delay."""
 
 
@@ -200,7 +200,7 @@ def _rows(table: Table, found: "Margins", suffix: str) -> None:
     for name, axis in zip("xyz", found.axes, strict=True):
         phase = "any" if math.isinf(axis.phase_margin_rad) else f"{math.degrees(axis.phase_margin_rad):.1f}"
         delay = "any" if math.isinf(axis.delay_margin_s) else f"{axis.delay_margin_s * 1e6:.0f}"
-        gain = "any" if math.isinf(axis.gain_margin) else f"{axis.gain_margin:.2f}"
+        gain = "any" if math.isinf(axis.gain_margin) else f"{20.0 * math.log10(axis.gain_margin):.1f}"
         table.add_row(name + suffix, *_sensitivities(axis), gain, phase, delay)
     table.add_row("MIMO" + suffix, *_sensitivities(found.mimo), "", "", "")
 

@@ -177,20 +177,20 @@ def _print_workspace(data: dict[str, Any]) -> None:
     volume, cube = data["volume_um3"], data["inscribed_cube_um"]
     _screen.print(f"Stage {data['stage']}, limit {data['v_max']:g} V")
     table = Table(box=None, pad_edge=False, show_header=False)
-    table.add_row("volume, exact", f"{volume['exact']:.1f} µm³", f"linear {volume['linear']:.1f} µm³")
-    share = f"{volume['held_share']:.1%} of it, ± {volume['held_error']:.2g} µm³"
-    table.add_row(f"held with {data['v_max']:g} V", f"{volume['held']:.1f} µm³", share)
+    table.add_row("volume, exact", f"{volume['exact']:.1f} um^3", f"linear {volume['linear']:.1f} um^3")
+    share = f"{volume['held_share']:.1%} of it, ± {volume['held_error']:.2g} um^3"
+    table.add_row(f"held with {data['v_max']:g} V", f"{volume['held']:.1f} um^3", share)
     for axis in "xyz":
         (low, high), (flat_low, flat_high) = (data["extents_um"][kind][axis] for kind in ("exact", "linear"))
-        table.add_row(axis, f"{low:.2f} to {high:.2f} µm", f"linear {flat_low:.2f} to {flat_high:.2f} µm")
+        table.add_row(axis, f"{low:.2f} to {high:.2f} um", f"linear {flat_low:.2f} to {flat_high:.2f} um")
     table.add_row(
         "inscribed cube",
-        f"{cube['standing']:.2f} µm",
-        f"standing on its corner; along x, y, z {cube['along_axes']:.2f} µm",
+        f"{cube['standing']:.2f} um",
+        f"standing on its corner; along x, y, z {cube['along_axes']:.2f} um",
     )
     _screen.print(table)
     corners = Table(box=None, pad_edge=False, header_style="dim")
-    for heading in ("corner: strokes (µm)", "position (µm)", "needs (V)"):
+    for heading in ("corner: strokes (um)", "position (um)", "needs (V)"):
         corners.add_column(heading, justify="right")
     for corner in data["corners"]:
         strokes, position = (", ".join(f"{v:.4g}" for v in corner[k]) for k in ("stroke_um", "position_um"))
@@ -293,7 +293,7 @@ def _report_design(chosen: "Selection", out: Path, as_json: bool) -> None:
     if as_json:
         print(json.dumps(data, allow_nan=False))
         return
-    _screen.print(f"L1 = {data['l1_um']:.1f} µm, L2 = {data['l2_um']:.1f} µm, alpha_0 = {data['alpha_0_rad']:.4f} rad")
+    _screen.print(f"L1 = {data['l1_um']:.1f} um, L2 = {data['l2_um']:.1f} um, alpha_0 = {data['alpha_0_rad']:.4f} rad")
     table = Table(box=None, pad_edge=False, header_style="dim")
     table.add_column("requirement")
     table.add_column("margin", justify="right")

@@ -2,6 +2,7 @@
 
 import dataclasses
 import json
+import shlex
 from pathlib import Path
 from typing import Annotated, Any
 
@@ -73,7 +74,12 @@ def montecarlo(
     if as_json:
         print(json.dumps(data, allow_nan=False))
     else:
-        _show(data)
+        options = {
+            "--tolerances": tolerances, "--controller": controller, "--stage": stage, "--plant": plant, "--bus": bus,
+            "--out": str(out), "--replay": str(data["worst_seed"]),
+        }  # fmt: skip
+        words = [word for name, value in options.items() if value is not None for word in (name, value)]
+        _show(data, shlex.join(["pkxyz", "montecarlo", scenario, *words]))
     raise typer.Exit(130 if interrupted else 1 if data["not_held"] else 0)
 
 
@@ -98,7 +104,7 @@ def _replay(study: Any, seed: int, out: Path, *, as_json: bool) -> None:
     raise typer.Exit(0 if result.ok else 1)
 
 
-def _show(data: dict[str, Any]) -> None:
+def _show(data: dict[str, Any], worst_alone: str) -> None:
     _screen.print(f"{data['controller']}, {data['scenario']}, {data['plants']} plants of {data['tolerances']!r}")
     table = Table(box=None, pad_edge=False, header_style="dim")
     for n, heading in enumerate(("", "median", "95 %", "largest", "its seed")):
@@ -109,4 +115,4 @@ def _show(data: dict[str, Any]) -> None:
     print_whole(_screen, table)
     if data["not_held"]:
         _screen.print(f"[bold red]{data['not_held']} did not hold[/]", markup=True)
-    _screen.print(f"the worst one alone: pkxyz montecarlo ... --replay {data['worst_seed']}", soft_wrap=True)
+    _screen.print(f"the worst one alone: {worst_alone}", soft_wrap=True)

@@ -8,6 +8,7 @@ from typing import Annotated, Any
 import typer
 
 from hil.screen.first_run import say_if_compiling
+from hil.screen.tables import error_lines
 from pkxyz_ctrl.config.files import ConfigError
 
 Scenario = Annotated[str, typer.Argument(help="A shipped scenario's name or a TOML file.")]
@@ -170,10 +171,8 @@ def _show(summary: dict[str, Any], folder: Path) -> None:
         f"{summary['scenario']} on {summary['bus']}: {summary['ticks']} ticks, {summary['missed_ticks']} missed, woken "
         f"{late['p50']} us late in the middle, {late['p99_9']} us at p99.9, {late['max']} us at most"
     )
-    for name in ("rms_error_nm", "hold_noise_nm"):
-        if summary[name]:
-            numbers = " / ".join(f"{value:.2f}" for value in summary[name].values())
-            print(f"{name.removesuffix('_nm').replace('_', ' ')}, by the estimate: {numbers} nm")
+    for line in error_lines(summary):
+        print(line)
     for check in summary["checks"]:
         if check["ok"] is False:
             print(f"check fails: {check['name']} = {check['value']}")

@@ -108,7 +108,8 @@ def _explain(source: str, item: dict[str, Any], model: type[BaseModel]) -> str:
     location = [str(part) for part in item["loc"]]
     key = ".".join(location)
     if item["type"] == "extra_forbidden":
-        return f"{source}: {key}: unknown key; {_remedy_for_unknown(location[-1], _fields_at(item['loc'][:-1], model))}"
+        known = [name for m in models_at(item["loc"][:-1], model) for name in m.model_fields]
+        return f"{source}: {key}: unknown key; {_remedy_for_unknown(location[-1], known)}"
     if item["type"] == "missing":
         return f"{source}: {key}: missing; add this key{_unit_hint(location[-1])}"
     message = str(item["msg"]).removeprefix("Value error, ")
@@ -147,8 +148,8 @@ def _remedy_for_unknown(key: str, fields: list[str]) -> str:
     return f"did you mean {near[0]!r}?" if near else f"known here: {', '.join(fields)}"
 
 
-def _fields_at(location: tuple[int | str, ...], model: type[BaseModel]) -> list[str]:
-    """Names of the fields at a place of a nested model; of all that may stand there, where the place doesn't tell."""
+def models_at(location: tuple[int | str, ...], model: type[BaseModel]) -> list[type[BaseModel]]:
+    """The models that may stand at a place of a nested model: one, or several where the place doesn't tell which."""
     models = [model]
     for part in location:
         if isinstance(part, int):
@@ -156,7 +157,7 @@ def _fields_at(location: tuple[int | str, ...], model: type[BaseModel]) -> list[
         tagged = [m for m in models if "kind" in m.model_fields and part in _values(m.model_fields["kind"].annotation)]
         stepped = [_models(m.model_fields[part].annotation) for m in models if part in m.model_fields]
         models = tagged or [m for found in stepped for m in found] or models
-    return [name for m in models for name in m.model_fields]
+    return models
 
 
 def _models(annotation: Any) -> list[type[BaseModel]]:
