@@ -9,6 +9,7 @@ from hil.conformance.sdo_client import Outcome
 from pkxyz_ctrl.can import cob_id
 from pkxyz_ctrl.can.cob_id import NmtCommand
 from pkxyz_ctrl.can.codec import Counts, ProcessCodec
+from pkxyz_ctrl.can.driver_config import OUR_TIMEOUT_MAX_MS
 from pkxyz_ctrl.can.frame import Frame
 from pkxyz_ctrl.can.startup import configuration_steps
 from pkxyz_ctrl.config.bus import BusConfig
@@ -148,7 +149,8 @@ class Talker:
     def operational(self) -> None:
         """From reset to operational as our driver does it. What it could not write, the line on configuration tells."""
         self.reset()
-        for step in configuration_steps(self.driver):
+        unhurried = self.driver.model_copy(update={"drive_timeout_ms": OUR_TIMEOUT_MAX_MS})  # SDO reads come in between
+        for step in configuration_steps(unhurried):
             if step.write and step.value is not None:
                 self.write(step.index, step.subindex, step.value, step.size)
         self.beating = True

@@ -71,7 +71,6 @@ class Setup:
             controller_node_id=driver.controller_node_id,
             protection=driver.protection,
             fd=driver.fd,
-            drive_timeout_syncs=driver.drive_timeout_syncs,
             heartbeat_timeout_max_ms=OUR_TIMEOUT_MAX_MS,
         )
 

@@ -71,6 +71,9 @@ class AmplifierNode:
         self._receivers: dict[int, Receiver] = {}  # by COB-ID, only what the present state lets in
         self._holds: set[int] = set()  # errors that keep the outputs at their error values
         self._silent_syncs = 0
+        self._step_max = 0
+        self._drive_timeout_us = 0
+        self._drive_deadline = Alarm(clock, self._drive_overdue)
         self._sync_following: dict[bytes, bytes] = {}
         self._sync_expected: bytes | None = None
 
@@ -172,7 +175,7 @@ class AmplifierNode:
 
     def _boot(self, now_us: int) -> None:
         self._send_heartbeat()  # state 0: the boot-up message
-        for index in (0x1005, 0x1016):
+        for index in (0x1005, 0x1016, 0x2011):
             self._configure(index)
         self._heartbeat.configure(1000 * self.od[0x1017, 0], beat_now=False)
         self._enter(NmtState.PRE_OPERATIONAL)
@@ -205,7 +208,7 @@ class AmplifierNode:
         self._plant.advance_to(t_us)
         pending = self._drive.pending
         if pending is not None:
-            self._apply(pending)
+            self._apply(pending, t_us)
         else:
             self._drive.miss()
             self._count_silence(t_us)
@@ -218,13 +221,17 @@ class AmplifierNode:
             self._sync_expected = self._sync_following[data]
 
     def _is_sync(self, data: bytes, t_us: int) -> bool:
-        """A SYNC other than the expected one. Out of step it is a SYNC all the same: it marks the instant."""
+        """A SYNC other than the expected one. Out of step it is a SYNC all the same: it marks the instant. But what was
+        meant for one that was missed is not applied at another: combs that are energised, or were to be, go to 0 V.
+        """
         expected = self._sync_expected
         if data not in self._sync_following:  # length not as configured, or a counter that cannot be
             self._sync_errors.bad(ErrorCode.SYNC_DATA, t_us, bytes((len(data),)) + data[:1])
             return False
         if expected is not None:
             self._sync_errors.bad(ErrorCode.SYNC_DATA, t_us, bytes((len(data),)) + data + expected)
+            if any(self.outputs) or any(self._drive.pending or ()):
+                self._release_combs()
         return True
 
     def _on_drive_event(self, data: bytes, t_us: int) -> None:
@@ -232,9 +239,22 @@ class AmplifierNode:
         self._drive.receive(data, t_us)
         if self._drive.pending is not None:
             self._plant.advance_to(t_us)
-            self._apply(self._drive.pending)
+            self._apply(self._drive.pending, t_us)
 
-    def _apply(self, counts: Counts) -> None:
+    def _apply(self, counts: Counts, t_us: int) -> None:
+        """Put counts on the converters; 0 V from anywhere, else no further from what is there than 0x2011 says."""
+        a, b, c = counts
+        if a or b or c:
+            step = self._step_max
+            was_a, was_b, was_c = self.outputs
+            if not (-step <= a - was_a <= step and -step <= b - was_b <= step and -step <= c - was_c <= step):
+                over = (abs(new - old) > step for new, old in zip(counts, self.outputs, strict=True))
+                self._drive_errors.bad(
+                    ErrorCode.DRIVE_STEP, t_us, bytes((sum(1 << comb for comb, is_over in enumerate(over) if is_over),))
+                )
+                self._release_combs()
+                return
+            self._drive_deadline.set(t_us + self._drive_timeout_us)
         self._drive.pending = None
         self._silent_syncs = 0
         self.outputs = counts
@@ -245,8 +265,18 @@ class AmplifierNode:
         self._silent_syncs = silent = self._silent_syncs + 1
         if silent == self.od[0x2010, 0] and any(self.outputs):
             self._drive_errors.bad(ErrorCode.DRIVE_MISSING, t_us, bytes((silent,)))
-            self._outputs_to_error_value()
-            self._drive.demand_zero()
+            self._release_combs()
+
+    def _drive_overdue(self, now_us: int) -> None:
+        """Nothing was applied for as long as 0x2012 says, whatever has become of SYNC."""
+        if any(self.outputs):
+            self._drive_errors.bad(ErrorCode.DRIVE_MISSING, now_us, b"")
+            self._release_combs()
+
+    def _release_combs(self) -> None:
+        """By the node's own decision; energised again only after a drive PDO with 0 V."""
+        self._outputs_to_error_value()
+        self._drive.demand_zero()
 
     def _set_outputs(self, counts: Counts, t_us: int) -> None:
         self._drive.pending = None
@@ -323,6 +353,8 @@ class AmplifierNode:
             case 0x1016:
                 for subindex, consumer in enumerate(self._consumers, start=1):
                     consumer.configure(od[0x1016, subindex])
+            case 0x2011 | 0x2012:
+                self._step_max, self._drive_timeout_us = od[0x2011, 0], 1000 * od[0x2012, 0]
             case 0x1017:
                 self._heartbeat.configure(1000 * od[0x1017, 0], beat_now=True)
             case self._drive_pdo.communication | self._drive_pdo.mapping:

@@ -33,6 +33,7 @@ class ErrorCode(IntEnum):
     DRIVE_COUNTER = 0xFF11
     DRIVE_VALUE = 0xFF12
     DRIVE_LATE = 0xFF13
+    DRIVE_STEP = 0xFF14
 
 
 class EmergencyProducer:

@@ -49,12 +49,13 @@ class AmplifierDriver:
     ``state`` and ``failure`` (a sentence: what was expected, what came, what to do) tell how the connection fares.
     ``node_events`` (NODE_... bits) are latched: EMERGENCY until ``acknowledge``, the others until ``start``, because a
     node that was silent, left the operational state or restarted has to be configured again. ``emergencies`` holds
-    the last 64. ``sense`` holds this tick's sense values. All times are integer microseconds of the caller's one clock
-    and never run backwards.
+    the last 64. ``sense`` holds this tick's sense values. ``count_step_max``: the node's own limit of a step at a SYNC,
+    in drive counts. All times are integer microseconds of the caller's one clock and never run backwards.
     """
 
-    def __init__(self, config: DriverConfig) -> None:
+    def __init__(self, config: DriverConfig, count_step_max: int = 32767) -> None:
         self.config = config
+        self._count_step_max = count_step_max
         self.state = DriverState.OFF
         self.failure = ""
         self.node_events = 0
@@ -272,8 +273,10 @@ class AmplifierDriver:
 
     def _begin(self, state: DriverState, t_us: int) -> Frames:
         self.state = state
-        steps = identity_steps if state is DriverState.IDENTIFYING else configuration_steps
-        self._dialogue = SdoDialogue(steps(self.config), self.config.sdo_timeout_us, self.config.retries)
+        config = self.config
+        identifying = state is DriverState.IDENTIFYING
+        steps = identity_steps(config) if identifying else configuration_steps(config, self._count_step_max)
+        self._dialogue = SdoDialogue(steps, config.sdo_timeout_us, config.retries)
         return self._sdo(self._dialogue.begin(t_us))
 
     def _advance(self, requests: tuple[bytes, ...], t_us: int) -> Frames:

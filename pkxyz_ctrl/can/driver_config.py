@@ -31,6 +31,7 @@ class DriverConfig(BaseModel):
     node_heartbeat_period_ms: HeartbeatMs = 20
     node_heartbeat_timeout_ms: HeartbeatMs = 50
     drive_timeout_syncs: int = Field(default=5, ge=2, le=255, description="0x2010, written if protected")
+    drive_timeout_ms: int = Field(default=20, ge=1, le=OUR_TIMEOUT_MAX_MS, description="0x2012, written if protected")
 
     boot_timeout_us: int = Field(default=1_000_000, gt=0, description="from NMT reset to the boot-up message")
     start_timeout_us: int = Field(default=200_000, gt=0, description="from NMT start to a heartbeat that says so")

@@ -6,6 +6,7 @@ from typing import NamedTuple
 PROTECTION_CRC = 0xFF10  # ours: a drive PDO with a wrong CRC was not applied
 PROTECTION_COUNTER = 0xFF11  # ours: a drive PDO with a wrong alive counter was not applied
 PROTECTION_LATE = 0xFF13  # ours: a drive PDO that came after its SYNC was not applied
+PROTECTION_STEP = 0xFF14  # ours: a drive PDO asked for a step beyond 0x2011, and the combs went to 0 V
 
 _EXACT = {
     0x8110: "CAN overrun, objects lost",
@@ -17,10 +18,11 @@ _EXACT = {
     0x8220: "PDO longer than its mapping",
     0x8230: "DAM MPDO not processed, destination not available",
     0x8240: "SYNC with unexpected length or counter",
-    0x8250: "RPDO time-out",
+    0x8250: "no drive PDO was applied in time",
     PROTECTION_CRC: "drive PDO with a wrong CRC",
     PROTECTION_COUNTER: "drive PDO with a wrong alive counter",
     PROTECTION_LATE: "drive PDO after the SYNC that it was meant for",
+    PROTECTION_STEP: "drive PDO with a step beyond the limit",
 }
 _CLASS = {
     0x00: "error reset or no error",

@@ -8,6 +8,7 @@ _SAME_DEVICE = "check that this is the amplifier of this configuration, or corre
 _NO_PROTECTION = "does the amplifier have protected PDOs? If not, set protection = false in the bus config"
 _NO_401 = "the amplifier must offer analogue outputs and inputs as CiA 401 says (0x6411, 0x6401, PDO 2)"
 _NO_SAFE_STATE = "an amplifier that cannot be told to go to 0 V by itself must not be used"
+_NO_STEP_LIMIT = "an amplifier that does not limit its own steps makes two in one where a frame is lost"
 _NO_HEARTBEAT = "the amplifier must produce and consume heartbeats"
 _READ_BACK = "the amplifier did not keep what was written; power it off and on, then compare it with its EDS"
 
@@ -25,9 +26,12 @@ def identity_steps(config: DriverConfig) -> tuple[SdoStep, ...]:
     )
 
 
-def configuration_steps(config: DriverConfig) -> tuple[SdoStep, ...]:
-    """All writes, then a read-back of the last value of everything that was written."""
-    writes = _writes(config)
+def configuration_steps(config: DriverConfig, count_step_max: int = 32767) -> tuple[SdoStep, ...]:
+    """All writes, then a read-back of the last value of everything that was written.
+
+    ``count_step_max``: most that a drive count may change at a SYNC, which the node holds itself to.
+    """
+    writes = _writes(config, count_step_max)
     last_value = {(step.index, step.subindex): step for step in writes}
     read_back = (
         SdoStep(step.index, step.subindex, step.size, step.value, False, f"read-back of {step.what}", _READ_BACK)
@@ -43,7 +47,7 @@ def mapping(value_index: int, protection_index: int, protection: bool) -> tuple[
     return values + guard if protection else values
 
 
-def _writes(config: DriverConfig) -> tuple[SdoStep, ...]:
+def _writes(config: DriverConfig, count_step_max: int) -> tuple[SdoStep, ...]:
     node = config.node_id
     drive_cob_id = cob_id.DRIVE_BASE + node
     sense_cob_id = cob_id.COB_ID_NO_RTR | (cob_id.SENSE_BASE + node)
@@ -59,7 +63,11 @@ def _writes(config: DriverConfig) -> tuple[SdoStep, ...]:
         steps.append(_write(0x6444, comb, 4, 0, f"error value of comb {comb}: 0 V", _NO_SAFE_STATE))
     steps.append(_write(0x1029, 1, 1, 0, "after a communication error: pre-operational", _NO_SAFE_STATE))
     if config.protection:
-        steps.append(_write(0x2010, 0, 1, config.drive_timeout_syncs, "SYNCs without a drive PDO", _NO_SAFE_STATE))
+        steps += [
+            _write(0x2010, 0, 1, config.drive_timeout_syncs, "SYNCs without a drive PDO", _NO_SAFE_STATE),
+            _write(0x2011, 0, 2, count_step_max, "largest step of a drive count", _NO_STEP_LIMIT),
+            _write(0x2012, 0, 2, config.drive_timeout_ms, "time without an applied drive PDO", _NO_SAFE_STATE),
+        ]
     consumer = config.controller_node_id << 16 | config.controller_heartbeat_timeout_ms
     steps += [
         _write(0x1016, 1, 4, consumer, "consumer of our heartbeat", _NO_HEARTBEAT),

@@ -48,7 +48,7 @@ class Controller:
         if bus.can is None:
             raise ValueError(f"bus {bus.name!r} has no [can]: nothing to control over")
         self.can: CanConfig = bus.can
-        self.driver = AmplifierDriver(bus.can.driver)
+        self.driver = AmplifierDriver(bus.can.driver, gate.count_slew_max)
         self.gate = TransmitGate(gate)
         self.faults: list[str] = []
         self.missing_sense = 0

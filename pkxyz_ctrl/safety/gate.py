@@ -107,9 +107,8 @@ class GateConfig:
 
     ``count_max`` and ``count_slew_max`` are drive counts (the scale of the wire, INTEGER16; 0 counts = 0 V), the latter
     per drive frame. ``spacing_min_us`` is the shortest time between two drive frames; None: half a period, so that
-    jitter passes and a second frame in the same tick does not. ``drive_timeout_syncs`` is the node's 0x2010: after so
-    many SYNCs without a drive PDO it goes to 0 V. ``fd``: the bus can carry FD frames. Raises ValueError if a value is
-    out of range.
+    jitter passes and a second frame in the same tick does not. ``fd``: the bus can carry FD frames. Time-outs that are
+    written to the node may be at most ``heartbeat_timeout_max_ms``. Raises ValueError if a value is out of range.
     """
 
     count_max: int
@@ -120,7 +119,6 @@ class GateConfig:
     protection: bool = True
     fd: bool = True
     spacing_min_us: int | None = None
-    drive_timeout_syncs: int = 5
     heartbeat_timeout_max_ms: int = 1000
 
     def __post_init__(self) -> None:
@@ -130,7 +128,6 @@ class GateConfig:
             "period_us": (2, 1_000_000),
             "node_id": (1, 127),
             "controller_node_id": (1, 127),
-            "drive_timeout_syncs": (2, 255),
             "heartbeat_timeout_max_ms": (1, 65535),
         }
         for name, (low, high) in ranges.items():
@@ -148,8 +145,10 @@ class TransmitGate:
 
     The first frame that it blocks latches it: until :meth:`clear`, only :data:`ALWAYS` passes. ``latched`` is that
     first reason, empty if there is none. What the combs hold counts as unknown at the beginning, after any NMT
-    command, and when the node has timed out; then only 0 V passes, and after that the slew limit starts from 0.
-    A voltage passes once per SYNC, so that every step that passed is a step that the combs make.
+    command, and after a SYNC that found no drive frame, since the node takes the next one for a late one; then only
+    0 V passes, and after that the slew limit starts from 0. A voltage passes once for each SYNC, and there must have
+    been one, so that every step that passed is a step that the combs make, if nothing is lost on the way. What is, the
+    gate can't know; the node does, and holds its own steps to the same limit (0x2011).
     """
 
     def __init__(self, config: GateConfig) -> None:
@@ -169,13 +168,12 @@ class TransmitGate:
         self._spacing_us = config.period_us // 2 if config.spacing_min_us is None else config.spacing_min_us
         self._count_max = config.count_max
         self._count_slew_max = config.count_slew_max
-        self._drive_timeout_syncs = config.drive_timeout_syncs
         # Of the last drive frame that passed:
         self._counts = (0, 0, 0)
         self._time_us = _LONG_AGO_US
         self._counter = -1  # none
         self._counter_next = 0
-        self._syncs = 0  # that passed since
+        self._syncs = 0  # that passed since; two are as good as more
         self._known = False  # whether the combs hold it
 
     def check(self, frame: Frame, mode: int, t_us: int) -> str | None:
@@ -188,7 +186,7 @@ class TransmitGate:
             reason = self._judge_drive(data, row, t_us)
         elif can_id == SYNC_ID:
             if row & _SYNC and len(data) == 1 and 1 <= data[0] <= 240:
-                self._syncs += 1
+                self._syncs = 1 if self._syncs == 0 else 2
                 return None
             reason = "SYNC must be one byte, 1..240" if row & _SYNC else _not_now(FrameKind.SYNC)
         else:
@@ -235,7 +233,7 @@ class TransmitGate:
             maximum = self._count_max
             if not (0 <= a <= maximum and 0 <= b <= maximum and 0 <= c <= maximum):
                 return f"drive counts {a}, {b}, {c} are not all in 0..{maximum}"
-            if not self._known or self._syncs >= self._drive_timeout_syncs:
+            if not self._known or self._syncs == 2:
                 return "what the combs hold is unknown (start, NMT command or pause): a frame with 0 V must come first"
             if self._syncs == 0:
                 return "a second drive PDO in one tick: no SYNC went out since the one before"
@@ -293,7 +291,8 @@ class TransmitGate:
         if not row & FrameKind.SDO_WRITE:
             return _not_now(FrameKind.SDO_WRITE)
         config = self.config
-        return write_refusal(data, config.node_id, config.controller_node_id, config.heartbeat_timeout_max_ms)
+        limits = config.heartbeat_timeout_max_ms, config.count_slew_max
+        return write_refusal(data, config.node_id, config.controller_node_id, *limits)
 
 
 def _refusal(flags: int) -> str:

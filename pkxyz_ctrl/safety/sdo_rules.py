@@ -24,6 +24,7 @@ class WriteContext(NamedTuple):
     node_id: int
     controller_node_id: int
     heartbeat_timeout_max_ms: int
+    count_slew_max: int
 
 
 @dataclass(frozen=True, slots=True)
@@ -60,6 +61,14 @@ def _our_heartbeat(value: int, context: WriteContext) -> bool:
     return value >> 16 == context.controller_node_id and 1 <= timeout_ms <= context.heartbeat_timeout_max_ms
 
 
+def _in_time(value: int, context: WriteContext) -> bool:
+    return 1 <= value <= context.heartbeat_timeout_max_ms
+
+
+def _step(value: int, context: WriteContext) -> bool:
+    return 1 <= value <= context.count_slew_max
+
+
 def _drive_or_off(value: int, context: WriteContext) -> bool:
     if context.object_index == 0x1401 and value & _COB_ID_MASK == 0x300 + context.node_id:
         return True
@@ -88,6 +97,8 @@ WRITE_RULES: Final = (
     WriteRule(0x1A00, 0x1BFF, 0, 0, 1, "transmit mapping: number of entries", "any", _anything),
     WriteRule(0x1A00, 0x1BFF, 1, 64, 4, "transmit mapping: entry", "any", _anything),
     WriteRule(0x2010, 0x2010, 0, 0, 1, "SYNCs without a drive PDO until 0 V", "1 or more, never off", _not_zero),
+    WriteRule(0x2011, 0x2011, 0, 0, 2, "largest step of a drive count", "1 to our own slew limit", _step),
+    WriteRule(0x2012, 0x2012, 0, 0, 2, "time without an applied drive PDO", "1 ms to the limit", _in_time),
     WriteRule(0x6443, 0x6443, 1, 3, 1, "error mode of a comb", "1, use the error value", _is(1)),
     WriteRule(0x6444, 0x6444, 1, 3, 4, "error value of a comb", "0, that is 0 V", _is(0)),
 )
@@ -108,7 +119,9 @@ def is_read(data: bytes) -> bool:
     return command == _ABORT
 
 
-def write_refusal(data: bytes, node_id: int, controller_node_id: int, heartbeat_timeout_max_ms: int) -> str | None:
+def write_refusal(
+    data: bytes, node_id: int, controller_node_id: int, heartbeat_timeout_max_ms: int, count_slew_max: int
+) -> str | None:
     """Why the eight bytes are not a permitted write; None if they are."""
     command, index, subindex, value = _fields(data)
     size = _DOWNLOAD_SIZE.get(command)
@@ -117,7 +130,7 @@ def write_refusal(data: bytes, node_id: int, controller_node_id: int, heartbeat_
     name = f"0x{index:04X}:{subindex:02X}"
     if value >> 8 * size:
         return f"SDO write of {name}: the bytes behind its {size} are not empty"
-    context = WriteContext(index, node_id, controller_node_id, heartbeat_timeout_max_ms)
+    context = WriteContext(index, node_id, controller_node_id, heartbeat_timeout_max_ms, count_slew_max)
     for rule in WRITE_RULES:
         if rule.covers(index, subindex):
             if size != rule.size:

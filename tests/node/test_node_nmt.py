@@ -247,13 +247,14 @@ def watched(behaviour: int = 0) -> Rig:
     rig = Rig()
     assert rig.write(0x1016, 1, 127 << 16 | CONSUMER_MS, 4) == 0
     assert rig.write(0x1029, 1, behaviour, 1) == 0
+    assert rig.write(0x2012, 0, 65535, 2) == 0  # the time-out of the drive PDO, which would be first
     return rig
 
 
 def test_consumer_starts_with_the_first_heartbeat() -> None:
     rig = watched()
     rig.energise()
-    rig.run(1_000_000)
+    rig.run(900_000)
     assert rig.node.outputs == (100, 200, 300)
 
 

@@ -11,7 +11,8 @@ from pkxyz_ctrl.can.codec import ProcessCodec
 
 COUNTS = st.tuples(*[st.integers(0, 32767)] * 3)
 ZERO = (0, 0, 0)
-CRC, COUNTER, VALUE, LATE, MISSING, SHORT, LONG = 0xFF10, 0xFF11, 0xFF12, 0xFF13, 0x8250, 0x8210, 0x8220
+CRC, COUNTER, VALUE, LATE, STEP = 0xFF10, 0xFF11, 0xFF12, 0xFF13, 0xFF14
+MISSING, SHORT, LONG = 0x8250, 0x8210, 0x8220
 GOOD = protected(DRIVE, (1, 2, 3), 0)
 
 
@@ -234,6 +235,7 @@ def test_errors_end_after_a_quiet_while() -> None:
 def test_combs_are_released_when_no_drive_pdo_comes(syncs: int) -> None:
     rig = Rig()
     rig.write(0x2010, 0, syncs, 1)
+    rig.write(0x2012, 0, 1000, 2)  # the time-out that does not need SYNC
     rig.start()
     rig.forget()
     rig.cycle((4, 5, 6))
@@ -253,6 +255,58 @@ def test_combs_are_released_when_no_drive_pdo_comes(syncs: int) -> None:
     rig.cycle((7, 7, 7))
     rig.sync()
     assert rig.node.outputs == (7, 7, 7)
+
+
+@pytest.mark.parametrize(
+    ("step_max", "change", "applied"), [(9, 9, True), (9, -9, True), (9, 10, False), (9, -10, False)]
+)
+@pytest.mark.parametrize("comb", [0, 1, 2])
+def test_a_step_at_a_sync_is_limited_whatever_the_frame_says(
+    step_max: int, change: int, applied: bool, comb: int
+) -> None:
+    rig = Rig()
+    rig.write(0x2011, 0, step_max, 2)
+    rig.start()
+    rig.forget()
+    held = [9, 9, 9]
+    rig.cycle((9, 9, 9))
+    rig.cycle((9 + 9, 9 + 9, 9 + 9))
+    rig.cycle((18, 18, 18))
+    rig.forget()
+    held = [18, 18, 18]
+    held[comb] += change
+    a, b, c = held
+    rig.cycle((a, b, c))
+    rig.sync()
+    rig.run(2000)
+    assert rig.node.outputs == ((a, b, c) if applied else ZERO)
+    assert emergencies(rig) == ([] if applied else [STEP])
+    if not applied:
+        assert rig.of(EMCY)[0][3] == 1 << comb
+        rig.cycle((1, 1, 1))
+        rig.sync()
+        assert rig.node.outputs == ZERO  # nothing before 0 V
+    else:
+        rig.cycle(ZERO)
+        rig.sync()
+        assert rig.node.outputs == ZERO  # which is no step too far from anywhere
+
+
+@pytest.mark.parametrize("timeout_ms", [1, 20, 1000])
+def test_combs_are_released_in_time_when_no_sync_comes(timeout_ms: int) -> None:
+    """Drive frames, even with 0 V, act at a SYNC: where none comes, the node has a time of its own."""
+    rig = Rig()
+    rig.write(0x2012, 0, timeout_ms, 2)
+    rig.start()
+    rig.forget()
+    rig.cycle((4, 5, 6))
+    applied_us = rig.now_us
+    rig.sync()
+    while rig.now_us < applied_us + 1000 * timeout_ms + 500:
+        rig.drive(ZERO)
+        rig.run(100)
+    assert rig.plant.driven == [(applied_us, (4, 5, 6)), (applied_us + 1000 * timeout_ms, ZERO)]
+    assert emergencies(rig) == [MISSING]
 
 
 def test_nothing_is_missed_at_zero_volts() -> None:
@@ -286,12 +340,27 @@ def test_a_sync_that_is_none_is_not_one(data: bytes) -> None:
 
 
 @pytest.mark.parametrize("jump", [0, 2, 100])
-def test_a_sync_out_of_step_is_a_sync_all_the_same(jump: int) -> None:
+def test_a_sync_out_of_step_is_sampled_at_but_takes_the_combs_to_0_v(jump: int) -> None:
+    """A SYNC was missed, or another sends one: what waits was not meant for this one."""
     rig = operational()
-    rig.cycle((1, 2, 3))
+    rig.cycle((1, 2, 3))  # to be applied at the second SYNC
     rig.give(SYNC, bytes((1 + jump,)))
     rig.run(100)
-    assert (rig.node.outputs, len(rig.of(SENSE)), emergencies(rig)) == ((1, 2, 3), 2, [0x8240])
+    assert (rig.node.outputs, len(rig.of(SENSE)), emergencies(rig)) == (ZERO, 2, [0x8240])
+    rig = operational()
+    rig.cycle((1, 2, 3))
+    rig.cycle((1, 2, 4))
+    assert rig.node.outputs == (1, 2, 3)
+    rig.give(SYNC, bytes((2 + jump,)))
+    rig.run(100)
+    assert (rig.node.outputs, len(rig.of(SENSE)), emergencies(rig)) == (ZERO, 3, [0x8240])
+    rig._sync = 2 + jump
+    rig.cycle((1, 2, 3))
+    rig.cycle(ZERO)
+    assert rig.node.outputs == ZERO  # nothing before 0 V
+    rig.cycle((1, 2, 3))
+    rig.sync()
+    assert rig.node.outputs == (1, 2, 3)
 
 
 @pytest.mark.parametrize("last", [2, 10, 240])

@@ -77,6 +77,8 @@ NEW_VALUES = {
     (0x2000, 1): 0,
     (0x2000, 2): 0,
     (0x2010, 0): 9,
+    (0x2011, 0): 400,
+    (0x2012, 0): 1000,
 }
 # only while the PDO is out of use
 PDO_OFF_VALUES = {

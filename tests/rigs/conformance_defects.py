@@ -420,9 +420,9 @@ class AppliesAtOnce(_OtherDrive):
 class Saturates(AmplifierNode):
     """outputs, with voltage: scaling"""
 
-    def _apply(self, counts: tuple[int, int, int]) -> None:
+    def _apply(self, counts: tuple[int, int, int], t_us: int) -> None:
         a, b, c = (min(count, 600) for count in counts)
-        super()._apply((a, b, c))
+        super()._apply((a, b, c), t_us)
 
 
 class Silent(AmplifierNode):

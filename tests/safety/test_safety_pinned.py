@@ -63,8 +63,8 @@ def test_bits_of_what_was_wrong_with_a_frame_and_a_node() -> None:
     assert {name: bit.value for name, bit in NodeEvent.__members__.items()} == {n: 1 << k for k, n in enumerate(node)}
 
 
-# What may be written to the amplifier (node 10, controller 127, at most 1000 ms): objects, sub-indices, bytes, a value
-# that is permitted, and values that are not. docs/understand/safety.md, CiA 301 and 401.
+# What may be written to the amplifier (node 10, controller 127, at most 1000 ms and 500 counts): objects, sub-indices,
+# bytes, a value that is permitted, and values that are not. docs/understand/safety.md, CiA 301 and 401.
 OFF = 1 << 31
 WRITES = (
     (0x1005, 0x1005, 0, 0, 4, 0x80, (0x81, 0x40000080, 0)),
@@ -83,6 +83,8 @@ WRITES = (
     (0x1A00, 0x1BFF, 0, 0, 1, 5, ()),
     (0x1A00, 0x1BFF, 1, 64, 4, 0x64010110, ()),
     (0x2010, 0x2010, 0, 0, 1, 1, (0,)),
+    (0x2011, 0x2011, 0, 0, 2, 500, (0, 501, 0xFFFF)),
+    (0x2012, 0x2012, 0, 0, 2, 1000, (0, 1001, 0xFFFF)),
     (0x6443, 0x6443, 1, 3, 1, 1, (0, 2)),
     (0x6444, 0x6444, 1, 3, 4, 0, (1, 0xFFFFFFFF)),
 )
@@ -91,7 +93,7 @@ COMMAND = {1: 0x2F, 2: 0x2B, 3: 0x27, 4: 0x23}
 
 def refused(index: int, subindex: int, size: int, value: int) -> bool:
     data = struct.pack("<BHBI", COMMAND[size], index, subindex, value)
-    return write_refusal(data, 10, 127, 1000) is not None
+    return write_refusal(data, 10, 127, 1000, 500) is not None
 
 
 def test_writes_at_every_corner_and_one_step_beyond() -> None:
@@ -132,6 +134,8 @@ def test_values_that_are_not_permitted(row: tuple[int, int, int, int, int, int, 
 def test_values_with_more_than_one_permitted() -> None:
     assert not refused(0x1029, 1, 1, 0)
     assert not refused(0x1016, 1, 4, 127 << 16 | 1)
+    assert not refused(0x2011, 0, 2, 1)
+    assert not refused(0x2012, 0, 2, 1)
     for cob_id in (0x30A, 0x4000030A, OFF | 0x30A, OFF):
         assert not refused(0x1401, 1, 4, cob_id)
     for index in (0x1400, 0x1402):
@@ -145,7 +149,7 @@ def test_nothing_may_stand_behind_the_value(index: int, subindex: int, size: int
     """Of objects that may hold anything: whatever is refused, is so for the bytes behind."""
     for bit in range(32):
         data = struct.pack("<BHBI", COMMAND[size], index, subindex, 1 << bit)
-        assert (write_refusal(data, 10, 127, 1000) is not None) == (bit >= 8 * size)
+        assert (write_refusal(data, 10, 127, 1000, 500) is not None) == (bit >= 8 * size)
 
 
 GATE_RANGES = {
@@ -154,7 +158,6 @@ GATE_RANGES = {
     "period_us": (2, 1_000_000),
     "node_id": (1, 127),
     "controller_node_id": (1, 127),
-    "drive_timeout_syncs": (2, 255),
     "heartbeat_timeout_max_ms": (1, 65535),
     "spacing_min_us": (0, 200),
 }
@@ -175,8 +178,7 @@ def test_gate_config_defaults_are_those_of_the_wire() -> None:
     config = GateConfig(count_max=30000, count_slew_max=500, period_us=200)
     assert dataclasses.asdict(config) == {
         "count_max": 30000, "count_slew_max": 500, "period_us": 200, "node_id": 10, "controller_node_id": 127,
-        "protection": True, "fd": True, "spacing_min_us": None, "drive_timeout_syncs": 5,
-        "heartbeat_timeout_max_ms": 1000,
+        "protection": True, "fd": True, "spacing_min_us": None, "heartbeat_timeout_max_ms": 1000,
     }  # fmt: skip
 
 
