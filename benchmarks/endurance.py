@@ -31,6 +31,7 @@ from numpy.typing import NDArray
 
 from hil.bench.suite import describe_machine
 from hil.lanes.ending import Ended, Ending
+from hil.lanes.lane import Lane
 from hil.lanes.wall import WallRig
 from hil.recording.wall_recorder import WallRecorder
 from hil.runs.run_folder import RunFolder, metadata_of
@@ -81,7 +82,7 @@ class Witness(WallRecorder):
     """A recorder that looks at the memory once a second. Its notes are made beforehand, so that noting takes none."""
 
     def __init__(self, folder: RunFolder, metadata: dict[str, Any], channel: str, ticks: int, period_us: int) -> None:
-        super().__init__(folder, metadata, channel)
+        super().__init__(folder.recording, folder.frames, metadata, channel)
         self._every = 1_000_000 // period_us
         self._left = self._every
         fields = dict(ROW.fields or {})
@@ -145,7 +146,7 @@ def run(minutes: float, bus: str) -> dict[str, Any]:
         run_folder = RunFolder(folder / "run")
         recorder = Witness(
             run_folder,
-            metadata_of(scenario, "wall", run_folder.write_config(scenario)),
+            metadata_of(scenario, Lane.WALL, run_folder.write_config(scenario)),
             "bus",
             setup.ticks,
             setup.bus.period_us,

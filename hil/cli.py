@@ -8,7 +8,7 @@ import sys
 import tomllib
 from collections.abc import Callable
 from pathlib import Path
-from typing import Annotated, Any, NoReturn
+from typing import TYPE_CHECKING, Annotated, Any, NoReturn
 
 import typer
 from rich.console import Console
@@ -29,11 +29,14 @@ from hil.commands import replay as replay_cli
 from hil.commands import run as run_cli
 from hil.commands import soak as soak_cli
 from hil.commands import tune as tune_cli
-from hil.screen.choices import Lane
+from hil.lanes.lane import InProcessLane, Lane
 from hil.screen.first_run import say_if_compiling
 from hil.screen.outputs import what_to_do
 from hil.screen.tables import error_lines, print_whole
 from pkxyz_ctrl.config.files import CONFIG_DIR, ConfigError, find, names
+
+if TYPE_CHECKING:
+    from hil.runs.summary import Summary
 
 app = typer.Typer(
     help="Real-time controller of a parallel-kinematics XYZ MEMS stage, and the harness that proves it.",
@@ -110,9 +113,9 @@ def _common(
 
 def sil(
     scenario: Annotated[str, typer.Argument(help="A shipped scenario's name or a TOML file.")] = "raster",
-    lane: Annotated[
-        Lane, typer.Option(help="lockstep: over the simulated bus; fast: compiled, no frames.")
-    ] = Lane.LOCKSTEP,
+    in_process: Annotated[
+        InProcessLane, typer.Option("--lane", help="lockstep: over the simulated bus; fast: compiled, no frames.")
+    ] = InProcessLane.LOCKSTEP,
     seed: Annotated[int | None, typer.Option(help="Instead of the scenario's.")] = None,
     out: Annotated[Path | None, typer.Option(help="Folder to write; default: runs/<scenario>-<lane>-<n>.")] = None,
     stage: Annotated[str | None, typer.Option(help="Name or file, instead of the scenario's.")] = None,
@@ -131,6 +134,7 @@ def sil(
     """Close the loop on a scenario; exit code 0 if its checks hold, 1 if not, 2 for bad input or a full disk, 130 if
     interrupted.
     """
+    lane = Lane(in_process.value)
     find("scenarios", scenario)  # a typo is said before anything is compiled
     say_if_compiling(quiet=as_json)
     from hil.faults.fault import parse
@@ -141,16 +145,17 @@ def sil(
     loaded = load_scenario(
         scenario, seed=seed, stage=stage, plant=plant, controller=controller, bus=bus, faults=faults, learning=learning
     )
+    from hil.pictures.run import draw
     from hil.recording.recording import RecordingError
-    from hil.runs.in_process import draw, require_bus
+    from hil.runs.run import require_bus
     from hil.runs.run_folder import RunFolder, next_free
     from pkxyz_ctrl.design.model.design_error import DesignError
     from pkxyz_ctrl.loop.controller import StartUpError
 
-    require_bus(loaded, lane.value)
-    folder = RunFolder(out if out is not None else next_free(Path("runs"), loaded.config.name, lane.value))
+    require_bus(loaded, lane)
+    folder = RunFolder(out if out is not None else next_free(Path("runs"), loaded.config.name, lane))
     try:
-        summary = _run_with_progress(folder, loaded, lane.value, quiet=as_json)
+        summary = _run_with_progress(folder, loaded, lane, quiet=as_json)
         draw(folder, summary)
     except RecordingError as error:
         raise ConfigError(str(error)) from None
@@ -158,10 +163,10 @@ def sil(
         print(f"pkxyz: {error}", file=sys.stderr)
         raise typer.Exit(1) from None
     if as_json:
-        print(json.dumps(summary | {"folder": str(folder.path)}, allow_nan=False))
+        print(json.dumps(summary.as_json() | {"folder": str(folder.path)}, allow_nan=False))
     else:
         _show(summary, folder.path)
-    raise typer.Exit(130 if summary["interrupted"] else 0 if summary["ok"] else 1)
+    raise typer.Exit(130 if summary.interrupted else 0 if summary.ok else 1)
 
 
 def configs(as_json: Annotated[bool, typer.Option("--json", help="Print JSON.")] = False) -> None:
@@ -205,11 +210,11 @@ for _name, _command, _words in _COMMANDS:
     app.command(_name, short_help=_words)(_command)
 
 
-def _run_with_progress(folder: Any, scenario: Any, lane: str, *, quiet: bool) -> dict[str, Any]:
-    from hil.runs.in_process import run_into
+def _run_with_progress(folder: Any, scenario: Any, lane: Lane, *, quiet: bool) -> "Summary":
+    from hil.runs.run import run_into
 
     if quiet or not _notes.is_terminal:
-        return run_into(folder, scenario, lane, lambda done, total: None)
+        return run_into(folder, scenario, lane)
     from rich.progress import BarColumn, Progress, TextColumn, TimeRemainingColumn
 
     columns = (
@@ -223,27 +228,25 @@ def _run_with_progress(folder: Any, scenario: Any, lane: str, *, quiet: bool) ->
         return run_into(folder, scenario, lane, lambda done, total: progress.update(task, completed=done, total=total))
 
 
-def _show(summary: dict[str, Any], folder: Path) -> None:
+def _show(summary: "Summary", folder: Path) -> None:
     from hil.pictures.report import bound_words
 
     table = Table(box=None, pad_edge=False, header_style="dim")
     for heading, side in (("check", "left"), ("value", "right"), ("bound", "right"), ("", "left")):
         table.add_column(heading, justify=side)  # type: ignore[arg-type]
-    for check in summary["checks"]:
-        value = "none" if check["value"] is None else f"{check['value']:.4g}"
-        verdict = {True: "[green]holds[/]", False: "[bold red]fails[/]", None: "[dim]no bus[/]"}[check["ok"]]
-        table.add_row(check["name"], value, bound_words(check), verdict)
-    speed = summary.get("realtime_factor")
+    for check in summary.checks:
+        value = "none" if check.value is None else f"{check.value:.4g}"
+        verdict = {True: "[green]holds[/]", False: "[bold red]fails[/]", None: "[dim]no bus[/]"}[check.ok]
+        table.add_row(check.name, value, bound_words(check), verdict)
+    speed = summary.loop.realtime_factor
     pace = f", {speed:.1f} times real time" if speed is not None else ""
-    _screen.print(
-        f"{summary['scenario']}, {summary['lane']} lane, seed {summary['seed']}: {summary['ticks']} ticks{pace}"
-    )
+    _screen.print(f"{summary.scenario}, {summary.lane} lane, seed {summary.seed}: {summary.rows.ticks} ticks{pace}")
     _screen.print(table)
-    for line in error_lines(summary):
+    for line in error_lines(summary.rows, summary.loop.errors_are_of):
         _screen.print(line)
-    for fault in summary.get("faults") or []:
+    for fault in summary.loop.faults:
         _screen.print(f"[red]fault[/]: {fault}", markup=True)
-    if summary["interrupted"]:
+    if summary.interrupted:
         _screen.print("interrupted: what was recorded until then is kept")
     _screen.print(f"recording, frame log, config, summary and picture are in {folder}/", soft_wrap=True)
 

@@ -8,7 +8,8 @@ from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
 from numpy.typing import NDArray
 
-from hil.lanes import either as lanes
+from hil.lanes import in_process as lanes
+from hil.lanes.lane import Lane
 from hil.lanes.setup import bare_setup
 from hil.runs.scenario import load_scenario
 from hil.studies.identify.calibrated_stage import write_calibrated_stage
@@ -28,7 +29,7 @@ def errors_nm(stage: str) -> tuple[Array, Array]:
     """Times (n,) of the reference in ms, and true position less reference (n, 3), while scanning."""
     scenario = load_scenario("raster_harsh", stage=stage)
     blocks: list[NDArray[np.void]] = []
-    lanes.run(scenario.setup(), "fast", on_block=lambda block: blocks.append(block.copy()))
+    lanes.run(scenario.setup(), Lane.FAST, on_block=lambda block: blocks.append(block.copy()))
     rows = np.concatenate(blocks)
     (scan_us,) = [s.scan_us for s in scenario.trajectory.segments if s.scan_us]
     t_us = rows["reference_tick"] * scenario.bus.period_us

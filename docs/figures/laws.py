@@ -9,7 +9,8 @@ from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
 from numpy.typing import NDArray
 
-from hil.lanes import either as lanes
+from hil.lanes import in_process as lanes
+from hil.lanes.lane import Lane
 from hil.lanes.setup import Setup
 from hil.runs.scenario import load_scenario
 
@@ -22,7 +23,7 @@ def rows_of(setup: Setup, law: NDArray[np.void] | None = None) -> NDArray[np.voi
         setup = replace(setup)
         setup.__dict__["law"] = law
     blocks: list[NDArray[np.void]] = []
-    lanes.run(setup, "fast", on_block=lambda block: blocks.append(block.copy()))
+    lanes.run(setup, Lane.FAST, on_block=lambda block: blocks.append(block.copy()))
     return np.concatenate(blocks)
 
 

@@ -4,7 +4,8 @@ import shutil
 import tempfile
 from pathlib import Path
 
-from hil.runs.in_process import draw, run_into
+from hil.pictures.run import draw
+from hil.runs.run import run_into
 from hil.runs.run_folder import RunFolder
 from hil.runs.scenario import load_scenario
 

@@ -4,12 +4,14 @@ import shutil
 import tempfile
 from pathlib import Path
 
-from hil.runs.in_process import draw, run_into
+from hil.lanes.lane import Lane
+from hil.pictures.run import draw
+from hil.runs.run import run_into
 from hil.runs.run_folder import RunFolder
 from hil.runs.scenario import load_scenario
 
 if __name__ == "__main__":
     with tempfile.TemporaryDirectory() as scratch:
         folder = RunFolder(Path(scratch) / "raster")
-        draw(folder, run_into(folder, load_scenario("raster"), "lockstep", lambda done, total: None))
+        draw(folder, run_into(folder, load_scenario("raster"), Lane.LOCKSTEP))
         shutil.copy(folder.picture, Path(__file__).with_suffix(".png"))

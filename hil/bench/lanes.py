@@ -11,7 +11,8 @@ from hil.bench.figure import Figure, once, repeated, times_of
 from hil.bench.rigs.closed_loop import scan
 from hil.bench.rigs.played import Played, PlayedPort, drive_counts, recorded_frames
 from hil.bench.tick import ticks_from_python
-from hil.lanes import either as lanes
+from hil.lanes import in_process as lanes
+from hil.lanes.lane import Lane
 from hil.lanes.setup import Setup
 from hil.plant.on_bus import PlantOnBus
 from hil.recording.recording import RecordingWriter
@@ -40,7 +41,7 @@ def lockstep() -> list[Figure]:
             whole_s, close_s = _recorded_run(scenario, setup, Path(folder))
             seconds["whole"].append(whole_s)
             seconds["close"].append(close_s)
-            seconds["bare"].append(once(partial(lanes.run, setup, "lockstep", on_block=_forget)))
+            seconds["bare"].append(once(partial(lanes.run, setup, Lane.LOCKSTEP, on_block=_forget)))
             played = Played(setup, PlayedPort(came))
             seconds["controller"].append(once(played.run))
             if not np.array_equal(drive_counts(played.port.sent, setup.gate.node_id)[: len(counts)], counts):
@@ -83,12 +84,12 @@ def fast() -> list[Figure]:
     """The default scenario in the fast lane: as a study runs it, without a file, and as `pkxyz sil` does, recorded."""
     scenario = load_scenario("raster")
     setup = scenario.setup()
-    run = partial(lanes.run, setup, "fast", on_block=_forget)
+    run = partial(lanes.run, setup, Lane.FAST, on_block=_forget)
     run()
     bare = repeated({"fast": run}, 15)["fast"]
     best, median = bare.per(setup.ticks)
     with tempfile.TemporaryDirectory() as folder:
-        recorded = times_of([_recorded_run(scenario, setup, Path(folder), "fast")[0] for _ in range(REPEATS)])
+        recorded = times_of([_recorded_run(scenario, setup, Path(folder), Lane.FAST)[0] for _ in range(REPEATS)])
     return [
         Figure("fast.realtime", _factor(setup, bare.best_s), "times", 50.0, "at least", _factor(setup, bare.median_s),
                "aim 100; trajectory, cycle and plant, rows handed on"),
@@ -102,7 +103,7 @@ def _factor(setup: Setup, seconds: float) -> float:
     return setup.ticks * setup.bus.period_s / seconds
 
 
-def _recorded_run(scenario: Scenario, setup: Setup, folder: Path, lane: str = "lockstep") -> tuple[float, float]:
+def _recorded_run(scenario: Scenario, setup: Setup, folder: Path, lane: Lane = Lane.LOCKSTEP) -> tuple[float, float]:
     """Processor time in s of one run as `pkxyz sil` does it, and of closing its recording."""
     metrics = Metrics(setup.trajectory, setup.bus.period_us)
     recording = RecordingWriter(folder / "recording.parquet", metadata_of(scenario, lane, resolve(scenario)))

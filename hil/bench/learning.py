@@ -3,7 +3,8 @@
 import numpy as np
 
 from hil.bench.figure import Figure
-from hil.lanes import either as lanes
+from hil.lanes import in_process as lanes
+from hil.lanes.lane import Lane
 from hil.runs.metrics import Metrics
 from hil.runs.period_errors import WITHIN, PeriodErrors
 from hil.runs.scenario import load_scenario
@@ -18,15 +19,17 @@ def learning() -> list[Figure]:
     harsh, _, _ = _run("frames_harsh")
     errors, floor_nm, faults = _run("frames")
     found = harsh.figures()
+    assert found.learning_factor is not None, "more than one period was scanned"
+    assert found.learning_factor_true is not None
     by_period = ", ".join(f"{value:.1f}" for value in harsh.sensed_nm)
     after = np.sqrt(np.mean([line**2 for line in errors.line_error_nm[_SETTLED:]], axis=0))
     before = errors.line_error_nm[0]
     words = f"harsh plant, periodic error of the first period over that after {WITHIN} more"
     of = "nominal plant, RMS error of the true position on the lines, worst axis"
     return [
-        Figure("learning.factor", found["learning_factor"], "times", 10.0, "at least", None,
+        Figure("learning.factor", found.learning_factor, "times", 10.0, "at least", None,
                f"{words}, as sensed (by period: {by_period} nm)"),
-        Figure("learning.factor_true", found["learning_factor_true"], "times", 10.0, "at least", None,
+        Figure("learning.factor_true", found.learning_factor_true, "times", 10.0, "at least", None,
                f"{words}, of the true position"),
         Figure("learning.raster_before", float(before.max() * 1e-9 / LINE_M * 100), "% of line", 0.1, "at most", None,
                f"{of}, first period, before anything is learnt"),
@@ -48,8 +51,9 @@ def _run(scenario: str) -> tuple[PeriodErrors, np.ndarray, int]:
         errors.update(block)
         metrics.update(block)
 
-    result = lanes.run(loaded.setup(), "fast", on_block=on_block)
-    floor = metrics.figures()["hold_noise_nm"]
+    result = lanes.run(loaded.setup(), Lane.FAST, on_block=on_block)
+    floor = metrics.figures().hold_noise_nm
+    assert floor is not None, "the scenario ends in a hold"
     return errors, np.array(list(floor.values())), len(result.faults)
 
 

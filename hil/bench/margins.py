@@ -7,6 +7,7 @@ from numpy.typing import NDArray
 
 from hil.bench.figure import Figure
 from hil.lanes.excitation import excitation, tones
+from hil.lanes.lane import Lane
 from hil.lanes.setup import bare_setup
 from hil.screen.choices import operating_strokes
 from hil.studies.margins.loop import Loop, agreement, over_changed_plants
@@ -80,6 +81,6 @@ def _measured(loop: Loop, strokes_m: NDArray[np.float64]) -> float:
     )  # fmt: skip
     config = load("controllers", "robust", ControllerConfig)
     run = at_point(bare_setup("reconstructed", "nominal", config, loop.bus, 1), strokes_m, added)
-    seen = measure(run, "fast")
+    seen = measure(run, Lane.FAST)
     compared = agreement(seen, loop.response(strokes_m, seen.frequency_hz), PERIODS)
     return compared.largest / compared.bound

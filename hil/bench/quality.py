@@ -1,9 +1,11 @@
 """How well the stage follows: the default scenario on the three shipped plants, over the bus."""
 
+import dataclasses
 from typing import Any
 
 from hil.bench.figure import Direction, Figure
-from hil.lanes import either as lanes
+from hil.lanes import in_process as lanes
+from hil.lanes.lane import Lane
 from hil.runs.metrics import Metrics
 from hil.runs.scenario import load_scenario
 
@@ -47,8 +49,8 @@ def harsh() -> list[Figure]:
 def _figures(plant: str) -> list[Figure]:
     setup = load_scenario("raster", plant=plant).setup()
     metrics = Metrics(setup.trajectory, setup.bus.period_us)
-    result = lanes.run(setup, "lockstep", on_block=metrics.update)
-    found: dict[str, Any] = metrics.figures() | {
+    result = lanes.run(setup, Lane.LOCKSTEP, on_block=metrics.update)
+    found: dict[str, Any] = dataclasses.asdict(metrics.figures()) | {
         "bus_load": result.bus_load, "missed_ticks": result.missed_ticks, "faults": len(result.faults),
     }  # fmt: skip
     figures = []

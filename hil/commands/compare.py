@@ -8,7 +8,7 @@ import typer
 from rich.console import Console
 from rich.table import Table
 
-from hil.screen.choices import Lane
+from hil.lanes.lane import InProcessLane, Lane
 from hil.screen.first_run import say_if_compiling
 from hil.screen.outputs import picture_to_write
 from hil.screen.progress import progress_bar
@@ -29,8 +29,8 @@ def compare(
     plant: Annotated[str | None, typer.Option(help="Name or file, instead of the scenario's.")] = None,
     seed: Annotated[int | None, typer.Option(min=0, help="Instead of the scenario's.")] = None,
     lane: Annotated[
-        Lane, typer.Option(help="lockstep: over the simulated bus; fast: compiled, no frames.")
-    ] = Lane.FAST,
+        InProcessLane, typer.Option(help="lockstep: over the simulated bus; fast: compiled, no frames.")
+    ] = InProcessLane.FAST,
     out: Annotated[Path, typer.Option(help="The picture to write.")] = Path("compare.png"),
     as_json: Annotated[bool, typer.Option("--json", help="Print JSON, and nothing else.")] = False,
 ) -> None:
@@ -43,7 +43,7 @@ def compare(
     say_if_compiling(quiet=as_json)
     names = tuple(name.strip() for name in controllers.split(",") if name.strip()) or DEFAULT
     with progress_bar("laws", quiet=as_json) as tell:
-        runs = run_all(scenario, names, stage=stage, plant=plant, seed=seed, lane=lane.value, on_progress=tell)
+        runs = run_all(scenario, names, stage=stage, plant=plant, seed=seed, lane=Lane(lane.value), on_progress=tell)
     title = f"{scenario}{f' on {plant}' if plant else ''}{f', {stage}' if stage else ''}"
     if drawn := any(run.figures.get("rms_error_nm") for run in runs):
         draw(runs, title, out)

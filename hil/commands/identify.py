@@ -8,7 +8,8 @@ import typer
 from rich.console import Console
 from rich.table import Table
 
-from hil.screen.choices import Lane, Tones, operating_strokes
+from hil.lanes.lane import InProcessLane, Lane
+from hil.screen.choices import Tones, operating_strokes
 from hil.screen.errors import one_line_errors
 from hil.screen.first_run import say_if_compiling
 from hil.screen.outputs import folder_to_write, writing
@@ -33,8 +34,8 @@ def identify(
     controller: Annotated[str, typer.Option(help="Name or file.")] = "lqg",
     bus: Annotated[str, typer.Option(help="Name or file.")] = "fd_5k",
     lane: Annotated[
-        Lane, typer.Option(help="lockstep: over the simulated bus; fast: compiled, no frames, the same bits.")
-    ] = Lane.FAST,
+        InProcessLane, typer.Option(help="lockstep: over the simulated bus; fast: compiled, no frames, the same bits.")
+    ] = InProcessLane.FAST,
     tones: Annotated[Tones, typer.Option(help="All tones at once, or one after another.")] = Tones.MULTISINE,
     amplitude_nm: Annotated[
         float | None,
@@ -76,7 +77,7 @@ def identify(
     from pkxyz_ctrl.stage import Stage
 
     on_bus, config = load("buses", bus, BusConfig), load("controllers", controller, ControllerConfig)
-    if lane is Lane.LOCKSTEP and on_bus.can is None:
+    if lane is InProcessLane.LOCKSTEP and on_bus.can is None:
         raise ConfigError(f"bus {on_bus.name!r} has no [can] and carries no frames; use --lane fast")
     if config.law == "open_loop":
         raise ConfigError(
@@ -93,7 +94,7 @@ def identify(
     amplitude = AMPLITUDE_NM[tones.value] if amplitude_nm is None else amplitude_nm
     with one_line_errors(), progress_bar("exciting the loop", quiet=as_json) as tell:
         found = identified(
-            bare_setup(stage, plant, config, on_bus, seed), strokes, lane.value, kind=tones.value,
+            bare_setup(stage, plant, config, on_bus, seed), strokes, Lane(lane.value), kind=tones.value,
             amplitude_m=amplitude * 1e-9, periods=periods, on_progress=tell,
         )  # fmt: skip
     found = replace(found, outside=outside)

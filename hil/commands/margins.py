@@ -9,7 +9,8 @@ import typer
 from rich.console import Console
 from rich.table import Table
 
-from hil.screen.choices import Lane, Tones, operating_strokes
+from hil.lanes.lane import InProcessLane, Lane
+from hil.screen.choices import Tones, operating_strokes
 from hil.screen.errors import one_line_errors
 from hil.screen.first_run import say_if_compiling
 from hil.screen.outputs import folder_to_write, writing
@@ -38,7 +39,7 @@ def margins(
     perturbed: Annotated[bool, typer.Option("--perturbed", help="Also Ms over the changed plants.")] = False,
     tolerances: Annotated[str, typer.Option(help="Name or file of what changes, for --perturbed.")] = "wide",
     measured: Annotated[bool, typer.Option("--measured", help="Also measure by exciting the running loop.")] = False,
-    lane: Annotated[Lane, typer.Option(help="Where to measure.")] = Lane.FAST,
+    lane: Annotated[InProcessLane, typer.Option(help="Where to measure.")] = InProcessLane.FAST,
     tones: Annotated[
         Tones, typer.Option(help="All tones at once, or one after another (20 of them).")
     ] = Tones.MULTISINE,
@@ -106,14 +107,14 @@ def margins(
 
 
 def _measure(
-    stage: str, plant: str, config: Any, bus: Any, strokes: Any, lane: Lane, kind: Tones, amplitude_nm: float,
+    stage: str, plant: str, config: Any, bus: Any, strokes: Any, lane: InProcessLane, kind: Tones, amplitude_nm: float,
     periods: int, seed: int, tell: "Callable[[int, int], None]",
 ) -> "MeasuredLoop":  # fmt: skip
     from hil.lanes.excitation import excitation, tones
     from hil.lanes.setup import bare_setup
     from hil.studies.margins.measured import at_point, measure
 
-    if lane is Lane.LOCKSTEP and bus.can is None:
+    if lane is InProcessLane.LOCKSTEP and bus.can is None:
         raise ConfigError(f"bus {bus.name!r} has no [can] and carries no frames; measure with --lane fast")
     stepped = kind is Tones.STEPPED
     seconds = 0.1 if stepped else 1.0  # a tone alone needs no such resolution
@@ -122,7 +123,7 @@ def _measure(
         kind.value, tones(period_ticks, 20 if stepped else 120, 1 if stepped else 5), period_ticks=period_ticks,
         periods=periods, amplitude_m=amplitude_nm * 1e-9, first_tick=0, seed=seed,
     )  # fmt: skip
-    return measure(at_point(bare_setup(stage, plant, config, bus, seed), strokes, added), lane.value, tell)
+    return measure(at_point(bare_setup(stage, plant, config, bus, seed), strokes, added), Lane(lane.value), tell)
 
 
 def _changed_data(changed: "ChangedPlants", tolerances: str) -> dict[str, Any]:

@@ -10,6 +10,7 @@ import typer
 from rich.console import Console
 from rich.table import Table
 
+from hil.lanes.lane import Lane
 from hil.screen.first_run import say_if_compiling
 from hil.screen.outputs import folder_to_write
 from hil.screen.progress import progress_bar
@@ -85,13 +86,14 @@ def montecarlo(
 
 def _replay(study: Any, seed: int, out: Path, *, as_json: bool) -> None:
     """One plant with everything a run leaves; the figures are those of the study, bit for bit."""
-    from hil.runs.in_process import draw, run_into
+    from hil.pictures.run import draw
+    from hil.runs.run import run_into
     from hil.runs.run_folder import RunFolder
     from hil.studies.montecarlo import run_one
 
     scenario = study.drawn(seed)
     folder = RunFolder(out / f"seed-{seed}")
-    ran = run_into(folder, scenario, "fast", lambda done, total: None)
+    ran = run_into(folder, scenario, Lane.FAST)
     draw(folder, ran)
     result, case = run_one(study, seed), study.tolerances.draw(seed)
     data = vars(result) | {"drawn": dataclasses.asdict(case.perturbation), "folder": str(folder.path)}

@@ -3,13 +3,16 @@
 import json
 import sys
 from pathlib import Path
-from typing import Annotated, Any
+from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
 from hil.screen.first_run import say_if_compiling
 from hil.screen.tables import error_lines
 from pkxyz_ctrl.config.files import ConfigError
+
+if TYPE_CHECKING:
+    from hil.runs.summary import Summary
 
 Scenario = Annotated[str, typer.Argument(help="A shipped scenario's name or a TOML file.")]
 Bus = Annotated[
@@ -46,8 +49,11 @@ def run(
 
     Ctrl-C, SIGTERM and errors leave the combs at 0 V. Errors of position are those of the estimate.
     """
-    from hil.lanes.wall import LANE, require_real_bus, run_into
+    from hil.lanes.lane import Lane
+    from hil.lanes.wall import require_real_bus
+    from hil.pictures.run import draw
     from hil.recording.recording import RecordingError
+    from hil.runs.at_rate import run_into
     from hil.runs.run_folder import RunFolder, next_free
     from pkxyz_ctrl.design.model.design_error import DesignError
     from pkxyz_ctrl.loop.controller import StartUpError
@@ -56,18 +62,10 @@ def run(
     loaded = _load(scenario, duration_s, stage=stage, controller=controller, bus=bus, learning=learning)
     require_real_bus(loaded.bus)
     say_if_compiling(quiet=as_json)
-    folder = RunFolder(out if out is not None else next_free(Path("runs"), loaded.config.name, LANE))
+    folder = RunFolder(out if out is not None else next_free(Path("runs"), loaded.config.name, Lane.WALL))
     try:
-        summary, result = run_into(folder, loaded, _tell)
-        if summary["ticks"]:
-            from hil.pictures.wall import draw_wall
-
-            with folder.in_one_line():
-                draw_wall(folder.recording, summary, result.lateness_us, folder.picture)
-                if summary.get("learning_factor") is not None:
-                    from hil.pictures.learning import draw_learning
-
-                    draw_learning(folder.recording, summary, folder.learning_picture)
+        ran = run_into(folder, loaded, _tell)
+        draw(folder, ran.summary, ran.lateness_us)
     except RecordingError as error:
         raise ConfigError(str(error)) from None
     except (StartUpError, DesignError) as error:
@@ -76,10 +74,10 @@ def run(
         print(f"pkxyz: {error}{hint if on_this_machine else ''}", file=sys.stderr)
         raise typer.Exit(1) from None
     if as_json:
-        print(json.dumps(summary | {"folder": str(folder.path)}, allow_nan=False))
+        print(json.dumps(ran.summary.as_json() | {"folder": str(folder.path)}, allow_nan=False))
     else:
-        _show(summary, folder.path)
-    raise typer.Exit(128 + result.ended_by if result.ended_by else 0 if summary["ok"] else 1)
+        _show(ran.summary, folder.path)
+    raise typer.Exit(128 + ran.ended_by if ran.ended_by else 0 if ran.summary.ok else 1)
 
 
 def plant(
@@ -165,19 +163,20 @@ def _tell(words: str) -> None:
     print(words, file=sys.stderr, flush=True)
 
 
-def _show(summary: dict[str, Any], folder: Path) -> None:
-    late = summary["lateness_us"]
+def _show(summary: "Summary", folder: Path) -> None:
+    rows, loop = summary.rows, summary.loop
+    late = loop.lateness_us or {"p50": 0, "p99_9": 0, "max": 0}
     print(
-        f"{summary['scenario']} on {summary['bus']}: {summary['ticks']} ticks, {summary['missed_ticks']} missed, woken "
+        f"{summary.scenario} on {summary.bus}: {rows.ticks} ticks, {loop.missed_ticks} missed, woken "
         f"{late['p50']} us late in the middle, {late['p99_9']} us at p99.9, {late['max']} us at most"
     )
-    for line in error_lines(summary):
+    for line in error_lines(rows, loop.errors_are_of):
         print(line)
-    for check in summary["checks"]:
-        if check["ok"] is False:
-            print(f"check fails: {check['name']} = {check['value']}")
-    for fault in summary["faults"]:
+    for check in summary.checks:
+        if check.ok is False:
+            print(f"check fails: {check.name} = {check.value}")
+    for fault in loop.faults:
         print(f"fault: {fault}")
-    if summary["interrupted"]:
+    if summary.interrupted:
         print("ended from outside: what was recorded until then is kept")
     print(f"recording, frame log, config, summary and picture are in {folder}/")

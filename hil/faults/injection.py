@@ -1,18 +1,20 @@
 """Faults put into one lockstep run, and the person who clears what they cause. Without them nothing of this exists."""
 
 from collections.abc import Callable, Sequence
-from typing import TYPE_CHECKING, NamedTuple
+from typing import NamedTuple
 
+from hil.bus.clock import Lockstep
+from hil.bus.wire import Wire
 from hil.faults.clock import FaultyClock
 from hil.faults.fault import Fault
 from hil.faults.plant import FAMILIES, FaultyPlant
 from hil.faults.wire import WireFaults
+from hil.node.amplifier import AmplifierNode
 from hil.plant.on_bus import PlantOnBus
+from pkxyz_ctrl.config.bus import BusConfig
+from pkxyz_ctrl.loop.controller import Controller
 from pkxyz_ctrl.safety.modes import Mode
-
-if TYPE_CHECKING:
-    from hil.lanes.lockstep import LockstepRig
-    from hil.lanes.setup import Setup
+from sim.plant import Plant
 
 _LOOK_US = 1_000  # how often the combs are looked at while nobody controls them
 
@@ -24,25 +26,29 @@ class Afterwards(NamedTuple):
     comb_voltage_v: tuple[float, float, float]
 
 
-def plant_of(setup: "Setup") -> PlantOnBus:
-    """The plant on the bus of a setup, with the faults that live there."""
-    faults = [f for f in setup.faults if f.family in FAMILIES]
-    if not faults:
-        return PlantOnBus(setup.new_plant())
-    return FaultyPlant(setup.new_plant(), faults, setup.bus, setup.seed)
+def plant_of(plant: Plant, faults: Sequence[Fault], bus: BusConfig, seed: int) -> PlantOnBus:
+    """The plant on its bus, with those of the faults that live there."""
+    its_own = [f for f in faults if f.family in FAMILIES]
+    return FaultyPlant(plant, its_own, bus, seed) if its_own else PlantOnBus(plant)
 
 
 class Injection:
-    """The faults of bus, node and controller of one rig, and whoever clears."""
+    """The faults of bus, node and controller of one run, and whoever clears ``clear_s`` after a fault decision."""
 
-    def __init__(self, rig: "LockstepRig") -> None:
-        self._rig = rig
-        setup = rig.setup
-        self.faults: Sequence[Fault] = setup.faults
+    def __init__(
+        self, faults: Sequence[Fault], clear_s: float | None, period_us: int, seed: int,
+        clock: Lockstep, wire: Wire, node: AmplifierNode, plant: PlantOnBus, controller: Controller,
+    ) -> None:  # fmt: skip
+        self.faults = faults
+        self._clear_ticks = None if clear_s is None else max(1, round(clear_s * 1e6 / period_us))
+        self._period_us = period_us
+        self._clock = clock
+        self._plant = plant
+        self._controller = controller
         self.afterwards: list[Afterwards] = []
         self.watched: list[tuple[float, float, float]] | None = None
         """If it is a list: the comb voltages at the end of each tick, true even while the node does not sample."""
-        self._wire = WireFaults(setup.faults, rig.clock, rig.wire, rig.node, rig.controller.can.driver, setup.seed + 1)
+        self._wire = WireFaults(faults, clock, wire, node, controller.can.driver, seed + 1)
         self._origin_us = 0
 
     def before_power_on(self) -> None:
@@ -51,21 +57,19 @@ class Injection:
 
     def arm(self) -> FaultyClock:
         """The next instant of the loop is its first tick: make all appointments. Returns the loop's clock."""
-        rig = self._rig
-        self._origin_us = rig.clock.now_us + rig.setup.bus.period_us
+        self._origin_us = self._clock.now_us + self._period_us
         self._wire.arm(self._origin_us)
-        return FaultyClock(rig.clock, self.faults, self._origin_us, rig.setup.bus.period_us)
+        return FaultyClock(self._clock, self.faults, self._origin_us, self._period_us)
 
     def clearing(self, record: Callable[[int], object], begin_anew: Callable[[int], object]) -> Callable[[int], object]:
         """``record`` and, so many ticks after a fault decision, a clear; a look at the combs, if one is wanted.
         ``begin_anew`` is told the tick after which the trajectory starts over.
         """
-        clear_s, controller, watched = self._rig.setup.clear_s, self._rig.controller, self.watched
+        patience, controller, watched = self._clear_ticks, self._controller, self.watched
         if watched is not None:
             record = self._watching(record, watched)
-        if clear_s is None:
+        if patience is None:
             return record
-        patience = max(1, round(clear_s / self._rig.setup.bus.period_s))
         waited = 0
 
         def record_and_clear(tick: int) -> None:
@@ -90,16 +94,14 @@ class Injection:
 
     def _look(self) -> tuple[float, float, float]:
         """Voltages at the combs now."""
-        rig = self._rig
-        rig.plant.advance_to(rig.clock.now_us)
-        rig.plant.settle()
-        a, b, c = rig.plant.plant.voltage_v.tolist()
+        self._plant.advance_to(self._clock.now_us)
+        self._plant.settle()
+        a, b, c = self._plant.plant.voltage_v.tolist()
         return a, b, c
 
     def outlive(self, ticks: int) -> None:
         """The controller is gone: time goes on to the end of the run, and the combs are watched."""
-        rig = self._rig
-        end_us = self._origin_us + ticks * rig.setup.bus.period_us
-        while rig.clock.now_us < end_us:
-            rig.clock.run_until(min(end_us, rig.clock.now_us + _LOOK_US))
-            self.afterwards.append(Afterwards(rig.clock.now_us - self._origin_us, self._look()))
+        clock, end_us = self._clock, self._origin_us + ticks * self._period_us
+        while clock.now_us < end_us:
+            clock.run_until(min(end_us, clock.now_us + _LOOK_US))
+            self.afterwards.append(Afterwards(clock.now_us - self._origin_us, self._look()))

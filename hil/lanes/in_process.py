@@ -12,6 +12,7 @@ from numpy.typing import NDArray
 from hil.bus.frame_time import INTERFRAME_BITS, frame_duration_ns
 from hil.lanes.blocks import Blocks
 from hil.lanes.fast import RunBlock, runner_of
+from hil.lanes.lane import Lane
 from hil.lanes.lockstep import LockstepRig
 from hil.lanes.setup import Setup
 from pkxyz_ctrl.can.frame import Frame
@@ -40,13 +41,13 @@ class LaneResult:
 
 def run(
     setup: Setup,
-    lane: str,
+    lane: Lane,
     *,
     on_block: Callable[[NDArray[np.void]], None],
     on_progress: Callable[[int, int], None] = lambda done, total: None,
     frame_log: Path | None = None,
 ) -> LaneResult:
-    """Run a setup in the lane "lockstep" or "fast".
+    """Run a setup in lockstep or in the fast lane.
 
     ``on_block`` gets the rows (n,) of ``ROW`` in order and must not keep them; ``on_progress`` the ticks done and in
     all. What was run before an exception (Ctrl-C) has been handed on. Raises ``ConfigError`` for a bus that the lane
@@ -57,20 +58,20 @@ def run(
         setup.trajectory, setup.bus.period_us, setup.ticks, on_block, on_progress, setup.excitation, learner
     )
     law = setup.law
-    if lane == "fast":
+    if lane == Lane.FAST:
         plant, memory = setup.new_plant(), new_memory(Mode.IDLE)
         run_block = runner_of(law)
         run_block(law, memory, np.zeros((1, 9)), plant.params, plant.state, np.zeros(0, np.int64), blocks.rows, 0)
         _sample_us(setup, 0, 0)
         begin_s = time.perf_counter()
         missed, load, faults = 0, None, _run_fast(setup, run_block, memory, plant, blocks)
-    elif lane == "lockstep":
+    elif lane == Lane.LOCKSTEP:
         rig = LockstepRig(setup, frame_log)
         begin_s = time.perf_counter()  # designed, wired up and loaded: what is timed from here is the run
         missed, load = rig.run(blocks)
         faults = rig.controller.faults
     else:
-        raise ValueError(f"no lane is called {lane!r}; there are lockstep and fast")
+        raise ValueError(f"the {lane} lane waits for a clock: hil.lanes.wall")
     factor = setup.ticks * setup.bus.period_s / (time.perf_counter() - begin_s)
     return LaneResult(setup.ticks, missed, load, tuple(faults), factor, learner)
 

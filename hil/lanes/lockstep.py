@@ -89,7 +89,7 @@ class LockstepRig:
         self.setup = setup
         self.clock = Lockstep()
         self.wire = Wire(self.clock, can.nominal_bitrate_bit_per_s, can.data_bitrate_bit_per_s, setup.seed)
-        self.plant = plant_of(setup)
+        self.plant = plant_of(setup.new_plant(), setup.faults, setup.bus, setup.seed)
         amplifier = self.wire.attach("amplifier")
         self.node = AmplifierNode(
             can.driver.node_id, self.clock, amplifier.send, self.plant, CONFIG_DIR / "comb_amplifier.eds",
@@ -100,7 +100,7 @@ class LockstepRig:
         self._endpoint = self.wire.attach("controller")
         self.port: Port = WirePort(self._endpoint, self.clock, latency_us)
         self.controller = Controller(setup.law, setup.bus, setup.gate, self.port.send, self.port.discard_unsent)
-        self.injection = Injection(self) if setup.faults or setup.clear_s is not None else None
+        self.injection = _injection_of(self) if setup.faults or setup.clear_s is not None else None
         self.log = FrameLog(frame_log, can.channel) if frame_log is not None else None
         if self.log is not None:
             self.log.attach(self.wire)
@@ -132,6 +132,14 @@ class LockstepRig:
             if self.log is not None:
                 self.log.close()
         return missed + self.controller.missing_sense, self.wire.bus_load(before)
+
+
+def _injection_of(rig: LockstepRig) -> Injection:
+    setup = rig.setup
+    return Injection(
+        setup.faults, setup.clear_s, setup.bus.period_us, setup.seed,
+        rig.clock, rig.wire, rig.node, rig.plant, rig.controller,
+    )  # fmt: skip
 
 
 @contextmanager

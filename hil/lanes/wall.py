@@ -2,53 +2,28 @@
 
 import dataclasses
 import time
-from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
 
-from hil.lanes.ending import Ended, Ending
+from hil.lanes.ending import Ending
 from hil.lanes.live_reference import LiveReference
 from hil.lanes.setup import Setup
 from hil.lanes.streamed_reference import StreamedReference
-from hil.recording.recording import Recording
 from hil.recording.wall_recorder import WallRecorder
-from hil.runs.learning import Learning
-from hil.runs.metrics import Metrics
-from hil.runs.run_folder import RunFolder, metadata_of, summarise
-from hil.runs.scenario import Scenario
 from pkxyz_ctrl.can.frame import Frame
 from pkxyz_ctrl.config.bus import BusConfig, CanConfig
 from pkxyz_ctrl.config.files import ConfigError
 from pkxyz_ctrl.io.can_port import CanPort, open_bus
-from pkxyz_ctrl.io.clocks import TickClock, WallClock, percentile_us
-from pkxyz_ctrl.io.realtime import go_real_time, leave_real_time, settle_memory
-from pkxyz_ctrl.learning import Learner
+from pkxyz_ctrl.io.clocks import TickClock, WallClock
 from pkxyz_ctrl.loop import cycle as cycling
 from pkxyz_ctrl.loop.controller import Controller
-from pkxyz_ctrl.loop.row import ROW, TRUTH_FIELDS
+from pkxyz_ctrl.loop.row import TRUTH_FIELDS
 from pkxyz_ctrl.loop.runtime import run, start
 from pkxyz_ctrl.safety.gate import GateConfig
 
-LANE = "wall"
 _GUARDS_PER_PERIOD = 8
-_SHARES = {"p50": 0.5, "p99_9": 0.999, "max": 1.0}
 _LAST_FRAMES_S = 0.02  # 0 V and pre-operational leave even a slow adapter before it is closed
-
-
-@dataclass
-class WallResult:
-    """What is known of a run besides its rows."""
-
-    ended_by: int = 0
-    """signal that ended it, 0 if it ran to its end"""
-    elapsed_s: float = 0.0
-    ticks: int = 0
-    faults: tuple[str, ...] = ()
-    lateness_us: list[int] = dataclasses.field(default_factory=list)
-    """wake-ups by whole microseconds of lateness"""
-    refused_frames: int = 0
-    learner: Learner | None = None
 
 
 def require_real_bus(bus: BusConfig) -> CanConfig:
@@ -179,76 +154,3 @@ def _warm_up(law: Any, reference: Any) -> None:
     memory = cycling.new_memory()
     for _ in range(3):
         cycling.cycle(law, memory, reference)
-
-
-def run_into(folder: RunFolder, scenario: Scenario, say: Any) -> tuple[dict[str, Any], WallResult]:
-    """Run ``scenario`` at rate and leave everything in ``folder`` but the picture; returns the summary and the rest.
-
-    ``say`` is called with what a person should know. Raises ``ConfigError``, ``StartUpError``, ``RecordingError``.
-    """
-    can_config = require_real_bus(scenario.bus)
-    resolved = folder.write_config(scenario)
-    setup = scenario.setup()
-    result = WallResult()
-    with Ending() as ending:
-        recorder = WallRecorder(folder, metadata_of(scenario, LANE, resolved), can_config.channel.replace(" ", "_"))
-        try:
-            _run(WallRig(setup, recorder, ending), result, say)
-        except Ended as end:
-            result.ended_by = end.signal_number
-        finally:
-            recorder.close()
-    figures = _figures(folder, scenario, result)
-    if scenario.config.learning is not None:
-        learning = Learning(scenario)
-        learning.errors.look_at(Recording.open(folder.recording))
-        figures |= learning.close(folder, result.learner, resolved["digest"])
-    summary = summarise(scenario, LANE, resolved["digest"], figures, interrupted=bool(result.ended_by))
-    folder.write_summary(summary)
-    return summary, result
-
-
-def _run(rig: WallRig, result: WallResult, say: Any) -> None:
-    begin_s = time.monotonic()
-    try:
-        say(go_real_time())
-        settle_memory()
-        begin_s = time.monotonic()
-        rig.run()
-    finally:
-        try:
-            rig.close()
-        finally:
-            leave_real_time()
-            result.elapsed_s = time.monotonic() - begin_s
-            result.faults = tuple(rig.controller.faults)
-            result.lateness_us = rig.ticks.lateness_us
-            result.refused_frames = rig.can_port.refused
-            result.learner = rig.live.learner if rig.live is not None else None
-
-
-def _figures(folder: RunFolder, scenario: Scenario, result: WallResult) -> dict[str, Any]:
-    """Figures of the recorded rows. Nobody here knows the truth, so errors are those of the estimate."""
-    recording = Recording.open(folder.recording)
-    metrics = Metrics(scenario.trajectory, scenario.bus.period_us)
-    fields = ("mode", "reference_tick", "saturated", "reference_m", "estimate_m", "overrun", "sense_status")
-    missed = 0
-    for block in recording.blocks(fields):
-        rows = np.zeros(len(block["mode"]), ROW)
-        for name in fields:
-            rows[name] = block[name]
-        rows["position_m"] = rows["estimate_m"]
-        metrics.update(rows)
-        missed += int(rows["overrun"].sum()) + int(np.count_nonzero(rows["sense_status"] & 1))
-    result.ticks = recording.ticks
-    late = result.lateness_us
-    return metrics.figures() | {
-        "errors_are_of": "estimate",
-        "estimate_error_nm": None,
-        "missed_ticks": missed,
-        "faults": list(result.faults),
-        "bus_load": None,
-        "realtime_factor": recording.ticks * scenario.bus.period_s / result.elapsed_s if result.elapsed_s else None,
-        "refused_frames": result.refused_frames,
-        "lateness_us": {name: percentile_us(late, share) for name, share in _SHARES.items()},
-    }

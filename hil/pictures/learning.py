@@ -1,7 +1,6 @@
 """The picture of what was learnt: the error of each period, and where in the period it was and is."""
 
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 from matplotlib.axes import Axes
@@ -13,12 +12,13 @@ from hil.pictures.report import AXIS_COLOURS
 from hil.recording.recording import Recording
 from hil.runs.period_errors import WITHIN, PeriodErrors
 from hil.runs.scenario import restore
+from hil.runs.summary import Summary
 
 _INK, _FAINT = "#2b2b2b", "#9a9a9a"
 _SENSED, _TRUE = "#51626f", "#D55E00"
 
 
-def draw_learning(recording_path: Path, summary: dict[str, Any], out: Path) -> None:
+def draw_learning(recording_path: Path, summary: Summary, out: Path) -> None:
     """Draw the learning of a recorded run to a PNG of 1600 pixels across."""
     recording = Recording.open(recording_path)
     scenario = restore(recording.metadata["config"], recording_path.parent)
@@ -33,10 +33,10 @@ def draw_learning(recording_path: Path, summary: dict[str, Any], out: Path) -> N
     draw_periods(figure.add_subplot(grid[:, 0]), errors)
     plots = [figure.add_subplot(grid[axis, 1]) for axis in range(3)]
     draw_profile(plots, errors)
-    figure.text(0.058, 0.945, f"{summary['scenario']}   ·   what was learnt", fontsize=17, color=_INK, weight="bold")
+    figure.text(0.058, 0.945, f"{summary.scenario}   ·   what was learnt", fontsize=17, color=_INK, weight="bold")
     figure.text(
-        0.058, 0.9, f"plant {summary['plant']}   ·   law {summary['controller']}   ·   bus {summary['bus']}   ·   "
-        f"{summary['learning']['mode']}   ·   seed {summary['seed']}", fontsize=10.5, color="#55606a",
+        0.058, 0.9, f"plant {summary.plant}   ·   law {summary.controller}   ·   bus {summary.bus}   ·   "
+        f"{scenario.config.learning.mode}   ·   seed {summary.seed}", fontsize=10.5, color="#55606a",
     )  # fmt: skip
     figure.savefig(out)
 

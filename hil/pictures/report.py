@@ -16,6 +16,8 @@ from numpy.typing import NDArray
 
 from hil.bus.load_trace import BusTrace, read_bus_trace
 from hil.recording.recording import Recording
+from hil.runs.metrics import Verdict
+from hil.runs.summary import Summary
 
 Array = NDArray[np.float64]
 
@@ -75,9 +77,7 @@ def read_signals(recording: Recording) -> Signals:
     return Signals(t_s, low, high, np.concatenate(path), np.concatenate(path_error))
 
 
-def draw_report(
-    recording_path: str | Path, frame_log: str | Path | None, summary: dict[str, Any], out: str | Path
-) -> None:
+def draw_report(recording_path: str | Path, frame_log: str | Path | None, summary: Summary, out: str | Path) -> None:
     """Draw the recording, the frame log if there is one and the summary's figures to a PNG of 1600 pixels across."""
     recording = Recording.open(recording_path)
     signals = read_signals(recording)
@@ -116,17 +116,21 @@ def _draw_position(plot: Axes, signals: Signals, axis: int) -> None:
         plot.legend(loc="lower right", ncols=2, frameon=False, fontsize=9, handlelength=1.6)
 
 
-def _draw_error(plot: Axes, signals: Signals, axis: int, limit_nm: float, summary: dict[str, Any]) -> None:
+def _draw_error(plot: Axes, signals: Signals, axis: int, limit_nm: float, summary: Summary) -> None:
     low, high = signals.low["error_nm"][:, axis], signals.high["error_nm"][:, axis]
     _plot_envelope(plot, signals.t_s, low, high, AXIS_COLOURS[axis], 0.6, "")
     plot.set_ylim(-limit_nm, limit_nm)
     plot.axhline(0, color=_INK, linewidth=0.5)
-    name = "xyz"[axis]
+    name, rows = "xyz"[axis], summary.rows
     plot.set_ylabel(f"{name} error\n(nm)", linespacing=1.3)
     words = [
-        f"{label} {summary[metric][name]:.2f} nm"
-        for metric, label in (("rms_error_nm", "scan rms"), ("max_error_nm", "max"), ("hold_noise_nm", "hold noise"))
-        if summary.get(metric)
+        f"{label} {measured[name]:.2f} nm"
+        for label, measured in (
+            ("scan rms", rows.rms_error_nm),
+            ("max", rows.max_error_nm),
+            ("hold noise", rows.hold_noise_nm),
+        )
+        if measured
     ]
     box = {"facecolor": "white", "alpha": 0.8, "edgecolor": "none", "pad": 1.5}
     plot.text(
@@ -162,12 +166,12 @@ def _draw_voltages(plot: Axes, signals: Signals) -> None:
         line.set_linewidth(2.5)
 
 
-def _draw_bus(plot: Axes, bus: BusTrace | None, summary: dict[str, Any]) -> None:
+def _draw_bus(plot: Axes, bus: BusTrace | None, summary: Summary) -> None:
     plot.set_ylabel("bus load  (%)")
     plot.set_ylim(0, 100)
     plot.set_yticks([0, 50, 100])
     if bus is None:
-        words = "no bus in this lane" if summary.get("bus_load") is None else f"{summary['bus_load']:.1%} on average"
+        words = "no bus in this lane" if summary.loop.bus_load is None else f"{summary.loop.bus_load:.1%} on average"
         plot.text(0.5, 0.5, words, transform=plot.transAxes, ha="center", va="center", color=_FAINT)
         return
     plot.fill_between(bus.t_s, 0, bus.load * 100, color="#c9d3dc", linewidth=0, step="mid")
@@ -235,10 +239,10 @@ def _draw_path(figure: Figure, signals: Signals) -> None:
     bar.outline.set_visible(False)
 
 
-def _draw_figures(plot: Axes, summary: dict[str, Any]) -> None:
+def _draw_figures(plot: Axes, summary: Summary) -> None:
     """The checks as a table: name, value, bound, verdict in words and colour."""
     plot.set_axis_off()
-    checks = summary.get("checks") or []
+    checks = summary.checks
     plot.set_xlim(0, 1)
     plot.set_ylim(-max(8.0, len(checks) + 1.6), 0.4)
     columns = ((0.02, "left"), (0.54, "right"), (0.78, "right"), (0.98, "right"))
@@ -246,45 +250,45 @@ def _draw_figures(plot: Axes, summary: dict[str, Any]) -> None:
         plot.text(x, 0, words, ha=side, va="center", fontsize=9, color="#6b7780")
     plot.axhline(-0.55, xmin=0.01, xmax=0.99, color="#c8c8c8", linewidth=0.8)
     for row, check in enumerate(checks, start=1):
-        ok = check["ok"]
+        ok = check.ok
         words, colour = {True: ("holds", "#1b7f5c"), False: ("fails", "#b3371a"), None: ("no bus", _FAINT)}[ok]
-        value = "none" if check["value"] is None else f"{check['value']:.4g}"
-        for (x, side), text in zip(columns, (check["name"], value, bound_words(check), words), strict=True):
+        value = "none" if check.value is None else f"{check.value:.4g}"
+        for (x, side), text in zip(columns, (check.name, value, bound_words(check), words), strict=True):
             plot.text(
                 x, -row, text, ha=side, va="center", fontsize=10.5, color=colour if text is words else _INK,
                 fontweight="bold" if text is words and ok is False else "normal",
             )  # fmt: skip
 
 
-def bound_words(check: dict[str, Any]) -> str:
+def bound_words(check: Verdict) -> str:
     """The bound of a check as people write it."""
-    low, high = check.get("min"), check.get("max")
+    low, high = check.min, check.max
     if low is None:
         return f"≤ {high:g}"
     return f"≥ {low:g}" if high is None else f"{low:g} to {high:g}"
 
 
-def _draw_title(figure: Figure, summary: dict[str, Any]) -> None:
-    heading = f"{summary['scenario']}   ·   {summary['lane']} lane   ·   seed {summary['seed']}"
+def _draw_title(figure: Figure, summary: Summary) -> None:
+    heading = f"{summary.scenario}   ·   {summary.lane} lane   ·   seed {summary.seed}"
     figure.text(0.055, 0.962, heading, fontsize=17, color=_INK, fontweight="bold", va="center")
-    rate = f"{1e6 / summary['period_us']:,.0f} ticks/s".replace(",", " ")
+    rate = f"{1e6 / summary.period_us:,.0f} ticks/s".replace(",", " ")
     parts = [
-        f"stage {summary['stage']}",
-        f"plant {summary['plant']}",
-        f"law {summary['controller']}",
-        f"bus {summary['bus']}",
+        f"stage {summary.stage}",
+        f"plant {summary.plant}",
+        f"law {summary.controller}",
+        f"bus {summary.bus}",
         rate,
     ]
-    for name, words in (("rms_error_nm", "rms error"), ("hold_noise_nm", "hold noise")):
-        if summary.get(name):
-            parts.append(f"{words} " + " / ".join(f"{v:.2f}" for v in summary[name].values()) + " nm")
-    if summary.get("bus_load") is not None:
-        parts.append(f"bus load {summary['bus_load']:.0%}")
+    for measured, words in ((summary.rows.rms_error_nm, "rms error"), (summary.rows.hold_noise_nm, "hold noise")):
+        if measured:
+            parts.append(f"{words} " + " / ".join(f"{v:.2f}" for v in measured.values()) + " nm")
+    if summary.loop.bus_load is not None:
+        parts.append(f"bus load {summary.loop.bus_load:.0%}")
     figure.text(0.055, 0.927, "   ·   ".join(parts), fontsize=10.5, color="#55606a", va="center")
-    verdict, colour = ("all checks hold", "#1b7f5c") if summary["ok"] else ("checks fail", "#b3371a")
-    if summary.get("interrupted"):
+    verdict, colour = ("all checks hold", "#1b7f5c") if summary.ok else ("checks fail", "#b3371a")
+    if summary.interrupted:
         verdict, colour = "interrupted", "#b3371a"
-    elif summary["faults"]:
+    elif summary.loop.faults:
         verdict, colour = "fault", "#b3371a"
     figure.text(0.965, 0.962, verdict, fontsize=13, color=colour, ha="right", va="center", fontweight="bold")
 

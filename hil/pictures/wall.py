@@ -1,7 +1,6 @@
 """The picture of a run at the wall clock: reference and estimate, commanded voltages, and how late its ticks were."""
 
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 from matplotlib.axes import Axes
@@ -10,15 +9,16 @@ from matplotlib.figure import Figure
 
 from hil.pictures.report import AXIS_COLOURS, COMB_COLOURS
 from hil.recording.recording import Recording
+from hil.runs.summary import Summary
 
 _POINTS = 20_000
 
 
-def draw_wall(recording_path: Path, summary: dict[str, Any], lateness_us: list[int], out: Path) -> None:
+def draw_wall(recording_path: Path, summary: Summary, lateness_us: list[int], out: Path) -> None:
     """Draw a PNG of 1600 pixels across."""
     recording = Recording.open(recording_path)
     step = -(-recording.ticks // _POINTS)
-    t_s = recording["tick"][::step] * summary["period_us"] * 1e-6
+    t_s = recording["tick"][::step] * summary.period_us * 1e-6
     reference, estimate = (recording.vector(name)[::step] for name in ("reference_m", "estimate_m"))
     tracking = recording["reference_tick"][::step] >= 0
     figure = Figure(figsize=(16, 10), dpi=100, facecolor="white", layout="constrained")
@@ -42,8 +42,8 @@ def draw_wall(recording_path: Path, summary: dict[str, Any], lateness_us: list[i
         plot.legend(loc="lower right", ncols=4, frameon=False, fontsize=9)
     draw_lateness(plots[3], {"wake-ups of this run": lateness_us})
     figure.suptitle(
-        f"{summary['scenario']}   ·   wall clock   ·   bus {summary['bus']}   ·   {summary['ticks']} ticks, "
-        f"{summary['missed_ticks']} missed, faults: {len(summary['faults'])}",
+        f"{summary.scenario}   ·   wall clock   ·   bus {summary.bus}   ·   {summary.rows.ticks} ticks, "
+        f"{summary.loop.missed_ticks} missed, faults: {len(summary.loop.faults)}",
         fontsize=15,
     )
     figure.savefig(out)

@@ -9,13 +9,13 @@ import fcntl
 import os
 import signal
 import struct
+from pathlib import Path
 from typing import Any
 
 import numpy as np
 
 from hil.bus.frame_log import FrameLog
 from hil.recording.recording import RecordingError, RecordingWriter
-from hil.runs.run_folder import RunFolder
 from pkxyz_ctrl.can.frame import Frame
 from pkxyz_ctrl.loop.row import ROW
 
@@ -30,8 +30,8 @@ _READ_BYTES = 1 << 16
 class WallRecorder:
     """Rows and frames on their way to disk. ``lost_bytes``: what the writer was too slow for."""
 
-    def __init__(self, folder: RunFolder, metadata: dict[str, Any], channel: str) -> None:
-        """Forks: make it before buses are opened and priorities raised."""
+    def __init__(self, recording: Path, frames: Path, metadata: dict[str, Any], channel: str) -> None:
+        """Files to write. Forks: make it before buses are opened and priorities raised."""
         self.lost_bytes = 0
         self._waiting: list[bytes] = []
         reading, self._pipe = os.pipe()
@@ -42,7 +42,7 @@ class WallRecorder:
         if self._child == 0:
             os.close(self._pipe)
             os.close(said)
-            _be_the_writer(reading, saying, folder, metadata, channel)
+            _be_the_writer(reading, saying, recording, frames, metadata, channel)
         os.close(reading)
         os.close(saying)
         self._said = said
@@ -112,13 +112,15 @@ def _length_at(entries: bytes, at: int) -> int:
     return _HEAD.size + entries[at + 1]
 
 
-def _be_the_writer(reading: int, saying: int, folder: RunFolder, metadata: dict[str, Any], channel: str) -> None:
+def _be_the_writer(
+    reading: int, saying: int, rows_to: Path, frames_to: Path, metadata: dict[str, Any], channel: str
+) -> None:
     """Never returns. Deaf to Ctrl-C: the end of the pipe is the end."""
     for number in (signal.SIGINT, signal.SIGTERM, signal.SIGHUP):
         signal.signal(number, signal.SIG_IGN)
     status = 0
     try:
-        with RecordingWriter(folder.recording, metadata) as recording, FrameLog(folder.frames, channel) as log:
+        with RecordingWriter(rows_to, metadata) as recording, FrameLog(frames_to, channel) as log:
             _write_down(reading, recording, log)
     except (RecordingError, OSError) as error:
         os.write(saying, str(error).encode())

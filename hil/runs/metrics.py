@@ -6,6 +6,7 @@ lead-in and lead-out; hold noise is the standard deviation of the true position 
 
 import math
 from collections.abc import Mapping
+from dataclasses import asdict, dataclass
 from typing import Any, Protocol
 
 import numpy as np
@@ -41,6 +42,33 @@ class _HasBounds(Protocol):
     def min(self) -> float | None: ...
     @property
     def max(self) -> float | None: ...
+
+
+@dataclass(frozen=True)
+class RowFigures:
+    """Figures by name of ``METRICS``, those that come from rows; None for what did not take place."""
+
+    ticks: int
+    saturated_ticks: int
+    rms_error_nm: Mapping[str, float] | None
+    max_error_nm: Mapping[str, float] | None
+    hold_noise_nm: Mapping[str, float] | None
+    estimate_error_nm: Mapping[str, float] | None
+
+
+@dataclass(frozen=True)
+class Verdict:
+    """What became of a check. ``ok`` is None where there is nothing that could be measured."""
+
+    name: str
+    value: float | None
+    min: float | None
+    max: float | None
+    ok: bool | None
+
+    def as_json(self) -> dict[str, Any]:
+        """Plain data; a bound that isn't there has no key."""
+        return {key: value for key, value in asdict(self).items() if value is not None or key in ("value", "ok")}
 
 
 class _Sums:
@@ -79,7 +107,6 @@ class Metrics:
         self._noise = [_Sums() for _ in self._stills]
         self.ticks = 0
         self.saturated_ticks = 0
-        self.fault_ticks = 0
 
     def update(self, block: NDArray[np.void]) -> None:
         """Take in a block (n,) of ``ROW``."""
@@ -87,7 +114,6 @@ class Metrics:
             raise TypeError(f"a block of rows is expected, got {block.dtype}")
         self.ticks += len(block)
         self.saturated_ticks += int(np.count_nonzero(block["saturated"]))
-        self.fault_ticks += int(np.count_nonzero(block["mode"] == Mode.FAULT))
         tick = block["reference_tick"]
         t_us = np.where((tick >= 0) & (block["mode"] == Mode.TRACKING), tick * self._period_us, -1)
         if len(t_us) == 0:
@@ -104,17 +130,17 @@ class Metrics:
             if inside is not None:  # less the reference, which is constant here: keeps digits
                 noise.add(block["position_m"][inside] - block["reference_m"][inside])
 
-    def figures(self) -> dict[str, Any]:
-        """Figures by name of ``METRICS``, those that come from rows; None for what did not take place."""
+    def figures(self) -> RowFigures:
+        """What has come together so far."""
         scanned = self._error.count > 0
-        return {
-            "ticks": self.ticks,
-            "saturated_ticks": self.saturated_ticks,
-            "rms_error_nm": _by_axis(self._error.rms()) if scanned else None,
-            "max_error_nm": _by_axis(self._error.largest) if scanned else None,
-            "hold_noise_nm": self._hold_noise(),
-            "estimate_error_nm": _by_axis(self._estimate.rms()) if scanned else None,
-        }
+        return RowFigures(
+            ticks=self.ticks,
+            saturated_ticks=self.saturated_ticks,
+            rms_error_nm=_by_axis(self._error.rms()) if scanned else None,
+            max_error_nm=_by_axis(self._error.largest) if scanned else None,
+            hold_noise_nm=self._hold_noise(),
+            estimate_error_nm=_by_axis(self._estimate.rms()) if scanned else None,
+        )
 
     def _hold_noise(self) -> dict[str, float] | None:
         """About each hold's own mean, pooled over the holds."""
@@ -136,25 +162,23 @@ def _inside(t_us: NDArray[np.int64], span: tuple[int, int], window: tuple[int, i
     return mask if mask.any() else None
 
 
-def evaluate(checks: Mapping[str, _HasBounds], summary: Mapping[str, Any]) -> list[dict[str, Any]]:
-    """The verdict on each check: name, value, min and max where bounded, ok.
+def evaluate(checks: Mapping[str, _HasBounds], figures: Mapping[str, Any]) -> tuple[Verdict, ...]:
+    """The verdict on each check, by figures of the names in ``METRICS``.
 
     The value of a metric of three axes is that of the worst one. Without a value a check is not met, save that of the
     bus load where there is no bus: there ``ok`` is None.
     """
     verdicts = []
     for name, bound in checks.items():
-        bounds = {key: limit for key, limit in (("min", bound.min), ("max", bound.max)) if limit is not None}
-        measured = summary.get(name)
-        values = _values(measured)
+        values = _values(figures.get(name))
         if not values:
-            verdicts.append({"name": name, "value": None, **bounds, "ok": None if name == "bus_load" else False})
+            verdicts.append(Verdict(name, None, bound.min, bound.max, None if name == "bus_load" else False))
             continue
         low = bound.min is not None and min(values) < bound.min
         worst = min(values) if low or bound.max is None else max(values)
         ok = not low and (bound.max is None or max(values) <= bound.max) and all(map(math.isfinite, values))
-        verdicts.append({"name": name, "value": worst, **bounds, "ok": ok})
-    return verdicts
+        verdicts.append(Verdict(name, worst, bound.min, bound.max, ok))
+    return tuple(verdicts)
 
 
 def _values(measured: Any) -> list[float]:

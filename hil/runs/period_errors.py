@@ -5,7 +5,8 @@ of squares over the axes; the noise of that one period is in it, constant errors
 less reference, all that a controller can know; "true" is true position less reference.
 """
 
-from typing import Any
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
@@ -13,7 +14,6 @@ from numpy.typing import NDArray
 from hil.recording.recording import Recording
 from pkxyz_ctrl.learning import LearningConfig, timetable
 from pkxyz_ctrl.learning.harmonics import count_up_to, harmonics
-from pkxyz_ctrl.loop.row import ROW
 from pkxyz_ctrl.safety.modes import Mode
 from pkxyz_ctrl.trajectory import Trajectory
 
@@ -23,6 +23,17 @@ AXES = ("x", "y", "z")
 WITHIN = 5
 """Periods after which the error is compared with that of the first one."""
 _NM = 1e9
+
+
+@dataclass(frozen=True)
+class PeriodFigures:
+    """Figures by name of ``METRICS``, and those of each period; None for what did not take place."""
+
+    line_error_nm: Mapping[str, float] | None
+    learning_factor: float | None
+    learning_factor_true: float | None
+    periods: Mapping[str, Sequence[float] | Sequence[Mapping[str, float]] | None]
+    """sensed_nm, true_nm and line_error_nm, each a value a period"""
 
 
 class PeriodErrors:
@@ -64,11 +75,7 @@ class PeriodErrors:
 
     def look_at(self, recording: Recording) -> None:
         """Take in all rows of a recording."""
-        fields = ("mode", "reference_tick", "measurement_m", "position_m", "reference_m")
-        for block in recording.blocks(fields):
-            rows = np.zeros(len(block["mode"]), ROW)
-            for name in fields:
-                rows[name] = block[name]
+        for rows in recording.rows(("mode", "reference_tick", "measurement_m", "position_m", "reference_m")):
             self.update(rows)
 
     def _close(self) -> None:
@@ -88,15 +95,15 @@ class PeriodErrors:
     def _periodic_nm(self, error_m: Array) -> float:
         return float(np.sqrt(2.0 * (np.abs(harmonics(error_m, 0, self._count)) ** 2).sum())) * _NM
 
-    def figures(self) -> dict[str, Any]:
-        """Figures by name of ``METRICS``, and ``periods``; None for what did not take place."""
+    def figures(self) -> PeriodFigures:
+        """What has come together so far."""
         lines = [dict(zip(AXES, map(float, line), strict=True)) for line in self.line_error_nm]
-        return {
-            "periods": {"sensed_nm": self.sensed_nm, "true_nm": self.true_nm or None, "line_error_nm": lines or None},
-            "line_error_nm": lines[-1] if lines else None,
-            "learning_factor": _factor(self.sensed_nm),
-            "learning_factor_true": _factor(self.true_nm),
-        }
+        return PeriodFigures(
+            lines[-1] if lines else None,
+            _factor(self.sensed_nm),
+            _factor(self.true_nm),
+            {"sensed_nm": self.sensed_nm, "true_nm": self.true_nm or None, "line_error_nm": lines or None},
+        )
 
 
 def _factor(errors_nm: list[float]) -> float | None:

@@ -1,83 +1,98 @@
-"""One scenario run into one folder: lane, recording, figures, verdict, picture."""
+"""One scenario run into one folder, whatever the lane: configuration, rows, figures, verdict."""
 
 from collections.abc import Callable
+from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
-from hil.lanes import either as lanes
+from hil.lanes import in_process as lanes
+from hil.lanes.lane import Lane
 from hil.recording.recording import RecordingWriter
 from hil.runs.learning import Learning
-from hil.runs.metrics import Metrics
-from hil.runs.run_folder import RunFolder, metadata_of, summarise
+from hil.runs.metrics import Metrics, RowFigures
+from hil.runs.run_folder import RunFolder, metadata_of
 from hil.runs.scenario import Scenario
+from hil.runs.summary import LoopFigures, Summary, summarise
 from pkxyz_ctrl.config.files import ConfigError
+from pkxyz_ctrl.learning import Learner
+
+
+@dataclass(frozen=True)
+class Begun:
+    """A run whose configuration is written and whose rows can come: what every lane begins and ends with."""
+
+    folder: RunFolder
+    scenario: Scenario
+    lane: Lane
+    resolved: dict[str, Any]
+    metrics: Metrics
+    learning: Learning | None
+
+    @classmethod
+    def begin(cls, folder: RunFolder, scenario: Scenario, lane: Lane) -> "Begun":
+        """Write the configuration. Raises ``ConfigError``."""
+        return cls(
+            folder, scenario, lane, folder.write_config(scenario), Metrics(scenario.trajectory, scenario.bus.period_us),
+            Learning(scenario) if scenario.config.learning is not None else None,
+        )  # fmt: skip
+
+    @property
+    def metadata(self) -> dict[str, Any]:
+        """What the recording carries with its rows."""
+        return metadata_of(self.scenario, self.lane, self.resolved)
+
+    def end(self, rows: RowFigures, loop: LoopFigures, learner: Learner | None = None, *, interrupted: bool) -> Summary:
+        """Store what was learnt and write the summary. Raises ``ConfigError`` and ``LearningError``."""
+        digest = self.resolved["digest"]
+        learnt = self.learning.close(self.folder, learner, digest) if self.learning is not None else None
+        summary = summarise(self.scenario, self.lane, digest, rows, loop, learnt, interrupted=interrupted)
+        self.folder.write_summary(summary.as_text())
+        return summary
 
 
 def run_into(
-    folder: RunFolder, scenario: Scenario, lane: str, on_progress: Callable[[int, int], None]
-) -> dict[str, Any]:
-    """Run ``scenario`` in ``lane`` and leave everything in ``folder``; returns the summary.
+    folder: RunFolder,
+    scenario: Scenario,
+    lane: Lane,
+    on_progress: Callable[[int, int], None] = lambda done, total: None,
+) -> Summary:
+    """Run ``scenario`` in lockstep or in the fast lane and leave everything in ``folder`` but the picture.
 
     Interrupted by the keyboard, it keeps what was recorded and says so in the summary. Raises ``ConfigError`` for a
     bus that the lane can't use, and it or ``RecordingError`` when the disk fails.
     """
     require_bus(scenario, lane)
-    resolved = folder.write_config(scenario)
-    metrics = Metrics(scenario.trajectory, scenario.bus.period_us)
-    learning = Learning(scenario) if scenario.config.learning is not None else None
+    begun = Begun.begin(folder, scenario, lane)
     result: lanes.LaneResult | None = None
-    interrupted = False
-    with RecordingWriter(folder.recording, metadata_of(scenario, lane, resolved)) as recording:
+    with RecordingWriter(folder.recording, begun.metadata) as recording:
 
         def on_block(block: NDArray[np.void]) -> None:
             recording.write(block)
-            metrics.update(block)
-            if learning is not None:
-                learning.errors.update(block)
+            begun.metrics.update(block)
+            if begun.learning is not None:
+                begun.learning.errors.update(block)
 
         try:
             setup = scenario.setup()
             with folder.in_one_line():
                 result = lanes.run(setup, lane, on_block=on_block, on_progress=on_progress, frame_log=folder.frames)
         except KeyboardInterrupt:
-            interrupted = True
-    figures = metrics.figures()
-    if result is not None:
-        figures |= {
-            "missed_ticks": result.missed_ticks,
-            "faults": list(result.faults),
-            "bus_load": result.bus_load,
-            "realtime_factor": result.realtime_factor,
-        }
-    if learning is not None:
-        figures |= learning.close(folder, result.learner if result is not None else None, resolved["digest"])
-    summary = summarise(scenario, lane, resolved["digest"], figures, interrupted=interrupted)
-    folder.write_summary(summary)
-    return summary
+            pass
+    rows = begun.metrics.figures()
+    if result is None:
+        return begun.end(rows, LoopFigures(), interrupted=True)
+    loop = LoopFigures(result.missed_ticks, result.faults, result.bus_load, result.realtime_factor)
+    return begun.end(rows, loop, result.learner, interrupted=False)
 
 
-def require_bus(scenario: Scenario, lane: str) -> None:
+def require_bus(scenario: Scenario, lane: Lane) -> None:
     """Raise ``ConfigError`` if the lane needs frames and the bus config has none."""
-    if lane == "lockstep" and scenario.bus.can is None:
+    if lane == Lane.LOCKSTEP and scenario.bus.can is None:
         raise ConfigError(
             f"bus {scenario.bus.name!r} has no [can] and carries no frames, which the lockstep lane needs; "
             "use --lane fast or another --bus"
         )
-    if lane != "lockstep" and (scenario.config.faults or scenario.config.clear_s is not None):
+    if lane != Lane.LOCKSTEP and (scenario.config.faults or scenario.config.clear_s is not None):
         raise ConfigError(f"the {lane} lane has no frames and nobody in whom something could fail; use --lane lockstep")
-
-
-def draw(folder: RunFolder, summary: dict[str, Any]) -> None:
-    """Draw the picture of a run that is already recorded; there is none of a run that never began."""
-    if summary["ticks"] == 0:
-        return
-    from hil.pictures.report import draw_report  # matplotlib takes as long to import as a run takes
-
-    with folder.in_one_line():
-        draw_report(folder.recording, folder.frames, summary, folder.picture)
-        if summary.get("learning_factor") is not None:
-            from hil.pictures.learning import draw_learning
-
-            draw_learning(folder.recording, summary, folder.learning_picture)

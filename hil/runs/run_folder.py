@@ -1,6 +1,5 @@
 """The folder that a run leaves: recording, frame log, configuration, summary and picture."""
 
-import json
 import re
 import shutil
 from collections.abc import Iterator
@@ -8,7 +7,7 @@ from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
-from hil.runs.metrics import evaluate
+from hil.lanes.lane import Lane
 from hil.runs.scenario import LEARNT_FROM, Scenario, resolve, tables
 from hil.runs.versions import versions
 from pkxyz_ctrl.config.files import ConfigError, write_toml
@@ -70,10 +69,10 @@ class RunFolder:
             raise ConfigError(f"{self.config}: {(error.strerror or str(error)).lower()}; give another --out") from None
         return resolved
 
-    def write_summary(self, summary: dict[str, Any]) -> None:
-        """Write the summary. Raises ``ConfigError``."""
+    def write_summary(self, text: str) -> None:
+        """Write ``Summary.as_text()``. Raises ``ConfigError``."""
         with self.in_one_line():
-            self.summary.write_text(json.dumps(summary, indent=2, allow_nan=False) + "\n", encoding="utf-8")
+            self.summary.write_text(text, encoding="utf-8")
 
     @contextmanager
     def in_one_line(self) -> Iterator[None]:
@@ -89,18 +88,18 @@ class RunFolder:
             ) from None
 
 
-def next_free(runs: Path, scenario: str, lane: str) -> Path:
+def next_free(runs: Path, scenario: str, lane: Lane) -> Path:
     """``runs/<scenario>-<lane>-<n>`` with the lowest n above those that exist."""
     stem = f"{scenario}-{lane}-"
     taken = [int(p.name[len(stem) :]) for p in runs.glob(f"{stem}*") if p.name[len(stem) :].isdigit()]
     return runs / f"{stem}{max(taken, default=0) + 1}"
 
 
-def metadata_of(scenario: Scenario, lane: str, resolved: dict[str, Any]) -> dict[str, Any]:
+def metadata_of(scenario: Scenario, lane: Lane, resolved: dict[str, Any]) -> dict[str, Any]:
     """What a recording carries with its rows."""
     return {
         "scenario": scenario.config.name,
-        "lane": lane,
+        "lane": lane.value,
         "seed": scenario.config.seed,
         "digest": resolved["digest"],
         "period_us": scenario.bus.period_us,
@@ -117,32 +116,3 @@ def metadata_of(scenario: Scenario, lane: str, resolved: dict[str, Any]) -> dict
         "versions": versions(),
         "config": resolved,
     }
-
-
-def summarise(
-    scenario: Scenario, lane: str, digest: str, figures: dict[str, Any], *, interrupted: bool
-) -> dict[str, Any]:
-    """The summary: who ran, figures, verdicts on the checks, and ``ok``, which is false for an interrupted run."""
-    summary: dict[str, Any] = {
-        "scenario": scenario.config.name,
-        "lane": lane,
-        "seed": scenario.config.seed,
-        "digest": digest,
-        "stage": scenario.stage.name,
-        "plant": scenario.plant.name,
-        "controller": scenario.controller.name,
-        "bus": scenario.bus.name,
-        "period_us": scenario.bus.period_us,
-        "duration_s": scenario.config.duration_s,
-        "interrupted": interrupted,
-        "missed_ticks": None,
-        "faults": [],
-        "bus_load": None,
-        "realtime_factor": None,
-        **figures,
-    }
-    checks = evaluate(scenario.config.checks, summary)
-    summary["checks"] = checks
-    summary["ok"] = not interrupted and all(check["ok"] is not False for check in checks)
-    summary["versions"] = versions()
-    return summary

@@ -14,7 +14,7 @@ from typing import TYPE_CHECKING, Annotated, Any, Self
 from pydantic import BaseModel, Field, field_validator, model_validator
 
 from hil.faults.fault import Fault
-from hil.runs.learning import belongs, stored_for
+from hil.runs.correction import belongs, stored_for
 from hil.runs.metrics import METRICS
 from pkxyz_ctrl.config import files as config
 from pkxyz_ctrl.config.bus import BusConfig

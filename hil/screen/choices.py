@@ -12,13 +12,6 @@ if TYPE_CHECKING:
     from pkxyz_ctrl.stage import Stage
 
 
-class Lane(StrEnum):
-    """Over the simulated bus, or composed in one compiled loop; both have the same bits."""
-
-    LOCKSTEP = "lockstep"
-    FAST = "fast"
-
-
 class Tones(StrEnum):
     """What is added to the measurement: all tones at once, or one after another."""
 

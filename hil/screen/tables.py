@@ -1,10 +1,13 @@
 """Tables of numbers on a terminal that is too narrow for them, or on none."""
 
-from collections.abc import Iterator, Mapping
-from typing import Any
+from collections.abc import Iterator
+from typing import TYPE_CHECKING
 
 from rich.console import Console
 from rich.table import Table
+
+if TYPE_CHECKING:
+    from hil.runs.metrics import RowFigures
 
 
 def print_whole(screen: Console, table: Table) -> None:
@@ -13,9 +16,12 @@ def print_whole(screen: Console, table: Table) -> None:
     Console(file=screen.file, width=max(screen.width, wide), highlight=False).print(table)
 
 
-def error_lines(summary: Mapping[str, Any]) -> Iterator[str]:
+def error_lines(rows: "RowFigures", errors_are_of: str) -> Iterator[str]:
     """A line for each figure of three axes that every run has: error while scanning, and noise in holds."""
-    by = ", by the estimate" if summary.get("errors_are_of") == "estimate" else ""
-    for name, words in (("rms_error_nm", "rms error while scanning"), ("hold_noise_nm", "rms noise in holds")):
-        if summary[name]:
-            yield f"{words}{by}, x / y / z: {' / '.join(f'{value:.2f}' for value in summary[name].values())} nm"
+    by = ", by the estimate" if errors_are_of == "estimate" else ""
+    for measured, words in (
+        (rows.rms_error_nm, "rms error while scanning"),
+        (rows.hold_noise_nm, "rms noise in holds"),
+    ):
+        if measured:
+            yield f"{words}{by}, x / y / z: {' / '.join(f'{value:.2f}' for value in measured.values())} nm"

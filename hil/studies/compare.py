@@ -1,5 +1,6 @@
 """Several laws on one scenario and one plant: what each reaches, side by side."""
 
+import dataclasses
 from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Any
@@ -7,9 +8,10 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from hil.lanes import either as lanes
-from hil.runs.in_process import require_bus
+from hil.lanes import in_process as lanes
+from hil.lanes.lane import Lane
 from hil.runs.metrics import Metrics
+from hil.runs.run import require_bus
 from hil.runs.scenario import load_scenario
 from pkxyz_ctrl.config.files import ConfigError
 
@@ -51,7 +53,7 @@ def compare(
     stage: str | None = None,
     plant: str | None = None,
     seed: int | None = None,
-    lane: str = "fast",
+    lane: Lane = Lane.FAST,
     on_progress: Callable[[int, int], None] = lambda done, total: None,
 ) -> list[Compared]:
     """Run a scenario with each controller. A law that can't be run there says why, and the others go on.
@@ -65,7 +67,9 @@ def compare(
     return found
 
 
-def _run(scenario: str, controller: str, stage: str | None, plant: str | None, seed: int | None, lane: str) -> Compared:
+def _run(
+    scenario: str, controller: str, stage: str | None, plant: str | None, seed: int | None, lane: Lane
+) -> Compared:
     loaded = load_scenario(scenario, controller=controller, stage=stage, plant=plant, seed=seed)
     require_bus(loaded, lane)
     metrics = Metrics(loaded.trajectory, loaded.bus.period_us)
@@ -88,7 +92,10 @@ def _run(scenario: str, controller: str, stage: str | None, plant: str | None, s
     except ConfigError as error:
         return Compared(controller, loaded.controller.law, {}, 0, str(error), np.empty(0), np.empty((0, 3)))
     result = lanes.run(setup, lane, on_block=on_block)
-    figures = metrics.figures() | {"faults": len(result.faults), "missed_ticks": result.missed_ticks}
+    figures = dataclasses.asdict(metrics.figures()) | {
+        "faults": len(result.faults),
+        "missed_ticks": result.missed_ticks,
+    }
     problem = result.faults[0] if result.faults else None
     return Compared(
         controller, loaded.controller.law, figures, gave_up, problem, np.concatenate(times), np.concatenate(errors)

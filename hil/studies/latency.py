@@ -17,9 +17,10 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from hil.lanes import either as lanes
+from hil.lanes import in_process as lanes
 from hil.lanes.blocks import PREVIEW_ROWS
 from hil.lanes.ending import Ended, Ending
+from hil.lanes.lane import Lane
 from hil.lanes.setup import Setup
 from hil.lanes.wall import wall_gate
 from hil.runs.scenario import load_scenario
@@ -172,7 +173,7 @@ def _setup(period_us: int, seconds: float) -> Setup:
 def _played(setup: Setup) -> list[Frame]:
     """The sense frames of a run in the fast lane."""
     counts: list[NDArray[np.int32]] = []
-    lanes.run(setup, "fast", on_block=lambda block: counts.append(block["sense_count"].copy()))
+    lanes.run(setup, Lane.FAST, on_block=lambda block: counts.append(block["sense_count"].copy()))
     assert setup.bus.can is not None
     driver = setup.bus.can.driver
     codec = ProcessCodec(cob_id.SENSE_BASE + driver.node_id, driver.protection)

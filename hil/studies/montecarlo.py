@@ -5,14 +5,15 @@ Plant n is drawn by seed n, which also seeds its noise, so any of them runs agai
 
 import json
 import math
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
-from hil.lanes import either as lanes
+from hil.lanes import in_process as lanes
+from hil.lanes.lane import Lane
 from hil.runs.metrics import Metrics
 from hil.runs.scenario import Scenario, resolve
 from hil.studies.margins.loop import Loop
@@ -84,21 +85,20 @@ def run_one(study: Study, seed: int) -> Result:
     scenario = study.drawn(seed)
     setup = scenario.setup()
     metrics = Metrics(setup.trajectory, setup.bus.period_us)
-    result = lanes.run(setup, "fast", on_block=metrics.update)
+    result = lanes.run(setup, Lane.FAST, on_block=metrics.update)
     figures = metrics.figures()
     case = study.tolerances.draw(seed)
     peak = Loop(Stage(setup.stage), setup.bus, setup.law).peak_sensitivity(case)
 
-    def worst(name: str) -> float | None:
-        values = figures[name]
+    def worst(values: Mapping[str, float] | None) -> float | None:
         return None if values is None or result.faults else max(values.values())
 
     return Result(
         seed,
-        worst("rms_error_nm"),
-        worst("hold_noise_nm"),
+        worst(figures.rms_error_nm),
+        worst(figures.hold_noise_nm),
         peak if math.isfinite(peak) else None,
-        int(figures["saturated_ticks"]),
+        figures.saturated_ticks,
         result.faults[0] if result.faults else None,
     )
 

@@ -8,6 +8,7 @@ import pytest
 from command_line import pkxyz
 
 from hil.commands.new import Kind, _model, commented
+from hil.runs.metrics import RowFigures
 from hil.screen.tables import error_lines
 from pkxyz_ctrl.config.files import CONFIG_DIR, load, names
 
@@ -84,9 +85,9 @@ def test_errors_of_each_axis_are_shown_also_where_a_check_fails(tmp_path):
 
 
 def test_error_lines_say_whose_errors_they_are():
-    summary = {"rms_error_nm": {"x": 1.0, "y": 2.5, "z": 0.126}, "hold_noise_nm": None}
-    assert list(error_lines(summary)) == ["rms error while scanning, x / y / z: 1.00 / 2.50 / 0.13 nm"]
-    assert ", by the estimate, " in next(error_lines(summary | {"errors_are_of": "estimate"}))
+    rows = RowFigures(10, 0, {"x": 1.0, "y": 2.5, "z": 0.126}, None, None, None)
+    assert list(error_lines(rows, "true position")) == ["rms error while scanning, x / y / z: 1.00 / 2.50 / 0.13 nm"]
+    assert ", by the estimate, " in next(error_lines(rows, "estimate"))
 
 
 @pytest.mark.slow

@@ -15,6 +15,7 @@ from sim_truth import truth_about
 from typer.testing import CliRunner
 
 from hil.cli import app
+from hil.lanes.lane import Lane
 from hil.lanes.setup import bare_setup
 from hil.runs.scenario import load_scenario
 from hil.studies.identify.calibrated_stage import calibration_of, write_calibrated_stage
@@ -263,7 +264,7 @@ HARSH = "harsh"
 
 
 def identified(stage_file="reconstructed", seed=1, plant=HARSH):
-    return identify(bare_setup(str(stage_file), plant, controller(), bus(), seed), MIDDLE, "fast")
+    return identify(bare_setup(str(stage_file), plant, controller(), bus(), seed), MIDDLE, Lane.FAST)
 
 
 @cache

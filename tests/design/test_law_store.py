@@ -115,7 +115,7 @@ def test_without_a_folder_it_is_designed_each_time(
 def test_the_second_run_needs_no_design_tools() -> None:
     """Their import is half of the time that a first run spends before it starts."""
     program = (
-        "import sys; from hil.runs.scenario import load_scenario; import hil.lanes.either;"
+        "import sys; from hil.runs.scenario import load_scenario; import hil.lanes.in_process;"
         "load_scenario('raster').setup().law;"
         "print([m for m in ('control', 'filterpy', 'scipy.stats', 'scipy.integrate', 'osqp') if m in sys.modules])"
     )

@@ -11,7 +11,8 @@ from loop_rig import bus, setup
 from hil.faults.catalogue import KINDS, PARTS, targets
 from hil.faults.fault import Fault, parse
 from hil.faults.plant import FaultyPlant
-from hil.runs.in_process import require_bus
+from hil.lanes.lane import Lane
+from hil.runs.run import require_bus
 from hil.runs.scenario import load_scenario, resolve
 from pkxyz_ctrl.config.files import CONFIG_DIR, ConfigError
 
@@ -92,7 +93,7 @@ def test_faults_of_a_file_and_of_the_command_line_come_together(tmp_path):
     assert [str(f) for f in loaded.setup().faults] == ["sense.2:offset@0.3,offset_m=1e-06", "bus:babbling@0.5+0.01"]
     assert resolve(loaded)["faults"][0]["parameters"] == {"offset_m": 1e-6}
     with pytest.raises(ConfigError, match="the fast lane has no frames"):
-        require_bus(loaded, "fast")
+        require_bus(loaded, Lane.FAST)
     path.write_text(text.replace("[checks]", f"{entry.replace('offset_m', 'gain')}\n[checks]"), encoding="utf-8")
     with pytest.raises(ConfigError, match=r"mine.toml: faults\.0: sense.2:offset has no parameter 'gain'"):
         load_scenario(path)

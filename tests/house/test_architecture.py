@@ -93,8 +93,8 @@ def test_the_reader_of_imports_reads_them_all():
         "pkxyz_ctrl.core.tick"
     )
     assert "pkxyz_ctrl.can.frame" in imports("pkxyz_ctrl.can.driver")
-    assert "hil.pictures.report" in imports("hil.runs.in_process")
-    assert "hil.pictures.report" not in imports("hil.runs.in_process", at_import_only=True)
+    assert "hil.lanes.setup" in imports("hil.runs.scenario")
+    assert "hil.lanes.setup" not in imports("hil.runs.scenario", at_import_only=True)
     assert len(FILES) > 80
 
 

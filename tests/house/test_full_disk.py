@@ -8,8 +8,10 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from hil.lanes.lane import Lane
+from hil.pictures.run import draw
 from hil.recording.recording import Recording, RecordingError
-from hil.runs.in_process import draw, run_into
+from hil.runs.run import run_into
 from hil.runs.run_folder import FRAMES, PICTURE, SUMMARY, RunFolder
 from hil.runs.scenario import load_scenario
 from pkxyz_ctrl.config.files import ConfigError
@@ -56,7 +58,7 @@ def test_whichever_file_meets_the_end_of_the_disk_the_recording_beside_it_opens(
     folder = RunFolder(tmp_path / "run")
     (folder.path / name).symlink_to("/dev/full")
     with pytest.raises((ConfigError, RecordingError), match="no space left on device"):
-        draw(folder, run_into(folder, load_scenario("raster"), "lockstep", lambda done, total: None))
+        draw(folder, run_into(folder, load_scenario("raster"), Lane.LOCKSTEP))
     recording = Recording.open(folder.recording)
     assert recording.ticks > (0 if name == FRAMES else 5000)
     assert np.array_equal(recording["tick"], np.arange(recording.ticks))

@@ -18,7 +18,7 @@ RIGS = ROOT / "tests" / "rigs"
 
 
 def without_compiler(*arguments: str) -> subprocess.CompletedProcess[str]:
-    environment = os.environ | {"NUMBA_DISABLE_JIT": "1", "PYTHONPATH": str(RIGS)}
+    environment = os.environ | {"NUMBA_DISABLE_JIT": "1", "PYTHONPATH": os.pathsep.join((str(ROOT), str(RIGS)))}
     return subprocess.run(
         [sys.executable, *arguments], capture_output=True, text=True, cwd=ROOT, env=environment, check=False
     )

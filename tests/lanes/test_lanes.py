@@ -11,7 +11,7 @@ from loop_rig import bus, first_difference, rows_of, setup, shortened
 import hil.lanes.blocks
 from hil.bus.published_wires import publish
 from hil.bus.sim_bus import to_frame, to_message
-from hil.lanes import either as lanes
+from hil.lanes import in_process as lanes
 from hil.lanes.blocks import Blocks
 from hil.lanes.lockstep import LockstepRig
 from pkxyz_ctrl.can.frame import Frame
@@ -152,8 +152,8 @@ def test_a_bus_without_frames_runs_in_the_fast_lane_only():
     assert len(rows) == result.ticks == 200
     with pytest.raises(ConfigError, match=r"'local_20k' has no \[can\].*use the fast lane"):
         rows_of(local, "lockstep")
-    with pytest.raises(ValueError, match="no lane is called 'quick'; there are lockstep and fast"):
-        rows_of(local, "quick")
+    with pytest.raises(ValueError, match="the wall lane waits for a clock"):
+        rows_of(local, "wall")
 
 
 def test_a_frame_that_our_own_gate_blocks_ends_the_start_up_with_its_reason():

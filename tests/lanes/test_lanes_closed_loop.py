@@ -24,7 +24,10 @@ def figures(plant, seed=1, bus_name="fd_5k"):
     rows, result = rows_of(run_setup, "fast")
     metrics = Metrics(run_setup.trajectory, run_setup.bus.period_us)
     metrics.update(rows)
-    return metrics.figures() | {"faults": result.faults, "modes": set(rows["mode"][-1000:].tolist())}
+    return dataclasses.asdict(metrics.figures()) | {
+        "faults": result.faults,
+        "modes": set(rows["mode"][-1000:].tolist()),
+    }
 
 
 @pytest.mark.parametrize("seed", [1, 2, 3])

@@ -20,7 +20,8 @@ import pytest
 
 from hil.bus.unix_bus import UnixBus
 from hil.commands import run as run_cli
-from hil.lanes import either as lanes
+from hil.lanes import in_process as lanes
+from hil.lanes.lane import Lane
 from hil.lanes.wall_plant import TRUTH
 from hil.recording.recording import Recording
 from hil.runs.scenario import load_scenario
@@ -198,7 +199,7 @@ def test_trajectories_agree_with_lockstep_within_the_noise(bench, changes):
     changes("pre-operational", False)
     blocks = []
     setup = load_scenario(bench / "on_slow.toml").setup()
-    lanes.run(setup, "lockstep", on_block=lambda block: blocks.append(block.copy()))
+    lanes.run(setup, Lane.LOCKSTEP, on_block=lambda block: blocks.append(block.copy()))
     exact = np.concatenate(blocks)
     exact = exact[exact["mode"] == Mode.TRACKING]
     for attempt in range(3):

@@ -424,9 +424,9 @@ def test_two_periods_of_delay_in_closed_loop():
     metrics = Metrics(slow.trajectory, slow.bus.period_us)
     metrics.update(rows)
     figures = metrics.figures()
-    assert figures["saturated_ticks"] == 0
-    assert all(0.2 < v < 2.0 for v in figures["rms_error_nm"].values())
-    assert all(0.2 < v < 2.0 for v in figures["hold_noise_nm"].values())
+    assert figures.saturated_ticks == 0
+    assert all(0.2 < v < 2.0 for v in figures.rms_error_nm.values())
+    assert all(0.2 < v < 2.0 for v in figures.hold_noise_nm.values())
     # counts of a tick reach the combs two ticks later, through an amplifier that is there within a period
     live = np.flatnonzero(rows["mode"] == Mode.TRACKING)[1000:-4]
     assert np.abs(rows["comb_voltage_v"][live + 3] - rows["voltage_v"][live]).max() < 1e-6

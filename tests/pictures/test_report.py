@@ -8,10 +8,11 @@ from synthetic_rows import START_TICKS, default_scenario, metadata, tracking_row
 
 from hil.bus.frame_time import frame_duration_ns
 from hil.bus.load_trace import read_bus_trace
+from hil.lanes.lane import Lane
 from hil.pictures.report import bound_words, draw_report, read_signals
 from hil.recording.recording import Recording, RecordingWriter
-from hil.runs.metrics import Metrics
-from hil.runs.run_folder import summarise
+from hil.runs.metrics import Metrics, Verdict
+from hil.runs.summary import LoopFigures, summarise
 from pkxyz_ctrl.can.frame import Frame
 
 
@@ -25,8 +26,8 @@ def summary_of(rows, interrupted=False):
     scenario = default_scenario()
     metrics = Metrics(scenario.trajectory, scenario.bus.period_us)
     metrics.update(rows)
-    measured = {"missed_ticks": 0, "faults": [], "bus_load": 0.8, "realtime_factor": 9.0}
-    return summarise(scenario, "lockstep", "0" * 16, metrics.figures() | measured, interrupted=interrupted)
+    loop = LoopFigures(missed_ticks=0, bus_load=0.8, realtime_factor=9.0)
+    return summarise(scenario, Lane.LOCKSTEP, "0" * 16, metrics.figures(), loop, interrupted=interrupted)
 
 
 @pytest.mark.parametrize("repeats", [1, 8])
@@ -70,7 +71,7 @@ def test_a_picture_is_drawn_however_the_run_ended(tmp_path, kept):
     width, height = png_size(tmp_path / "report.png")
     assert width == 1600
     assert 900 <= height <= 1200
-    assert summary["ok"] is (kept == slice(None))
+    assert summary.ok is (kept == slice(None))
 
 
 def test_bus_load_over_time_is_that_of_the_frames(tmp_path):
@@ -100,6 +101,6 @@ def test_bus_load_over_time_is_that_of_the_frames(tmp_path):
 
 
 def test_bounds_in_words():
-    assert bound_words({"max": 5.0}) == "≤ 5"
-    assert bound_words({"min": 0.5}) == "≥ 0.5"
-    assert bound_words({"min": 0.5, "max": 2.0}) == "0.5 to 2"
+    assert bound_words(Verdict("ticks", 1.0, None, 5.0, True)) == "≤ 5"
+    assert bound_words(Verdict("ticks", 1.0, 0.5, None, True)) == "≥ 0.5"
+    assert bound_words(Verdict("ticks", 1.0, 0.5, 2.0, True)) == "0.5 to 2"

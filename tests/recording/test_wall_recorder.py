@@ -13,6 +13,7 @@ import pytest
 
 from hil.bus.frame_log import FrameLog
 from hil.lanes.ending import Ending
+from hil.lanes.lane import Lane
 from hil.lanes.wall import WallRig
 from hil.recording.recording import Recording, RecordingError
 from hil.recording.wall_recorder import WallRecorder
@@ -35,7 +36,7 @@ def folder(tmp_path):
 
 def metadata(**changes):
     scenario = load_scenario("raster", bus="unix_2k")
-    return metadata_of(scenario, "wall", resolve(scenario)) | changes
+    return metadata_of(scenario, Lane.WALL, resolve(scenario)) | changes
 
 
 def random_rows(count, seed=1):
@@ -57,7 +58,7 @@ FRAMES = (
 
 def test_rows_and_frames_arrive_as_if_written_here(folder, tmp_path):
     rows = random_rows(5000)
-    recorder = WallRecorder(folder, metadata(), "bus")
+    recorder = WallRecorder(folder.recording, folder.frames, metadata(), "bus")
     with FrameLog(tmp_path / "here.log", "bus") as here:
         for index in range(len(rows)):
             frame = FRAMES[index % len(FRAMES)]
@@ -77,7 +78,7 @@ def test_rows_and_frames_arrive_as_if_written_here(folder, tmp_path):
 
 def test_a_writer_that_fails_says_why_and_stops_the_loop(folder):
     folder.path.joinpath("frames.log").mkdir()  # cannot be opened as a file
-    recorder = WallRecorder(folder, metadata(), "bus")
+    recorder = WallRecorder(folder.recording, folder.frames, metadata(), "bus")
     row = random_rows(1).view(np.uint8).data
 
     def go_on():  # which row meets the closed pipe is not known
@@ -93,7 +94,8 @@ def test_rows_survive_a_kill_of_the_loop(tmp_path):
     script = (
         "import os, sys; from pathlib import Path; sys.path[:0] = ['tests/rigs', 'tests/recording']\n"
         "import numpy as np; from test_wall_recorder import *\n"
-        "recorder = WallRecorder(RunFolder(Path(sys.argv[1])), metadata(), 'bus'); rows = random_rows(300)\n"
+        "folder = RunFolder(Path(sys.argv[1]))\n"
+        "recorder = WallRecorder(folder.recording, folder.frames, metadata(), 'bus'); rows = random_rows(300)\n"
         "for index in range(300): recorder.row(rows[index : index + 1].view(np.uint8).data)\n"
         "os.kill(os.getpid(), 9)\n"
     )
@@ -110,7 +112,7 @@ class Watched(WallRecorder):
     """Notes the memory in use, as Python has it, every 250 ticks."""
 
     def __init__(self, folder, metadata, channel):
-        super().__init__(folder, metadata, channel)
+        super().__init__(folder.recording, folder.frames, metadata, channel)
         self.ticks = 0
         self.in_use = np.zeros(100, np.int64)  # made before, so that noting takes no memory
 

@@ -7,7 +7,8 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from hil.lanes import either as lanes
+from hil.lanes import in_process as lanes
+from hil.lanes.lane import Lane
 from hil.lanes.setup import Setup
 from hil.runs.scenario import load_scenario
 from pkxyz_ctrl.config.bus import BusConfig
@@ -122,7 +123,7 @@ def shortened(original: Setup, ticks: int) -> Setup:
 def rows_of(run_setup: Setup, lane: str) -> tuple[Rows, lanes.LaneResult]:
     """All rows of a run, and what the lane says about it."""
     blocks: list[Rows] = []
-    result = lanes.run(run_setup, lane, on_block=lambda block: blocks.append(block.copy()))
+    result = lanes.run(run_setup, Lane(lane), on_block=lambda block: blocks.append(block.copy()))
     return np.concatenate(blocks), result
 
 

@@ -4,6 +4,7 @@ import functools
 
 import numpy as np
 
+from hil.lanes.lane import Lane
 from hil.runs.run_folder import metadata_of
 from hil.runs.scenario import load_scenario, resolve
 from pkxyz_ctrl.loop.row import ROW
@@ -19,7 +20,7 @@ def default_scenario():
 
 def metadata():
     scenario = default_scenario()
-    return metadata_of(scenario, "lockstep", resolve(scenario))
+    return metadata_of(scenario, Lane.LOCKSTEP, resolve(scenario))
 
 
 def tracking_rows(seed=1, error_m=1e-9):

@@ -6,9 +6,10 @@ import pytest
 from learning_rig import LINES
 
 from hil.commands.run import learning_of
+from hil.lanes.lane import Lane
 from hil.pictures.learning import draw_learning
-from hil.runs.in_process import run_into
 from hil.runs.replay import replay
+from hil.runs.run import run_into
 from hil.runs.run_folder import RunFolder
 from hil.runs.scenario import load_scenario
 from pkxyz_ctrl.config.files import ConfigError
@@ -59,7 +60,7 @@ def scenario_file(folder, pitch="0.3e-6"):
 def run(folder, path, learning=None):
     run_folder = RunFolder(folder)
     scenario = load_scenario(path, learning=learning)
-    return run_folder, run_into(run_folder, scenario, "fast", lambda done, total: None)
+    return run_folder, run_into(run_folder, scenario, Lane.FAST)
 
 
 @pytest.fixture(scope="module")
@@ -70,18 +71,18 @@ def learnt(tmp_path_factory):
 
 def test_the_folder_holds_what_was_learnt_and_how(learnt):
     _, folder, summary = learnt
-    assert summary["ok"]
-    learning = summary["learning"]
-    assert learning["mode"] == "learn"
-    assert learning["stored"] == "learnt.json"
-    assert learning["period_ticks"] == 100 * LINES
-    assert len(learning["periods"]["sensed_nm"]) == len(learning["periods"]["line_error_nm"]) == 5
-    assert [step["window"] for step in learning["steps"]] == [0, 1, 2]
-    assert json.loads(folder.summary.read_text())["learning_factor"] == summary["learning_factor"]
+    assert summary.ok
+    learning = summary.learnt
+    assert learning.mode == "learn"
+    assert learning.stored == "learnt.json"
+    assert learning.period_ticks == 100 * LINES
+    assert len(learning.figures.periods["sensed_nm"]) == len(learning.figures.periods["line_error_nm"]) == 5
+    assert [step["window"] for step in learning.steps] == [0, 1, 2]
+    assert json.loads(folder.summary.read_text())["learning_factor"] == summary.learnt.figures.learning_factor
     stored = load(folder.learnt)
     assert stored.harmonics_m.shape == (32, 3)  # 12.5 Hz apart, up to 400 Hz
     assert stored.provenance["plant"] == "harsh"
-    assert stored.provenance["digest"] == summary["digest"]
+    assert stored.provenance["digest"] == summary.digest
 
 
 def test_a_recording_of_it_replays_bit_for_bit(learnt):
@@ -96,11 +97,11 @@ def test_its_correction_is_replayed_and_refreshed_and_these_replay_too(learnt):
     file = {"file": str(first.learnt)}
     for mode in ("replay", "refresh"):
         folder, summary = run(root / mode, scenario_file(root), {"mode": mode} | file)
-        sensed = summary["learning"]["periods"]["sensed_nm"]
-        first_nm, *_, last_nm = before["learning"]["periods"]["sensed_nm"]
+        sensed = summary.learnt.figures.periods["sensed_nm"]
+        first_nm, *_, last_nm = before.learnt.figures.periods["sensed_nm"]
         assert sensed[0] < 0.2 * first_nm  # with what the way in has stirred up, once
         assert 0.7 * last_nm < max(sensed[1:]) < 1.4 * last_nm
-        assert (summary["learning"]["stored"] is None) == (mode == "replay")
+        assert (summary.learnt.stored is None) == (mode == "replay")
         assert (folder.path / "learnt_from.json").read_bytes() == first.learnt.read_bytes()
         result = replay(folder.recording)
         assert result.differences == []

@@ -7,8 +7,8 @@ import pytest
 from learning_rig import PERIOD, errors_of, setup
 from loop_rig import first_difference
 
-from hil.lanes.either import _sample_us
 from hil.lanes.fast import run_block
+from hil.lanes.in_process import _sample_us
 from hil.lanes.live_reference import LiveReference
 from hil.runs.learning import belongs
 from hil.runs.period_errors import PeriodErrors
@@ -33,8 +33,8 @@ def harsh():
 def test_ten_times_less_within_five_periods_on_the_harsh_plant(harsh):
     errors, learner, _ = harsh
     assert 30.0 < errors.sensed_nm[0] < 120.0
-    assert 10.0 < errors.figures()["learning_factor"] < 40.0
-    assert 7.0 < errors.figures()["learning_factor_true"] < 30.0  # gain errors of the sense chain are not seen
+    assert 10.0 < errors.figures().learning_factor < 40.0
+    assert 7.0 < errors.figures().learning_factor_true < 30.0  # gain errors of the sense chain are not seen
     assert [step.share for step in learner.steps] == [1.0] * learner.table.windows
     assert sum(step.reverted for step in learner.steps) <= 2
 
@@ -125,7 +125,7 @@ def test_a_correction_that_suits_another_device_is_unlearnt(harsh):
     errors, _, _ = errors_of(dataclasses.replace(run, stored=stored_of(setup(), learner)))
     assert errors.sensed_nm[0] > 20.0
     assert errors.sensed_nm[-1] < 3.0
-    assert errors.figures()["learning_factor"] > 10.0
+    assert errors.figures().learning_factor > 10.0
 
 
 def test_limits_that_leave_no_room_leave_the_reference_alone():

@@ -12,9 +12,10 @@ from loop_rig import Cycle, counts_at
 from typer.testing import CliRunner
 
 from hil.cli import app
+from hil.lanes.lane import Lane
 from hil.recording.recording import Recording, RecordingError, RecordingWriter, journal_of
-from hil.runs.in_process import run_into
 from hil.runs.replay import replay
+from hil.runs.run import run_into
 from hil.runs.run_folder import RunFolder, metadata_of
 from hil.runs.scenario import load_scenario, resolve, restore
 from pkxyz_ctrl.config.controller import ControllerConfig
@@ -56,7 +57,7 @@ def written(folder, rows, metadata):
 def run(tmp_path_factory):
     """The folder of 0.5 s of the default scenario in the fast lane, its rows and metadata."""
     folder = RunFolder(tmp_path_factory.mktemp("replay") / "run")
-    run_into(folder, scenario_of("raster"), "fast", lambda done, total: None)
+    run_into(folder, scenario_of("raster"), Lane.FAST)
     return folder.path, *rows_of(folder.recording)
 
 
@@ -64,7 +65,7 @@ def run(tmp_path_factory):
 def test_a_run_of_either_lane_replays_bit_for_bit(tmp_path, name, lane, changes):
     scenario = scenario_of(name, **changes)
     folder = RunFolder(tmp_path / "run")
-    run_into(folder, scenario, lane, lambda done, total: None)
+    run_into(folder, scenario, Lane(lane))
     result = replay(folder.recording)
     assert result.differences == []
     assert result.notes == []
@@ -112,7 +113,7 @@ def test_whatever_happened_to_the_controller_is_in_the_recording(tmp_path, troub
         stroke_m = noise[tick] + trouble.pop("jump_m", 0.0)
         rows[tick] = cycle.tick(counts_at(stroke_m), **trouble)
     resolved = resolve(scenario)
-    result = replay(written(tmp_path / "by_hand", rows, metadata_of(scenario, "fast", resolved)))
+    result = replay(written(tmp_path / "by_hand", rows, metadata_of(scenario, Lane.FAST, resolved)))
     assert result.differences == []
     assert result.ticks == 420
 
@@ -178,10 +179,10 @@ def test_rows_that_are_missing_are_no_difference_but_an_error(run, tmp_path):
 
 def test_a_table_is_kept_with_the_run_and_may_not_change(tmp_path):
     folder = RunFolder(tmp_path / "run")
-    run_into(folder, scenario_of("path"), "fast", lambda done, total: None)
+    run_into(folder, scenario_of("path"), Lane.FAST)
     (table,) = folder.path.glob("reference.*.csv")
     assert RunFolder(folder.path).path.is_dir()  # still taken for a run, and replaced
-    run_into(RunFolder(folder.path), scenario_of("path"), "fast", lambda done, total: None)
+    run_into(RunFolder(folder.path), scenario_of("path"), Lane.FAST)
     text = table.read_text(encoding="utf-8").rstrip()
     table.write_text(text + "0\n", encoding="utf-8")
     with pytest.raises(ValueError, match="its table is not the one of the run"):

@@ -23,7 +23,8 @@ from pathlib import Path
 
 import matplotlib.font_manager  # noqa: F401  makes its list of fonts in the cache, which takes a guest a minute
 
-from hil.lanes import either as lanes
+from hil.lanes import in_process as lanes
+from hil.lanes.lane import Lane
 from hil.runs.scenario import load_scenario
 
 ROOT = Path(__file__).parent.parent.parent
@@ -66,7 +67,7 @@ def main(chosen: list[str]) -> int:
         return 0
     begin_s = time.monotonic()
     short = dataclasses.replace(load_scenario("raster").setup(), duration_s=0.02)
-    lanes.run(short, "lockstep", on_block=lambda _: None)  # compiles what is not compiled: a guest takes ten minutes
+    lanes.run(short, Lane.LOCKSTEP, on_block=lambda _: None)  # compiles what is not compiled: a guest takes ten minutes
     # a system call of the guest is a change between two of the host's processes, on one processor a fast one
     os.sched_setaffinity(0, {max(os.sched_getaffinity(0))})
     for boot in range(1, BOOTS + 1):

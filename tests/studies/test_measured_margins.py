@@ -13,6 +13,7 @@ from typer.testing import CliRunner
 
 from hil.cli import app
 from hil.lanes.excitation import excitation, tones
+from hil.lanes.lane import Lane
 from hil.studies.margins.loop import Loop, agreement, as_data, over_changed_plants
 from hil.studies.margins.measured import MeasurementError, at_point, measure, sampled_margins
 from pkxyz_ctrl.config.files import ConfigError, load, parse, plain
@@ -50,7 +51,7 @@ def measured(kind="multisine", combs=(0.0, 0.0, 0.0)):
         amplitude_m=8e-9, first_tick=0, seed=3,
     )  # fmt: skip
     run = dataclasses.replace(setup(), plant=plant_with(comb_mismatch={"relative": list(combs)}))
-    return measure(at_point(run, OFF_CENTRE, added), "fast")
+    return measure(at_point(run, OFF_CENTRE, added), Lane.FAST)
 
 
 @pytest.mark.parametrize("kind", ["multisine", "stepped"])
@@ -101,9 +102,9 @@ def test_a_loop_that_opens_while_it_is_measured_is_no_measurement():
         "multisine", np.array([200, 240]), period_ticks=500, periods=3, amplitude_m=1e-6, first_tick=0, seed=1
     )
     with pytest.raises(MeasurementError, match="opened while it was measured"):
-        measure(at_point(setup(), MIDDLE, added), "fast")
+        measure(at_point(setup(), MIDDLE, added), Lane.FAST)
     with pytest.raises(ValueError, match="without an excitation"):
-        measure(setup(), "fast")
+        measure(setup(), Lane.FAST)
 
 
 # -- changed plants ---------------------------------------------------------------------------------------------------

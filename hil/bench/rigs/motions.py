@@ -7,7 +7,8 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from hil.lanes import either as lanes
+from hil.lanes import in_process as lanes
+from hil.lanes.lane import Lane
 from hil.lanes.setup import Setup
 from hil.runs.scenario import load_scenario
 from pkxyz_ctrl.config.files import ConfigError
@@ -63,7 +64,7 @@ def run(segments: list[Any], controller: str = "lqg", plant: str = "nominal", he
     """Move to a height on the axis and go through ``segments`` there. Raises ``ConfigError`` where that faults."""
     setup, first = setup_of(segments, controller, plant, height_m)
     blocks: list[NDArray[np.void]] = []
-    result = lanes.run(setup, "fast", on_block=lambda block: blocks.append(block.copy()))
+    result = lanes.run(setup, Lane.FAST, on_block=lambda block: blocks.append(block.copy()))
     rows = np.concatenate(blocks)
     rows = rows[rows["reference_tick"] >= 0]
     if result.faults:

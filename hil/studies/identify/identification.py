@@ -10,6 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from hil.lanes.excitation import Excitation, excitation, tones
+from hil.lanes.lane import Lane
 from hil.lanes.setup import Setup
 from hil.studies.identify.outside_scale import OutsideScale
 from hil.studies.identify.plant_response import PlantResponse, measure_plant
@@ -29,7 +30,7 @@ class Identification:
     """What was found, and from what: the setup as it was run, on its point, with its excitation."""
 
     setup: Setup
-    lane: str
+    lane: Lane
     kind: Literal["multisine", "stepped"]
     response: PlantResponse
     modes: ModalFit
@@ -128,7 +129,7 @@ def exciting(
 def identify(
     setup: Setup,
     strokes_m: Array,
-    lane: str,
+    lane: Lane,
     *,
     kind: Literal["multisine", "stepped"] = "multisine",
     amplitude_m: float = 5e-9,

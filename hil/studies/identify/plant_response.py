@@ -14,8 +14,9 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from hil.lanes import either as lanes
+from hil.lanes import in_process as lanes
 from hil.lanes.excitation import Excitation, Passage
+from hil.lanes.lane import Lane
 from hil.lanes.setup import Setup
 from hil.studies.margins.measured import MeasurementError
 from pkxyz_ctrl.safety.modes import Mode
@@ -79,7 +80,7 @@ class PlantResponse:
 
 
 def measure_plant(
-    setup: Setup, lane: str, on_progress: Callable[[int, int], None] = lambda done, total: None
+    setup: Setup, lane: Lane, on_progress: Callable[[int, int], None] = lambda done, total: None
 ) -> PlantResponse:
     """Run a setup of ``at_point`` in a lane and take P from it. Raises ``MeasurementError`` where the loop did not stay
     closed to the end.

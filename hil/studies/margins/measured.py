@@ -12,8 +12,9 @@ import numpy as np
 import scipy.interpolate
 from numpy.typing import NDArray
 
-from hil.lanes import either as lanes
+from hil.lanes import in_process as lanes
 from hil.lanes.excitation import Excitation
+from hil.lanes.lane import Lane
 from hil.lanes.setup import Setup
 from pkxyz_ctrl.design.margins.margins import LoopResponse, Margins, margins_of_response
 from pkxyz_ctrl.stage import Stage
@@ -84,7 +85,7 @@ def at_point(setup: Setup, strokes_m: Array, excitation: Excitation) -> Setup:
 
 
 def measure(
-    setup: Setup, lane: str, on_progress: Callable[[int, int], None] = lambda done, total: None
+    setup: Setup, lane: Lane, on_progress: Callable[[int, int], None] = lambda done, total: None
 ) -> MeasuredLoop:
     """Run a setup of ``at_point`` in a lane and take S from it. Raises ``MeasurementError`` where the loop did not
     stay closed to the end.

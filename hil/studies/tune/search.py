@@ -235,13 +235,14 @@ def _beyond(goals: Goals, figures: dict[str, float]) -> dict[str, float]:
 
 def _run(search: SearchConfig, controller: ControllerConfig, plant: str) -> float:
     """RMS error in nm of the worst axis while scanning; NaN after a fault."""
-    from hil.lanes import either as lanes
+    from hil.lanes import in_process as lanes
+    from hil.lanes.lane import Lane
     from hil.runs.metrics import Metrics
 
     setup = replace(_setup(search.scenario, search.stage, plant, search.bus), controller=controller)
     metrics = Metrics(setup.trajectory, setup.bus.period_us)
-    result = lanes.run(setup, "fast", on_block=metrics.update)
-    error = metrics.figures()["rms_error_nm"]
+    result = lanes.run(setup, Lane.FAST, on_block=metrics.update)
+    error = metrics.figures().rms_error_nm
     return math.nan if result.faults or error is None else max(error.values())
 
 

@@ -1,0 +1,113 @@
+"""One scenario run at the machine's clock into one folder."""
+
+import dataclasses
+import time
+from collections.abc import Callable
+from dataclasses import dataclass
+
+from hil.lanes.ending import Ended, Ending
+from hil.lanes.lane import Lane
+from hil.lanes.wall import WallRig, require_real_bus
+from hil.recording.recording import Recording
+from hil.recording.wall_recorder import WallRecorder
+from hil.runs.metrics import Metrics, RowFigures
+from hil.runs.run import Begun
+from hil.runs.run_folder import RunFolder
+from hil.runs.scenario import Scenario
+from hil.runs.summary import LoopFigures, Summary
+from pkxyz_ctrl.io.clocks import percentile_us
+from pkxyz_ctrl.io.realtime import go_real_time, leave_real_time, settle_memory
+from pkxyz_ctrl.learning import Learner
+
+_SHARES = {"p50": 0.5, "p99_9": 0.999, "max": 1.0}
+
+
+@dataclass(frozen=True)
+class RanAtRate:
+    """What a run at rate leaves besides its folder."""
+
+    summary: Summary
+    ended_by: int
+    """signal that ended it, 0 if it ran to its end"""
+    lateness_us: list[int]
+    """wake-ups by whole microseconds of lateness"""
+
+
+@dataclass
+class _Watched:
+    """What is known of the loop when it has ended, however it did."""
+
+    ended_by: int = 0
+    elapsed_s: float = 0.0
+    faults: tuple[str, ...] = ()
+    lateness_us: list[int] = dataclasses.field(default_factory=list)
+    refused_frames: int = 0
+    learner: Learner | None = None
+
+
+def run_into(folder: RunFolder, scenario: Scenario, say: Callable[[str], object]) -> RanAtRate:
+    """Run ``scenario`` at rate and leave everything in ``folder`` but the picture.
+
+    ``say`` is called with what a person should know. Raises ``ConfigError``, ``StartUpError``, ``RecordingError``.
+    """
+    can_config = require_real_bus(scenario.bus)
+    begun = Begun.begin(folder, scenario, Lane.WALL)
+    setup = scenario.setup()
+    watched = _Watched()
+    with Ending() as ending:
+        channel = can_config.channel.replace(" ", "_")
+        recorder = WallRecorder(folder.recording, folder.frames, begun.metadata, channel)
+        try:
+            _run(WallRig(setup, recorder, ending), watched, say)
+        except Ended as end:
+            watched.ended_by = end.signal_number
+        finally:
+            recorder.close()
+    recording = Recording.open(folder.recording)
+    if begun.learning is not None:
+        begun.learning.errors.look_at(recording)
+    rows, missed = _figures(recording, begun.metrics)
+    late, period_s = watched.lateness_us, scenario.bus.period_s
+    loop = LoopFigures(
+        missed_ticks=missed,
+        faults=watched.faults,
+        realtime_factor=recording.ticks * period_s / watched.elapsed_s if watched.elapsed_s else None,
+        errors_are_of="estimate",
+        refused_frames=watched.refused_frames,
+        lateness_us={name: percentile_us(late, share) for name, share in _SHARES.items()},
+    )
+    summary = begun.end(rows, loop, watched.learner, interrupted=bool(watched.ended_by))
+    return RanAtRate(summary, watched.ended_by, late)
+
+
+def _run(rig: WallRig, watched: _Watched, say: Callable[[str], object]) -> None:
+    begin_s = time.monotonic()
+    try:
+        say(go_real_time())
+        settle_memory()
+        begin_s = time.monotonic()
+        rig.run()
+    finally:
+        try:
+            rig.close()
+        finally:
+            leave_real_time()
+            watched.elapsed_s = time.monotonic() - begin_s
+            watched.faults = tuple(rig.controller.faults)
+            watched.lateness_us = rig.ticks.lateness_us
+            watched.refused_frames = rig.can_port.refused
+            watched.learner = rig.live.learner if rig.live is not None else None
+
+
+def _figures(recording: Recording, metrics: Metrics) -> tuple[RowFigures, int]:
+    """Figures of the recorded rows, and how many ticks were missed. Nobody here knows the truth, so errors are those
+    of the estimate.
+    """
+    missed = 0
+    fields = ("mode", "reference_tick", "saturated", "reference_m", "estimate_m", "overrun", "sense_status")
+    for rows in recording.rows(fields):
+        rows["position_m"] = rows["estimate_m"]
+        metrics.update(rows)
+        missed += int(rows["overrun"].sum()) + int((rows["sense_status"] & 1).sum())
+    figures = dataclasses.replace(metrics.figures(), estimate_error_nm=None)
+    return figures, missed

@@ -1,0 +1,108 @@
+"""What is known of a run when it is over: who ran, figures, verdicts on its checks."""
+
+import dataclasses
+import json
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+from typing import Any
+
+from hil.lanes.lane import Lane
+from hil.runs.metrics import RowFigures, Verdict, evaluate
+from hil.runs.period_errors import PeriodFigures
+from hil.runs.scenario import Scenario
+from hil.runs.versions import versions
+
+
+@dataclass(frozen=True)
+class LoopFigures:
+    """What the lane knows of a run besides its rows. ``None``: unknown in this lane, or the run did not get so far."""
+
+    missed_ticks: int | None = None
+    """skipped, without a sense frame, or with a drive frame that was late on the wire"""
+    faults: tuple[str, ...] = ()
+    """a sentence for each fault decision"""
+    bus_load: float | None = None
+    """0..1 over the ticks"""
+    realtime_factor: float | None = None
+    """stage time over the machine's time"""
+    errors_are_of: str = "true position"
+    """or of the "estimate", where nobody knows the truth"""
+    refused_frames: int | None = None
+    """frames that the adapter did not take; wall lane"""
+    lateness_us: Mapping[str, int] | None = None
+    """of the wake-ups: p50, p99_9, max; wall lane"""
+
+
+@dataclass(frozen=True)
+class Learnt:
+    """What learning has to say of a run."""
+
+    figures: PeriodFigures
+    mode: str
+    period_ticks: int
+    cutoff_hz: float
+    steps: tuple[Mapping[str, Any], ...]
+    """what was decided after each window"""
+    stored: str | None
+    """name of the file in the run's folder; None if nothing was taught"""
+
+
+@dataclass(frozen=True)
+class Summary:
+    """One run. ``ok`` is false for a run that was interrupted or does not keep its checks."""
+
+    scenario: str
+    lane: Lane
+    seed: int
+    digest: str
+    stage: str
+    plant: str
+    controller: str
+    bus: str
+    period_us: int
+    duration_s: float
+    interrupted: bool
+    rows: RowFigures
+    loop: LoopFigures
+    learnt: Learnt | None
+    checks: tuple[Verdict, ...]
+    ok: bool
+    versions: Mapping[str, str] = field(repr=False)
+
+    @property
+    def has_learnt(self) -> bool:
+        """Whether there is more than one period to compare."""
+        return self.learnt is not None and self.learnt.figures.learning_factor is not None
+
+    def as_json(self) -> dict[str, Any]:
+        """Plain data, the figures by name of ``METRICS`` at the top."""
+        plain = dataclasses.asdict(self)
+        rows, loop, learnt = plain.pop("rows"), plain.pop("loop"), plain.pop("learnt")
+        wall = {key: loop.pop(key) for key in ("refused_frames", "lateness_us")}
+        if self.lane is Lane.WALL:
+            loop |= wall
+        if learnt is not None:
+            figures = learnt.pop("figures")
+            periods = figures.pop("periods")
+            plain |= figures | {"learning": learnt | {"periods": periods}}
+        return plain | rows | loop | {"checks": [verdict.as_json() for verdict in self.checks]}
+
+    def as_text(self) -> str:
+        """The text of ``summary.json``."""
+        return json.dumps(self.as_json(), indent=2, allow_nan=False) + "\n"
+
+
+def summarise(
+    scenario: Scenario, lane: Lane, digest: str, rows: RowFigures, loop: LoopFigures, learnt: Learnt | None = None,
+    *, interrupted: bool,
+) -> Summary:  # fmt: skip
+    """Figures and the verdicts on the scenario's checks."""
+    measured = dataclasses.asdict(rows) | dataclasses.asdict(loop)
+    if learnt is not None:
+        measured |= dataclasses.asdict(learnt.figures)
+    checks = evaluate(scenario.config.checks, measured)
+    return Summary(
+        scenario.config.name, lane, scenario.config.seed, digest, scenario.stage.name, scenario.plant.name,
+        scenario.controller.name, scenario.bus.name, scenario.bus.period_us, scenario.config.duration_s, interrupted,
+        rows, loop, learnt, checks, not interrupted and all(check.ok is not False for check in checks), versions(),
+    )  # fmt: skip
