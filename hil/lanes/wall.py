@@ -131,10 +131,11 @@ class WallRig:
         finally:
             self._bus.shutdown()
 
-    def _take_late_frames(self) -> None:
-        port, controller = self.port, self.controller
-        while (frame := port.receive(0)) is not None:
-            controller.receive(frame, self.clock.now_us)
+    def _take_late_frames(self, until_us: int) -> None:
+        """What waits, as far as there is time for it: on a flooded bus there is always more."""
+        port, controller, clock = self.port, self.controller, self.clock
+        while clock.now_us < until_us and (frame := port.receive(0)) is not None:
+            controller.receive(frame, clock.now_us)
 
 
 class _Interruptible:

@@ -69,13 +69,16 @@ class CanPort:
     where that is a time of day, as python-can wants it, else when it was read.
 
     ``receive`` looks again and again for ``spin_us`` before it sleeps: an answer that comes within that time, as a
-    sense frame does, is not delayed by a wake-up, some 50 us.
+    sense frame does, is not delayed by a wake-up, some 50 us. It reckons by ``clock``, and leaves python-can's own
+    ``recv`` alone: that follows the time of day, and waits for five seconds more where it is set back by five.
     """
 
     def __init__(self, bus: can.BusABC, clock: _Time, spin_us: int = 0) -> None:
         self._bus = bus
         self._clock = clock
         self._spin_us = spin_us
+        has_own_recv = type(bus).recv is not can.BusABC.recv  # some that come from elsewhere, and wrappers
+        self._read = bus.recv if has_own_recv else self._read_once
         self.refused = 0
         self.last_us = 0
 
@@ -89,17 +92,18 @@ class CanPort:
         return True
 
     def receive(self, deadline_us: int) -> Frame | None:
-        """The next frame, or None once it is ``deadline_us``; one that is already there comes even after that.
+        """The next frame, or None once it is ``deadline_us``; one that is already there comes even after that, so
+        whoever reads on and on looks at the clock in between.
 
         A bus that cannot be read any more is silent: the monitors find that out.
         """
-        clock, recv = self._clock, self._bus.recv
+        clock, read = self._clock, self._read
         sleep_us = min(deadline_us, clock.now_us + self._spin_us)
         try:
-            while (message := recv(0.0)) is None and clock.now_us < sleep_us:
+            while (message := read(0.0)) is None and clock.now_us < sleep_us:
                 pass
-            if message is None and clock.now_us < deadline_us:
-                message = recv((deadline_us - clock.now_us) * 1e-6)
+            while message is None and (left_us := deadline_us - clock.now_us) > 0:
+                message = read(left_us * 1e-6)
         except (can.CanError, OSError, ValueError):
             return None
         if message is None:
@@ -108,6 +112,11 @@ class CanPort:
         age_s = time.time() - message.timestamp
         self.last_us = now_us - round(age_s * 1e6) if 0 <= age_s < _STAMP_MAX_AGE_S else now_us
         return to_frame(message)
+
+    def _read_once(self, timeout_s: float) -> can.Message | None:
+        """A message that passes the filters; None also before the time is over, where one came that does not pass."""
+        message, is_filtered = self._bus._recv_internal(timeout_s)
+        return message if message is None or is_filtered or self._bus._matches_filters(message) else None
 
     def unsent(self) -> int:
         """0: python-can doesn't tell what still waits."""

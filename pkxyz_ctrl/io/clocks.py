@@ -38,8 +38,9 @@ class WallClock:
 class TickClock:
     """A ``runtime.Clock`` for a loop at rate: it looks after what a tick must not begin with.
 
-    - What came after a tick had given up waiting is handed to ``late_frames`` before the next tick begins. Otherwise a
-      single sense frame that was late would leave every later one to be taken a tick too late.
+    - What came after a tick had given up waiting is taken before the next tick begins, by ``late_frames``, which is
+      told until when there is time for it. Otherwise a single sense frame that was late would leave every later one to
+      be taken a tick too late.
     - A tick that is woken so late that no answer could come in time, more than ``latest_start_us``, is given up: it
       waits for the next, and the loop counts it as skipped.
     - So is a tick whose predecessor ended less than ``guard_us`` before it began: two drive frames would be too near.
@@ -54,7 +55,7 @@ class TickClock:
         *,
         latest_start_us: int,
         guard_us: int,
-        late_frames: Callable[[], object] = lambda: None,
+        late_frames: Callable[[int], object] = lambda until_us: None,
         leave: Callable[[], object] = lambda: None,
     ) -> None:
         """``leave`` is called between ticks; it raises what is to end the loop."""
@@ -80,8 +81,10 @@ class TickClock:
             behind_us = clock.now_us + self._guard_us - t_us
             if behind_us > 0:
                 t_us += -(-behind_us // period_us) * period_us
-            clock.wait_until(t_us - self._guard_us // 2)
-            self._late_frames()  # while there is time; what comes later than this came in a tick of its own
+            last_look_us = t_us - self._guard_us // 2
+            self._late_frames(last_look_us)
+            clock.wait_until(last_look_us)
+            self._late_frames(t_us)  # what comes later than this came in a tick of its own
             clock.wait_until(t_us)
             late_us = clock.now_us - t_us
             lateness[late_us if late_us < _HISTOGRAM_US else -1] += 1

@@ -10,6 +10,7 @@ from numpy.typing import NDArray
 
 from pkxyz_ctrl.can.driver import AmplifierDriver, DriverState
 from pkxyz_ctrl.can.frame import Frame
+from pkxyz_ctrl.can.other_traffic import OtherTraffic
 from pkxyz_ctrl.config.bus import BusConfig, CanConfig
 from pkxyz_ctrl.loop import cycle as cycling
 from pkxyz_ctrl.loop.period import period_on
@@ -66,6 +67,8 @@ class Controller:
         self._restarting = False
         self._blocked = 0
         self._sense = self.driver.sense
+        self._others = OtherTraffic(bus.can.driver.node_id)
+        self._begun_us = 0
         self._reference: Array = np.zeros((1, 9))  # the latest that was handed in
         self._drive_counts = (0, 0, 0)
         self._cycle = period_on(law, self._reference)
@@ -75,6 +78,7 @@ class Controller:
 
     def start(self, t_us: int) -> None:
         """Begin the start-up dialogue with the amplifier."""
+        self._others.forget(t_us)
         for frame in self.driver.start(t_us):
             self.send(frame, t_us)
 
@@ -85,12 +89,14 @@ class Controller:
         Raises ``StartUpError``, also for a frame that our own gate blocks: nobody would ever answer it.
         """
         driver = self.driver
+        if frame is not None:
+            self._others.note(frame, t_us)
         for reply in driver.poll(t_us) if frame is None else driver.receive(frame, t_us):
             self.send(reply, t_us)
         if self._blocked:
             raise StartUpError(self.faults[-1])
         if driver.state is DriverState.FAILED:
-            raise StartUpError(driver.failure)
+            raise StartUpError(f"{driver.failure}{self._others.complaint}")
         if driver.state is DriverState.CONFIGURING and self.mode == Mode.BOOT:
             self._apply(Event.NODE_FOUND)
         if driver.state is not DriverState.OPERATIONAL:
@@ -119,13 +125,17 @@ class Controller:
         """The tick begins: SYNC, on which the amplifier applies the last voltages and samples."""
         if self.mode < _IDLE:
             self._go_on_starting(t_us)
+        self._begun_us = t_us
         self.send(self.driver.sync(t_us), t_us)
 
     def receive(self, frame: Frame, t_us: int) -> bool:
         """Take a frame from the bus; True once this tick's sense values are there."""
         for reply in self.driver.receive(frame, t_us):
             self.send(reply, t_us)
-        return self._sense.fresh
+        if self._sense.fresh:
+            return True
+        self._others.note(frame, t_us)
+        return False
 
     def compute(self, reference: Array, overrun: int) -> None:
         """Run the cycle on what has come since the SYNC. ``reference`` (n, 9) float64, row after row in memory;
@@ -136,6 +146,8 @@ class Controller:
         c1, c2, c3, status = self._sense.take()
         if status & 1:
             self.missing_sense += 1
+        else:
+            self._others.forget(self._begun_us)
         if self._blocked:
             self.memory["input"]["trips"] = self._blocked
             self._blocked = 0
@@ -213,7 +225,7 @@ class Controller:
             reason = explain(int(row["trips"]))
             emergencies = "".join(f"; {e}" for e in self.driver.emergencies)
             detail = f" [{self.driver.failure}]" if self.driver.failure else ""
-            self.faults.append(f"at {row['t_us'] * 1e-6:.4f} s: {reason}{detail}{emergencies}")
+            self.faults.append(f"at {row['t_us'] * 1e-6:.4f} s: {reason}{detail}{emergencies}{self._others.complaint}")
 
 
 def _require_rows(reference: Array) -> None:

@@ -13,6 +13,7 @@ from pkxyz_ctrl.can.frame import Frame
 from pkxyz_ctrl.loop.controller import Controller
 
 _POLL_US = 1000
+_UNPOLLED_MOST_US = 20_000  # of a start-up in which frame after frame comes, none of them the one that is waited for
 
 Reference = Callable[[int], NDArray[np.float64]]
 """Rows of the trajectory for the tick of an index; it sets ``reference_base`` when it hands out another block."""
@@ -37,7 +38,7 @@ class Port(Protocol):
     def send(self, frame: Frame) -> object: ...
 
     def receive(self, deadline_us: int) -> Frame | None:
-        """The next frame, or None once it is ``deadline_us``."""
+        """The next frame, or None once it is ``deadline_us``; one that already waits may come later than that."""
 
     def unsent(self) -> int:
         """Frames that still wait to go out, as far as the port can tell."""
@@ -46,8 +47,16 @@ class Port(Protocol):
 def start(clock: Clock, port: Port, controller: Controller) -> None:
     """Bring the amplifier to operation. Raises ``StartUpError``."""
     controller.start(clock.now_us)
-    while not controller.dialogue(port.receive(clock.now_us + _POLL_US), clock.now_us):
-        pass
+    polled_us = clock.now_us
+    while True:
+        frame = port.receive(clock.now_us + _POLL_US)
+        if frame is None:
+            polled_us = clock.now_us
+        elif clock.now_us - polled_us > _UNPOLLED_MOST_US:
+            polled_us = clock.now_us
+            controller.dialogue(None, polled_us)
+        if controller.dialogue(frame, clock.now_us):
+            return
 
 
 def run(
@@ -56,7 +65,8 @@ def run(
     """Run ``ticks`` periods from the next instant of ``clock``; returns how many were missed: skipped, or late on the
     wire.
 
-    Deadlines are absolute: a tick that begins late shifts no other, and ticks that are past are skipped whole.
+    Deadlines are absolute: a tick that begins late shifts no other, and ticks that are past are skipped whole. Other
+    frames than the one that is waited for do not put the deadline off, however many there are.
     """
     period_us, compute_us = controller.period_us, controller.can.compute_us
     answer_us, heartbeat_us = controller.can.sense_deadline_us, controller.can.heartbeat_deadline_us
@@ -73,8 +83,10 @@ def run(
         if unsent():
             missed += 1
         begin(t_us)
-        while (frame := receive_frame(t_us + answer_us)) is not None and not receive(frame, clock.now_us):
-            pass
+        deadline_us = t_us + answer_us
+        while (frame := receive_frame(deadline_us)) is not None:
+            if receive(frame, clock.now_us) or clock.now_us > deadline_us:
+                break
         compute(reference(tick), overrun)
         spend(compute_us)
         finish(clock.now_us, t_us + heartbeat_us)

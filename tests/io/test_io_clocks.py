@@ -92,11 +92,15 @@ def test_late_frames_are_taken_before_the_tick_and_leaving_ends_the_loop():
     scripted, taken = Scripted([]), []
     clock = TickClock(
         scripted, PERIOD_US, latest_start_us=LATEST_US, guard_us=GUARD_US,
-        late_frames=lambda: taken.append(scripted.now_us),
+        late_frames=lambda until_us: taken.append((scripted.now_us, until_us)),
     )  # fmt: skip
     for t_us in (1000, 2000, 3000):
         clock.wait_until(t_us)
-    assert taken == [1000 - 62, 2000 - 62, 3000 - 62]
+    looks = [
+        (1000 * n, 1000 * n + 938) for n in range(3)
+    ]  # once when the tick before is done, as long as there is time
+    last_looks = [(1000 * n + 938, 1000 * n + 1000) for n in range(3)]  # and once shortly before the next
+    assert taken == sorted(looks + last_looks)
 
     def leave():
         raise KeyboardInterrupt
