@@ -1,27 +1,35 @@
 """A CAN bus among the processes of one machine: python-can's ``can.Bus(interface="pkxyz-unix", channel=...)``.
 
 Frames, FD included, are datagrams between Unix sockets in one folder, the channel: whoever opens the channel binds a
-socket there, and a frame goes to all others. There is no wire timing and no arbitration. A receiver that stands still
-finds some 256 frames when it goes on, as on a socket of the kernel's CAN; what it missed beyond them is lost. The queue
-of a Unix socket is shorter (``net.unix.max_dgram_qlen``, often 10: three ticks), so what does not fit waits with the
-sender, which hands it over whenever it sends or receives.
+socket there, and a frame goes to all others, as long as they are the same user's (``unix_folder``). There is no wire
+timing and no arbitration. A receiver that stands still finds some 256 frames when it goes on, as on a socket of the
+kernel's CAN; what it missed beyond them is lost. The queue of a Unix socket is shorter (``net.unix.max_dgram_qlen``,
+often 10: three ticks), so what does not fit waits with the sender, which hands it over whenever it sends or receives.
 
 Unlike over other interfaces, ``timestamp`` is when the frame was sent, in seconds of the time of day.
 """
 
-import contextlib
 import errno
 import os
 import select
 import socket
 import struct
-import tempfile
 import time
 from collections import deque
 from itertools import count
-from pathlib import Path
 
 import can
+
+from hil.bus.unix_folder import (
+    UnsafeFolderError,
+    bind_privately,
+    close_folder,
+    folder_of,
+    open_folder,
+    remove_socket,
+    socket_name,
+    sockets_in,
+)
 
 # time of day in ns, identifier with the flags of linux/can.h, length, flags of the FD frame; then the data
 _HEAD = struct.Struct("<qIBB")
@@ -29,19 +37,12 @@ _EXTENDED, _REMOTE, _ERROR = 0x8000_0000, 0x4000_0000, 0x2000_0000
 _BIT_RATE_SWITCH, _ERROR_STATE, _FD = 0x01, 0x02, 0x04
 _LONGEST_PATH = 107  # sockaddr_un.sun_path less its closing zero
 _GONE = {errno.ECONNREFUSED, errno.ENOENT, errno.ECONNRESET, errno.ENOTCONN}
+_NO_PARTICIPANT = {errno.EPROTOTYPE, errno.EACCES, errno.EPERM}  # something else with a name like that
+_JOIN_ATTEMPTS = 10
 _WAITING_MOST = 256  # frames for one receiver
 _RETRY_S = 0.5e-3  # how often a sender that waits for frames itself looks whether its own can be handed over
 _LEAVE_S = 0.1  # for how long it does so before it leaves
 _numbers = count(1)
-
-
-def folder_of(channel: str) -> Path:
-    """The folder that a channel means: a path as it is, a name below the user's folder for such things."""
-    if "/" in channel:
-        return Path(channel)
-    runtime = os.environ.get("XDG_RUNTIME_DIR")
-    base = Path(runtime) if runtime and os.access(runtime, os.W_OK) else Path(tempfile.gettempdir())
-    return base / f"pkxyz-unix-{os.getuid()}" / channel
 
 
 class UnixBus(can.BusABC):
@@ -60,7 +61,7 @@ class UnixBus(can.BusABC):
         data_bitrate: int | None = None,
     ) -> None:
         self._folder = folder_of(str(channel))
-        self._path = self._folder / f"{os.getpid()}-{next(_numbers)}"
+        self._path = self._folder / socket_name(next(_numbers))
         self._fd = fd
         self._peers: list[str] = []
         self._listed_ns = -1
@@ -74,14 +75,25 @@ class UnixBus(can.BusABC):
         self._socket = socket.socket(socket.AF_UNIX, socket.SOCK_DGRAM)
         self._socket.setblocking(False)
         try:
-            self._folder.mkdir(mode=0o700, parents=True, exist_ok=True)
-            self._path.unlink(missing_ok=True)  # of a process that had our number and was killed
-            self._socket.bind(str(self._path))
-        except OSError as error:
+            self._join()
+        except (OSError, UnsafeFolderError) as error:
             self._socket.close()
-            raise can.CanInitializationError(f"channel {channel!r}: {error.strerror or error}") from error
+            reason = getattr(error, "strerror", None) or error
+            raise can.CanInitializationError(f"channel {channel!r}: {reason}") from error
         super().__init__(channel, can_filters)
         self._can_protocol = can.CanProtocol.CAN_FD if fd else can.CanProtocol.CAN_20
+
+    def _join(self) -> None:
+        """Into the folder; once more where the last of the others has just taken it away."""
+        for attempt in range(_JOIN_ATTEMPTS):
+            open_folder(self.channel)
+            try:
+                bind_privately(self._socket, self._path)
+            except FileNotFoundError:
+                if attempt == _JOIN_ATTEMPTS - 1:
+                    raise
+            else:
+                return
 
     def send(self, msg: can.Message, timeout: float | None = None) -> None:
         """Send to all others; ``timeout`` is not used, as nothing here waits.
@@ -114,9 +126,10 @@ class UnixBus(can.BusABC):
         except BlockingIOError:
             return False
         except OSError as error:
-            if error.errno not in _GONE:
+            if error.errno in _GONE:
+                self._forget(peer)
+            elif error.errno not in _NO_PARTICIPANT:
                 raise can.CanOperationError(f"{self.channel_info}: {error.strerror}", error.errno) from error
-            self._forget(peer)
         return True
 
     def _hand_over(self) -> None:
@@ -171,9 +184,8 @@ class UnixBus(can.BusABC):
                 self._hand_over()
             super().shutdown()
             self._socket.close()
-            self._path.unlink(missing_ok=True)
-            with contextlib.suppress(OSError):
-                self._folder.rmdir()  # the last one turns off the light
+            remove_socket(self._path)
+            close_folder(self.channel)
 
     def _others(self) -> list[str]:
         """Sockets of the other participants; the folder is listed again when it has changed."""
@@ -183,16 +195,15 @@ class UnixBus(can.BusABC):
             if changed_ns != self._listed_ns:
                 settled = time.time_ns() - changed_ns > 20_000_000
                 self._listed_ns = changed_ns if settled else -1
-                mine = self._path.name
-                self._peers = [str(self._folder / name) for name in os.listdir(self._folder) if name != mine]
+                mine = str(self._path)
+                self._peers = [path for path in sockets_in(self._folder) if path != mine]
         except FileNotFoundError:
             self._peers = []
         return self._peers
 
     def _forget(self, peer: str) -> None:
         """Take away what a killed process left behind."""
-        with contextlib.suppress(OSError):
-            os.unlink(peer)
+        remove_socket(peer)
         self._peers = [other for other in self._peers if other != peer]
         self._waiting.pop(peer, None)
 
