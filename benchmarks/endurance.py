@@ -22,10 +22,6 @@ import tracemalloc
 from pathlib import Path
 from typing import Any
 
-import matplotlib
-
-matplotlib.use("Agg")
-import matplotlib.pyplot as plt
 import numpy as np
 from numpy.typing import NDArray
 
@@ -33,6 +29,7 @@ from hil.bench.suite import describe_machine
 from hil.lanes.ending import Ended, Ending
 from hil.lanes.lane import Lane
 from hil.lanes.wall import WallRig
+from hil.pictures.style import BLUE, FAINT, MUTED, ORANGE, VERMILION, dress, legend, save, sheet
 from hil.recording.wall_recorder import WallRecorder
 from hil.runs.run_folder import RunFolder, metadata_of
 from hil.runs.scenario import Scenario, load_scenario
@@ -234,29 +231,27 @@ def loop_alone(values: list[int], cleared_s: list[int]) -> Array:
 
 def draw(result: dict[str, Any], path: Path) -> None:
     """The picture: everything over time, from 0 up."""
-    figure, (above, below) = plt.subplots(2, 1, figsize=(7.2, 4.4), sharex=True, layout="constrained")
+    figure = sheet(7.2, 4.4)
+    above, below = figure.subplots(2, 1, sharex=True)
     t_min = np.arange(1, len(result["allocated_blocks"]) + 1) / 60.0
-    for name, colour in zip(WHO, ("#1f5f8b", "#c0392b", "#8a929b"), strict=True):
+    for name, colour in zip(WHO, (BLUE, VERMILION, FAINT), strict=True):
         above.plot(t_min, np.array(result["resident_kb"][name]) / 1000, color=colour, label=name)
-    above.set_ylabel("resident memory (MB)")
-    above.legend(frameon=False, fontsize=8, ncols=3)
-    below.plot(t_min, np.array(result["traced_bytes"]) / 1000, color="#1f5f8b", label="tracemalloc, kB")
+    dress(above, "", "resident memory (MB)")
+    legend(above, columns=3)
+    below.plot(t_min, np.array(result["traced_bytes"]) / 1000, color=BLUE, label="tracemalloc, kB")
     blocks = np.array(result["allocated_blocks"])
     alone = loop_alone(result["allocated_blocks"], result["cleared_s"])
     for kept, style, name in ((blocks, ":", "with what faults leave"), (alone, "-", "of the loop alone")):
         label = f"blocks since the warm-up, {name}"
-        below.plot(t_min, kept - kept[result["warm_up_s"]], style, color="#c0392b", label=label)
+        below.plot(t_min, kept - kept[result["warm_up_s"]], style, color=VERMILION, label=label)
     for n, second in enumerate(result["cleared_s"]):
-        below.axvline(second / 60.0, color="#d8b365", lw=0.8, zorder=0, label="a fault" if n == 0 else None)
-    below.set(xlabel="minutes; dashed: end of the warm-up", ylabel="kB, or blocks of Python")
-    below.legend(fontsize=8, ncols=2, facecolor="white", edgecolor="none", framealpha=1.0, loc="upper left")
+        below.axvline(second / 60.0, color=ORANGE, lw=0.8, zorder=0, label="a fault" if n == 0 else None)
+    dress(below, "minutes; dashed: end of the warm-up", "kB, or blocks of Python")
+    legend(below, "upper left", columns=2)
     for axes in (above, below):
         axes.set_ylim(min(0.0, axes.get_ylim()[0]), 1.35 * axes.get_ylim()[1])
-        axes.axvline(result["warm_up_s"] / 60.0, color="0.7", lw=0.8, ls="--")
-        axes.grid(alpha=0.25)
-        axes.spines[["top", "right"]].set_visible(False)
-    figure.savefig(path, dpi=130)
-    plt.close(figure)
+        axes.axvline(result["warm_up_s"] / 60.0, color=MUTED, lw=0.8, ls="--")
+    save(figure, path)
 
 
 def main() -> int:

@@ -14,6 +14,7 @@ from typing import NamedTuple
 from hil.bus.clock import Lockstep
 from hil.bus.frame_time import INTERFRAME_BITS, frame_bit_counts, frame_duration_ns, frame_range_us
 from hil.bus.wire import Wire
+from hil.pictures.style import BLUE, FAINT, GREEN, TINY_PT, VERMILION, dress, save, sheet
 from pkxyz_ctrl.can.frame import Frame
 
 PAGE = Path(__file__).parents[1] / "understand" / "bus.md"
@@ -118,13 +119,9 @@ def one_cycle() -> tuple[list[Passage], float]:
 
 
 def draw(passages: list[Passage], load: float) -> None:
-    import matplotlib
-
-    matplotlib.use("Agg")
-    import matplotlib.pyplot as plt
-
-    colours = {"SYNC": "#4c6a92", "sense PDO": "#2a8c6a", "drive PDO": "#c2672b"}
-    figure, axes = plt.subplots(figsize=(9.0, 2.6), layout="constrained")
+    colours = {"SYNC": BLUE, "sense PDO": GREEN, "drive PDO": VERMILION}
+    figure = sheet(9.0, 2.8)
+    axes = figure.subplots()
     for p in passages:
         colour = colours[p.label]
         axes.broken_barh([(p.start_us, p.end_us - p.start_us)], (0, 1), color=colour, alpha=0.45, lw=0)
@@ -145,15 +142,14 @@ def draw(passages: list[Passage], load: float) -> None:
             ha="center",
             va="top",
             arrowprops={"arrowstyle": "->"},
-            fontsize=8,
+            fontsize=TINY_PT,
         )
-    axes.axvline(PERIOD_US, color="0.5", ls=":", lw=1)
-    axes.set(xlim=(-4, 243), ylim=(-2.1, 1.5), yticks=[], xlabel="time after the start of SYNC (us)")
-    axes.set_title(f"One cycle of fd_5k: light 1 Mbit/s, dark 5 Mbit/s; bus load {100 * load:.0f} %", fontsize=10)
-    for side in ("left", "right", "top"):
-        axes.spines[side].set_visible(False)
-    figure.savefig(PICTURE, dpi=130)
-    plt.close(figure)
+    axes.axvline(PERIOD_US, color=FAINT, ls=":", lw=1)
+    axes.set(xlim=(-4, 243), ylim=(-2.1, 1.5), yticks=[])
+    title = f"One cycle of fd_5k: light 1 Mbit/s, dark 5 Mbit/s; bus load {100 * load:.0f} %"
+    dress(axes, "time after the start of SYNC (us)", title=title, grid="")
+    axes.spines["left"].set_visible(False)
+    save(figure, PICTURE)
 
 
 def generated() -> dict[str, str]:

@@ -5,16 +5,14 @@ from pathlib import Path
 
 import numpy as np
 import scipy.signal
-from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
 from numpy.typing import NDArray
 
 from hil.lanes import in_process as lanes
 from hil.lanes.lane import Lane
 from hil.lanes.setup import Setup
+from hil.pictures.style import BLUE, FAINT, MUTED, SMALL_PT, VERMILION, WASH, dress, legend, save, sheet
 from hil.runs.scenario import load_scenario
-
-BLUE, ORANGE, GREY = "#0072b2", "#d55e00", "#8a8a8a"
 
 
 def rows_of(setup: Setup, law: NDArray[np.void] | None = None) -> NDArray[np.void]:
@@ -53,15 +51,15 @@ def draw_errors(figure: Figure) -> None:
     axes = figure.add_subplot(1, 2, 1)
     window = slice(*np.searchsorted(whole["t_us"], [400_000, 440_000]))
     t_ms = (whole["t_us"][window] - 400_000) * 1e-3
-    for name, colour in (("no feedback", GREY), ("feed-forward at the sample", ORANGE)):
+    for name, colour in (("no feedback", FAINT), ("feed-forward at the sample", VERMILION)):
         error = error_nm(rows_of(setup, changed(setup, name)), 0)[window]
         offset = error.mean() if name == "no feedback" else 0.0
         label = f"{name} (less its mean, {offset:.0f} nm)" if offset else name
         axes.plot(t_ms, error - offset, color=colour, label=label)
     axes.plot(t_ms, error_nm(whole, 0)[window], color=BLUE, label="the whole law")
-    axes.set(xlabel="time (ms)", ylabel="error in x (nm)", title="Two lines of a raster, mild plant")
+    dress(axes, "time (ms)", "error in x (nm)", "Two lines of a raster, mild plant")
     axes.set_ylim(-27, 45)
-    axes.legend(frameon=False, fontsize=9, loc="upper right")
+    legend(axes, "upper right")
 
 
 def draw_quantisation(figure: Figure) -> None:
@@ -69,7 +67,7 @@ def draw_quantisation(figure: Figure) -> None:
     setup = load_scenario("raster").setup()
     axes = figure.add_subplot(1, 2, 2)
     gain = setup.law["tick"]["drive"]["force_gain_n_per_v2"][0]
-    for name, colour in (("no noise shaping", ORANGE), ("noise shaping", BLUE)):
+    for name, colour in (("no noise shaping", VERMILION), ("noise shaping", BLUE)):
         rows = rows_of(setup, changed(setup, name))
         hold = rows[(rows["t_us"] > 950_000)]
         rounding_v = hold["voltage_v"] - np.sqrt(hold["force_n"] / gain)
@@ -77,27 +75,19 @@ def draw_quantisation(figure: Figure) -> None:
         f, density = scipy.signal.welch(rounding_v, rate_hz, nperseg=256, axis=0)
         axes.loglog(f[1:], np.sqrt(density.mean(axis=1))[1:] * 1e6, color=colour, label=name)
     f = np.array([20.0, 2500.0])
-    axes.axvspan(20, 772, color="#e9eef2", zorder=0)
-    axes.annotate("the stage follows", (24, 6), color="#5b6770", fontsize=9)
-    axes.set(
-        xlim=f,
-        xlabel="frequency (Hz)",
-        ylabel="voltage error (uV/rtHz)",
-        title="Rounding to 6.1 mV counts, while holding",
-    )
-    axes.legend(frameon=False, fontsize=9, loc="lower right")
+    axes.axvspan(20, 772, color=WASH, zorder=0)
+    axes.annotate("the stage follows", (24, 6), color=MUTED, fontsize=SMALL_PT)
+    axes.set_xlim(*f)
+    dress(axes, "frequency (Hz)", "voltage error (uV/rtHz)", "Rounding to 6.1 mV counts, while holding")
+    legend(axes, "lower right")
 
 
 def main() -> None:
     """Draw both panels."""
-    figure = Figure(figsize=(11, 4.2), layout="constrained", dpi=130)
-    FigureCanvasAgg(figure)
+    figure = sheet(11, 4.2)
     draw_errors(figure)
     draw_quantisation(figure)
-    for axes in figure.axes:
-        axes.spines[["top", "right"]].set_visible(False)
-        axes.title.set_fontsize(11)
-    figure.savefig(Path(__file__).with_suffix(".png"))
+    save(figure, Path(__file__).with_suffix(".png"))
 
 
 if __name__ == "__main__":

@@ -5,9 +5,24 @@ over the changed and the drawn plants.
 from pathlib import Path
 
 import numpy as np
-from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
 
+from hil.pictures.style import (
+    BAD_WASH,
+    BLUE,
+    GREEN,
+    INK,
+    MUTED,
+    REFERENCE,
+    SKY,
+    TINY_PT,
+    VERMILION,
+    bound,
+    dress,
+    legend,
+    save,
+    sheet,
+)  # fmt: skip
 from hil.studies.margins.loop import Loop, over_changed_plants
 from pkxyz_ctrl.config.bus import BusConfig
 from pkxyz_ctrl.config.controller import ControllerConfig
@@ -22,8 +37,8 @@ from pkxyz_ctrl.stage import Stage
 
 MIDDLE = np.full(3, 12.5e-6)
 COLOURS = {
-    "lqg": "#56b4e9", "lqg_wide": "#0072b2", "hinf": "#009e73", "pi_notch": "#e6b58f", "pi_notch_robust": "#d55e00",
-    "irc": "#c8c8c8", "irc_robust": "#7a7a7a", "robust": "#000000",
+    "lqg": SKY, "lqg_wide": BLUE, "hinf": GREEN, "pi_notch": "#e6b58f", "pi_notch_robust": VERMILION,
+    "irc": REFERENCE, "irc_robust": MUTED, "robust": INK,
 }  # fmt: skip
 SHOWN = ("lqg", "lqg_wide", "hinf", "pi_notch_robust", "irc_robust", "robust")
 DRAWN = range(1, 201)
@@ -76,8 +91,7 @@ def effort(loop: Loop) -> float:
 
 def draw(all_loops: dict[str, Loop]) -> Figure:
     """|S| of x, and the loops of x in the Nyquist plane beside the disk of margin 0.6."""
-    figure = Figure(figsize=(11, 4.2), layout="constrained", dpi=130)
-    FigureCanvasAgg(figure)
+    figure = sheet(11, 4.2)
     left, right = figure.subplots(1, 2)
     frequency = np.unique(np.r_[np.geomspace(10, 2499, 800), np.linspace(500, 800, 600)])
     for name in SHOWN:
@@ -85,34 +99,25 @@ def draw(all_loops: dict[str, Loop]) -> Figure:
         left.loglog(frequency, np.abs(s), color=COLOURS[name], label=name, lw=1.8 if name == "robust" else 1.2)
         right.plot((1 / s - 1).real, (1 / s - 1).imag, color=COLOURS[name], lw=1.8 if name == "robust" else 1.2)
     for level, style, words in ((2.0, ":", "2"), (np.sqrt(0.5), "--", "-3 dB")):
-        left.axhline(level, color="#5b6770", lw=0.8, ls=style)
-        left.text(10.4, level * 1.02, words, fontsize=8, color="#5b6770", va="bottom")
-    left.axvline(200.0, color="#5b6770", lw=0.8, ls="--")
-    left.text(195.0, 0.032, "200 Hz", fontsize=8, color="#5b6770", ha="right", va="bottom")
-    left.set(xlabel="frequency (Hz)", ylabel="|S|", title="Sensitivity in x", xlim=(10, 2500), ylim=(0.03, 4))
-    left.legend(frameon=False, fontsize=9, loc="lower right", bbox_to_anchor=(0.98, 0.0), labelspacing=0.3)
+        bound(left, level, words, 10.4, style=style)
+    left.axvline(200.0, color=MUTED, lw=0.8, ls="--")
+    left.text(195.0, 0.032, "200 Hz", fontsize=TINY_PT, color=MUTED, ha="right", va="bottom")
+    left.set(xlim=(10, 2500), ylim=(0.03, 4))
+    dress(left, "frequency (Hz)", "|S|", "Sensitivity in x")
+    legend(left, "lower right", anchor=(0.98, 0.0))
     turn = 0.3 * np.exp(1j * np.linspace(0, 2 * np.pi, 200))
     edge = -(1 + turn) / (1 - turn)  # of L that some factor of the disk takes to -1
-    right.fill(edge.real, edge.imag, color="#f3d9d0", lw=0)
-    right.plot(-1, 0, "+", color="black")
-    right.set(
-        xlabel="Re L",
-        ylabel="Im L",
-        title="Loops in x; shaded: disk margin below 0.6",
-        xlim=(-3, 1.5),
-        ylim=(-2, 2),
-        aspect="equal",
-    )
-    for axes in (left, right):
-        axes.spines[["top", "right"]].set_visible(False)
-        axes.title.set_fontsize(11)
+    right.fill(edge.real, edge.imag, color=BAD_WASH, lw=0)
+    right.plot(-1, 0, "+", color=INK)
+    right.set(xlim=(-3, 1.5), ylim=(-2, 2), aspect="equal")
+    dress(right, "Re L", "Im L", "Loops in x; shaded: disk margin below 0.6")
     return figure
 
 
 def main() -> None:
     """Draw the picture and put the table into its page."""
     all_loops = loops(Stage.load("reconstructed"), load("buses", "fd_5k", BusConfig))
-    draw(all_loops).savefig(Path(__file__).with_suffix(".png"))
+    save(draw(all_loops), Path(__file__).with_suffix(".png"))
     page = Path(__file__).parents[1] / "understand" / "margins.md"
     before, rest = page.read_text().split(BEGIN)
     page.write_text(before + BEGIN + table(all_loops) + END + rest.split(END)[1])

@@ -10,11 +10,9 @@ import re
 from pathlib import Path
 from typing import Any
 
-from matplotlib.backends.backend_agg import FigureCanvasAgg
-from matplotlib.figure import Figure as Picture
-
 from hil.bench.figure import Figure
 from hil.commands.bench import bound_of, in_digits
+from hil.pictures.style import BLUE, FAINT, GREEN, MUTED, ORANGE, SKY, TINY_PT, dress, legend, save, sheet
 
 ROOT = Path(__file__).parents[2]
 PAGE = ROOT / "docs" / "lookup" / "performance.md"
@@ -29,7 +27,7 @@ TABLES = {
     "floor": ("limits", "bus"),
     "quality": ("nominal", "mild", "harsh", "learning", "control", "margins"),
 }  # fmt: skip
-COLOURS = ("#0072b2", "#56b4e9", "#009e73", "#e69f00", "#8a8a8a")
+COLOURS = (BLUE, SKY, GREEN, ORANGE, FAINT)
 
 
 def read_figures(results: dict[str, Any]) -> dict[str, Figure]:
@@ -85,8 +83,7 @@ def draw(figures: dict[str, Figure]) -> None:
         "lockstep": [p.value for p in parts],
         "fast": [0.0, 0.0, kernel, period, max(0.0, fast - kernel - period)],
     }
-    picture = Picture(figsize=(9.0, 2.4), layout="constrained")
-    FigureCanvasAgg(picture)
+    picture = sheet(9.0, 2.4)
     axes = picture.add_subplot()
     left = [0.0] * len(bars)
     for k, (part, colour) in enumerate(zip(parts, COLOURS, strict=True)):
@@ -95,14 +92,14 @@ def draw(figures: dict[str, Figure]) -> None:
         axes.barh(list(bars), widths, left=left, color=colour, label=label)
         left = [a + b for a, b in zip(left, widths, strict=True)]
     target_us = 200.0 / (figures["lockstep.realtime"].target or 1.0)
-    axes.axvline(target_us, color="0.4", lw=1, ls=":")
-    axes.annotate("8 times real time ", (target_us, -0.47), ha="right", va="bottom", fontsize=8, annotation_clip=False)
+    axes.axvline(target_us, color=MUTED, lw=1, ls=":")
+    axes.annotate(
+        "8 times real time ", (target_us, -0.47), ha="right", va="bottom", fontsize=TINY_PT, annotation_clip=False
+    )
     axes.invert_yaxis()
-    axes.set(xlabel="us of processor time a tick of 200 us")
-    axes.legend(loc="lower right", bbox_to_anchor=(0.9, 0.0), fontsize=8, frameon=False)
-    for side in ("right", "top"):
-        axes.spines[side].set_visible(False)
-    picture.savefig(PICTURE, dpi=130)
+    dress(axes, "us of processor time a tick of 200 us", grid="x")
+    legend(axes, "lower right", anchor=(0.9, 0.0))
+    save(picture, PICTURE)
 
 
 if __name__ == "__main__":

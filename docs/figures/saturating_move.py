@@ -3,17 +3,14 @@
 from pathlib import Path
 from typing import Any
 
-import matplotlib
 import numpy as np
-
-matplotlib.use("Agg")
-import matplotlib.pyplot as plt
 
 from hil.bench.control import BAND_M, LOW_M, WAY_M
 from hil.bench.rigs.motions import run, settled_s
+from hil.pictures.style import BLUE, FAINT, bound, dress, legend, save, sheet
 from pkxyz_ctrl.trajectory import Steps
 
-COLOURS = {"lqg": "tab:gray", "mpc": "tab:blue"}
+COLOURS = {"lqg": FAINT, "mpc": BLUE}
 BEFORE, AFTER = 14, 30
 
 
@@ -29,7 +26,8 @@ def jumps(controller: str) -> list[tuple[Any, float]]:
 
 def draw(path: Path) -> None:
     """Height, its distance from the target, and the voltages; the loop's ticks are the marks."""
-    figure, axes = plt.subplots(3, 2, figsize=(11, 8.5), sharex=True, constrained_layout=True)
+    figure = sheet(11, 8.5)
+    axes = figure.subplots(3, 2, sharex=True)
     for controller, colour in COLOURS.items():
         for column, (rows, settle_ms) in enumerate(jumps(controller)):
             t_ms = (np.arange(len(rows)) - BEFORE) * 0.2
@@ -44,17 +42,14 @@ def draw(path: Path) -> None:
                 voltage.plot(t_ms[solved], rows["voltage_v"][solved, 0], "o", color=colour, ms=4, label="OSQP solved")
     for column, title in enumerate(("up", "down")):
         height, distance, voltage = axes[:, column]
-        height.set_title(f"a jump of {WAY_M * 1e6:.0f} um {title}")
-        distance.axhline(BAND_M * 1e9, color="tab:red", lw=0.8)
-        voltage.set_xlabel("time after the jump of the reference, ms")
-        height.legend(), voltage.legend()
-    for axis, label in zip(
-        axes[:, 0], ("height, um", "distance from the target, nm", "voltage of a comb, V"), strict=True
-    ):
-        axis.set_ylabel(label)
-    for axis in axes.flat:
-        axis.grid(alpha=0.3)
-    figure.savefig(path, dpi=110)
+        labels = ("height (um)", "distance from the target (nm)", "voltage of a comb (V)") if column == 0 else ("",) * 3
+        dress(height, "", labels[0], f"a jump of {WAY_M * 1e6:.0f} um {title}")
+        dress(distance, "", labels[1])
+        dress(voltage, "time after the jump of the reference (ms)", labels[2])
+        bound(distance, BAND_M * 1e9)
+        legend(height)
+        legend(voltage)
+    save(figure, path)
 
 
 if __name__ == "__main__":

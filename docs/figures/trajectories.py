@@ -4,14 +4,12 @@ from pathlib import Path
 
 import numpy as np
 from matplotlib.axes import Axes
-from matplotlib.backends.backend_agg import FigureCanvasAgg
-from matplotlib.figure import Figure
 from numpy.typing import NDArray
 
+from hil.pictures.style import BLUE, REFERENCE, TINY_PT, VERMILION, dress, save, sheet
 from hil.runs.scenario import load_scenario
 from pkxyz_ctrl.trajectory import Sine, Trajectory
 
-BLUE, ORANGE, GREY = "#0072b2", "#d55e00", "#b4b4b4"
 STEP_US = 20
 PATHS = [  # title, scenario, segment
     ("raster", "raster", 3),
@@ -50,17 +48,17 @@ def draw_path(axes: Axes, title: str, trajectory: Trajectory, segment: int) -> N
     if title == "raster":  # one layer
         first_layer = rows[:, 2] <= rows[scans][0, 2] + 1e-9
         x, y, scans = x[first_layer], y[first_layer], scans[first_layer]
-    axes.plot(x, y, color=GREY, lw=0.8, zorder=1)
+    axes.plot(x, y, color=REFERENCE, lw=0.8, zorder=1)
     axes.plot(np.where(scans, x, np.nan), y, color=BLUE, lw=0.7)
-    axes.set(title=title, xlabel="x (um)", ylabel="y (um)")
+    dress(axes, "x (um)", "y (um)", title, grid="")
     axes.set_aspect("equal", "datalim")
     if title.startswith("spiral"):
-        axes.plot(x[scans][:: 4000 // STEP_US], y[scans][:: 4000 // STEP_US], ".", color=ORANGE, ms=2.5)
+        axes.plot(x[scans][:: 4000 // STEP_US], y[scans][:: 4000 // STEP_US], ".", color=VERMILION, ms=2.5)
     if title == "waypoints":
         inset = axes.inset_axes((0.02, 0.62, 0.3, 0.36), xlim=(-0.2, 0.2), ylim=(1.63, 2.03), xticks=[], yticks=[])
         inset.plot(x, y, color=BLUE, lw=1.0)
-        inset.plot(0.0, 2.0, "+", color=ORANGE)
-        inset.set_xlabel("400 nm", fontsize=8)
+        inset.plot(0.0, 2.0, "+", color=VERMILION)
+        inset.set_xlabel("400 nm", fontsize=TINY_PT)
 
 
 def draw_course(axes: Axes, title: str, trajectory: Trajectory, segment: int, axis: int) -> None:
@@ -68,15 +66,14 @@ def draw_course(axes: Axes, title: str, trajectory: Trajectory, segment: int, ax
     t_s, rows, scans = rows_of(trajectory, segment)
     shown = t_s <= 0.5
     t_ms, position = t_s[shown] * 1e3, rows[shown, axis] * 1e6
-    axes.plot(t_ms, position, color=GREY, lw=0.8)
-    axes.plot(t_ms, np.where(scans[shown], position, np.nan), color=ORANGE, lw=0.7)
-    axes.set(title=title, xlabel="time (ms)", ylabel=f"{'xyz'[axis]} (um)")
+    axes.plot(t_ms, position, color=REFERENCE, lw=0.8)
+    axes.plot(t_ms, np.where(scans[shown], position, np.nan), color=VERMILION, lw=0.7)
+    dress(axes, "time (ms)", f"{'xyz'[axis]} (um)", title, grid="")
 
 
 def main() -> None:
     """Draw the sheet."""
-    figure = Figure(figsize=(15, 9), layout="constrained", dpi=110)
-    FigureCanvasAgg(figure)
+    figure = sheet(15, 9, dpi=110)
     upper, lower = figure.subfigures(2, 1, height_ratios=[2, 0.75])
     paths, courses = upper.subplots(2, 4).ravel(), lower.subplots(1, 5)
     shipped = {name: load_scenario(name).trajectory for _, name, *_ in (*PATHS, *COURSES) if name}
@@ -85,10 +82,7 @@ def main() -> None:
         draw_path(axes, title, shipped[scenario], segment)
     for axes, (title, scenario, segment, axis) in zip(courses, COURSES, strict=True):
         draw_course(axes, title, shipped[scenario], segment, axis)
-    for axes in (*paths, *courses):
-        axes.spines[["top", "right"]].set_visible(False)
-        axes.title.set_fontsize(11)
-    figure.savefig(Path(__file__).with_suffix(".png"))
+    save(figure, Path(__file__).with_suffix(".png"))
 
 
 if __name__ == "__main__":

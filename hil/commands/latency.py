@@ -24,7 +24,9 @@ def latency(
     measured = measure(period_us, seconds, cyclictest)
     figures = measured.figures()
     if out is not None:
-        _draw(measured, out)
+        from hil.pictures.latency import draw_latency
+
+        draw_latency(measured, out)
     if as_json:
         histograms = {"lateness_us": measured.lateness_us, "cycle_us": measured.cycle_us}
         if measured.cyclictest_us is not None:
@@ -53,21 +55,3 @@ def _show(figures: dict[str, Any], out: Path | None) -> None:
         print(f"p99.9 is {ours / max(theirs, 1):.2f} times cyclictest's")
     if out is not None:
         print(f"histograms are in {out}")
-
-
-def _draw(measured: Any, out: Path) -> None:
-    from matplotlib.backends.backend_agg import FigureCanvasAgg
-    from matplotlib.figure import Figure
-
-    from hil.pictures.wall import draw_lateness
-
-    figure = Figure(figsize=(11, 5), dpi=120, facecolor="white", layout="constrained")
-    FigureCanvasAgg(figure)
-    histograms = {"wake-up of the loop": measured.lateness_us, "cycle": measured.cycle_us}
-    if measured.cyclictest_us is not None:
-        histograms["cyclictest at the same time"] = measured.cyclictest_us
-    plot = figure.subplots()
-    draw_lateness(plot, histograms)
-    plot.set_xlabel("1 + time  (µs)")
-    plot.set_title(f"{measured.ticks} ticks of {measured.period_us} µs, {measured.missed_ticks} missed")
-    figure.savefig(out)

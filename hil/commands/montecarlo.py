@@ -44,8 +44,9 @@ def montecarlo(
 
     Exit code 0 if every loop held, 1 if one did not, 2 for bad input, 130 if interrupted (what is done is kept).
     """
+    from hil.pictures.montecarlo import draw_montecarlo
     from hil.runs.scenario import load_scenario
-    from hil.studies.montecarlo import Results, Study, draw, run_study, summary
+    from hil.studies.montecarlo import Results, Study, run_study, summary
     from hil.studies.spread.workers import cores
     from pkxyz_ctrl.config.files import load
     from pkxyz_ctrl.design.margins.tolerances import Tolerances
@@ -71,7 +72,7 @@ def montecarlo(
         "digest": study.digest(), "first_seed": seed, "interrupted": interrupted, "folder": str(out),
     }  # fmt: skip
     (out / "summary.json").write_text(json.dumps(data, indent=2, allow_nan=False) + "\n", encoding="utf-8")
-    draw(study, found, out / "distributions.png")
+    draw_montecarlo(study, found, out / "distributions.png")
     if as_json:
         print(json.dumps(data, allow_nan=False))
     else:

@@ -36,7 +36,7 @@ def tune(
     """
     from hil.studies.spread.workers import cores
     from hil.studies.tune.search import load_problem
-    from hil.studies.tune.tuning import best, draw, judged, nearest, open_study, write_controller
+    from hil.studies.tune.tuning import best, importances, judged, nearest, open_study, write_controller
     from hil.studies.tune.tuning import search as run_search
 
     problem = load_problem(search)
@@ -52,7 +52,11 @@ def tune(
             interrupted = True
     found = best(study, problem)
     tried = judged(study)
-    importance = draw(study, problem, out) if tried else {}
+    importance = importances(study)
+    if tried:
+        from hil.pictures.tuning import draw_tuning
+
+        draw_tuning(study, problem, importance, out)
     path = out / f"{problem.search.name}_tuned.toml"
     if found is not None:
         write_controller(problem, found, path)

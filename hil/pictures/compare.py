@@ -4,13 +4,28 @@ from collections.abc import Sequence
 from pathlib import Path
 
 import numpy as np
-from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
 from numpy.typing import NDArray
 
+from hil.pictures.style import (
+    BLUE,
+    FAINT,
+    GREEN,
+    INK,
+    LABEL_PT,
+    ORANGE,
+    PINK,
+    SKY,
+    SMALL_PT,
+    TINY_PT,
+    VERMILION,
+    dress,
+    save,
+    sheet,
+)
 from hil.studies.compare import Compared
 
-COLOURS = ("#0072B2", "#56B4E9", "#009E73", "#D55E00", "#8a8a8a", "#CC79A7", "#E69F00", "#2b2b2b")
+COLOURS = (BLUE, SKY, GREEN, VERMILION, FAINT, PINK, ORANGE, INK)
 _BINS = 700
 _SHOWN = {"rms_error_nm": "rms while scanning", "hold_noise_nm": "hold noise"}
 
@@ -18,8 +33,7 @@ _SHOWN = {"rms_error_nm": "rms while scanning", "hold_noise_nm": "hold noise"}
 def draw(runs: Sequence[Compared], title: str, path: Path) -> None:
     """Write the picture of those runs that have figures."""
     shown = [run for run in runs if run.figures.get("rms_error_nm")]
-    figure = Figure(figsize=(11, 1.6 + 1.05 * max(len(shown), 2)), layout="constrained", dpi=130)
-    FigureCanvasAgg(figure)
+    figure = sheet(11, 1.6 + 1.05 * max(len(shown), 2))
     grid = figure.add_gridspec(max(len(shown), 1), 2, width_ratios=(2.2, 1))
     largest = _scale(shown)
     first = None
@@ -30,16 +44,15 @@ def draw(runs: Sequence[Compared], title: str, path: Path) -> None:
         t_s, top = _envelope(run.t_s, size)
         axes.fill_between(t_s, np.minimum(top, largest), color=COLOURS[n % len(COLOURS)], lw=0)
         axes.set_ylim(0, largest)
-        axes.set_ylabel(run.controller, rotation=0, ha="right", va="center", fontsize=9)
-        axes.spines[["top", "right"]].set_visible(False)
-        axes.tick_params(labelbottom=n == len(shown) - 1, labelsize=8)
+        axes.set_ylabel(run.controller, rotation=0, ha="right", va="center", fontsize=SMALL_PT)
+        dress(axes, "time of the trajectory (s)" if n == len(shown) - 1 else "", grid="y")
+        axes.tick_params(labelbottom=n == len(shown) - 1)
         if n == 0:
             cut = f", cut off at {largest:.3g}" if any(_farthest(each) > largest for each in shown) else ""
-            axes.set_title(f"{title}: distance from the reference (nm){cut}", fontsize=10, loc="left")
+            axes.set_title(f"{title}: distance from the reference (nm){cut}", fontsize=LABEL_PT, loc="left")
     if first is not None:
-        figure.axes[len(shown) - 1].set_xlabel("time of the trajectory (s)", fontsize=9)
         _bars(figure, grid, shown)
-    figure.savefig(path)
+    save(figure, path)
 
 
 def _bars(figure: Figure, grid: object, shown: Sequence[Compared]) -> None:
@@ -50,8 +63,10 @@ def _bars(figure: Figure, grid: object, shown: Sequence[Compared]) -> None:
         alpha = 1.0 if k == 0 else 0.45
         colours = [COLOURS[n % len(COLOURS)] for n in range(len(shown))]
         bars = axes.barh(rows + 0.2 - 0.4 * k, values, 0.36, color=colours, alpha=alpha)
-        axes.bar_label(bars, [f" {v:.3g} {words}" if v < 1000.0 else f" {v:.0f} {words}" for v in values], fontsize=8)
-    axes.set_yticks(rows, [run.controller for run in shown], fontsize=9)
+        axes.bar_label(
+            bars, [f" {v:.3g} {words}" if v < 1000.0 else f" {v:.0f} {words}" for v in values], fontsize=TINY_PT
+        )
+    axes.set_yticks(rows, [run.controller for run in shown], fontsize=SMALL_PT)
     seen = [v for run in shown for k in _SHOWN for v in (run.figures.get(k) or {}).values()]
     right = max(seen)
     if right > 20.0 * min(seen):
@@ -63,8 +78,7 @@ def _bars(figure: Figure, grid: object, shown: Sequence[Compared]) -> None:
     else:
         axes.set_xlim(0.0, 1.8 * right)
     axes.invert_yaxis()
-    axes.set_xlabel("nm, worst axis", fontsize=9)
-    axes.spines[["top", "right"]].set_visible(False)
+    dress(axes, "nm, worst axis", grid="x")
 
 
 def _scale(shown: Sequence[Compared]) -> float:

@@ -3,21 +3,23 @@
 from pathlib import Path
 
 import numpy as np
-from matplotlib.backends.backend_agg import FigureCanvasAgg
-from matplotlib.figure import Figure
 
+from hil.pictures.style import AXIS, FAINT, INK, LABEL_PT, dress, legend, save, sheet
 from hil.studies.identify.identification import Identification
-
-COLOURS = ("#0072b2", "#d55e00", "#009e73")
-GREY = "#9aa5ad"
 
 
 def draw_response(found: Identification, path: Path) -> None:
     """Rows: sense chains. Left: size of the three entries in each comb's V^2; then phase of the chain's own comb; then
     coherence, and the residual in standard deviations.
     """
-    figure = Figure(figsize=(13.5, 9.0), layout="constrained", dpi=120)
-    FigureCanvasAgg(figure)
+    hz = ", ".join(f"{v:.1f}" for v in found.modes.frequency_hz)
+    setup = found.setup
+    figure = sheet(
+        13.5,
+        9.0,
+        f"{setup.stage.name}, plant {setup.plant.name}, {setup.controller.name} on {setup.bus.name}: "
+        f"modes at {hz} Hz (dashed), chi-square {found.modes.chi_square:.2f}",
+    )
     panels = figure.subplots(3, 4, sharex=True, width_ratios=(2.2, 1.4, 1.0, 1.0))
     r, modes = found.response, found.modes
     f = r.frequency_hz
@@ -28,7 +30,7 @@ def draw_response(found: Identification, path: Path) -> None:
     used = f <= modes.used_hz[1]
     for i, row in enumerate(panels):
         size, phase, coherence, left = row
-        for j, colour in enumerate(COLOURS):
+        for j, colour in enumerate(AXIS):
             name = f"comb {j + 1}" + (" (its own)" if i == j else "")
             size.errorbar(
                 f, np.abs(r.p[:, i, j]), yerr=r.deviation[:, i, j], fmt=".", ms=3, lw=0.6, color=colour, alpha=0.55
@@ -36,14 +38,14 @@ def draw_response(found: Identification, path: Path) -> None:
             size.plot(fine, np.abs(fitted[:, i, j]), color=colour, lw=1.3, label=name)
             apart = r.p[used, i, j] - at_tones[used, i, j]
             left.plot(f[used], np.abs(apart) / r.deviation[used, i, j], ".", ms=3, color=colour, alpha=0.6)
-        phase.plot(f, _degrees(r.p[:, i, i]), ".", ms=3, color=COLOURS[i], alpha=0.55)
-        phase.plot(fine, _degrees(fitted[:, i, i]), color=COLOURS[i], lw=1.2)
-        coherence.plot(f, r.coherence[:, i], color="black", lw=1.0)
+        phase.plot(f, _degrees(r.p[:, i, i]), ".", ms=3, color=AXIS[i], alpha=0.55)
+        phase.plot(fine, _degrees(fitted[:, i, i]), color=AXIS[i], lw=1.2)
+        coherence.plot(f, r.coherence[:, i], color=INK, lw=1.0)
         for axes in (size, phase):
-            for hz in modes.frequency_hz:
-                axes.axvline(hz, color=GREY, lw=0.8, ls="--", zorder=0)
+            for mode_hz in modes.frequency_hz:
+                axes.axvline(mode_hz, color=FAINT, lw=0.8, ls="--", zorder=0)
         size.set(yscale="log", ylabel=f"chain {i + 1} (counts / V$^2$)")
-        size.legend(frameon=False, fontsize=8, loc="lower left")
+        legend(size, "lower left")
         phase.set(ylim=(-400, 40), yticks=(-360, -270, -180, -90, 0))
         coherence.set(ylim=(0.0, 1.03))
         left.set(ylim=(0.0, 5.0))
@@ -54,21 +56,12 @@ def draw_response(found: Identification, path: Path) -> None:
         "|measured - fit| / deviation",
     )
     for axes, title in zip(panels[0], titles, strict=True):
-        axes.set_title(title, fontsize=10)
-    for axes in panels.ravel():
-        axes.set_xscale("log")
-        axes.spines[["top", "right"]].set_visible(False)
-        axes.grid(True, which="major", color="#e6eaed", lw=0.6)
-    for axes in panels[-1]:
-        axes.set_xlabel("frequency (Hz)")
-    hz = ", ".join(f"{v:.1f}" for v in modes.frequency_hz)
-    setup = found.setup
-    figure.suptitle(
-        f"{setup.stage.name}, plant {setup.plant.name}, {setup.controller.name} on {setup.bus.name}: "
-        f"modes at {hz} Hz (dashed), chi-square {modes.chi_square:.2f}",
-        fontsize=12,
-    )
-    figure.savefig(path)
+        axes.set_title(title, fontsize=LABEL_PT)
+    for row in range(3):
+        for axes in panels[row]:
+            axes.set_xscale("log")
+            dress(axes, "frequency (Hz)" if row == 2 else "")
+    save(figure, path)
 
 
 def _degrees(values: np.ndarray) -> np.ndarray:

@@ -4,18 +4,27 @@ from pathlib import Path
 
 import numpy as np
 from matplotlib.axes import Axes
-from matplotlib.backends.backend_agg import FigureCanvasAgg
-from matplotlib.figure import Figure
 from matplotlib.ticker import FormatStrFormatter, LogLocator, MaxNLocator, NullFormatter
 
-from hil.pictures.report import AXIS_COLOURS
+from hil.pictures.style import (
+    AXIS,
+    HEADING_PT,
+    INK,
+    LABEL_PT,
+    MUTED,
+    REFERENCE,
+    VERMILION,
+    WASH,
+    bound,
+    dress,
+    legend,
+    save,
+    sheet,
+)  # fmt: skip
 from hil.recording.recording import Recording
 from hil.runs.period_errors import WITHIN, PeriodErrors
 from hil.runs.scenario import restore
 from hil.runs.summary import Summary
-
-_INK, _FAINT = "#2b2b2b", "#9a9a9a"
-_SENSED, _TRUE = "#51626f", "#D55E00"
 
 
 def draw_learning(recording_path: Path, summary: Summary, out: Path) -> None:
@@ -25,39 +34,37 @@ def draw_learning(recording_path: Path, summary: Summary, out: Path) -> None:
     assert scenario.config.learning is not None
     errors = PeriodErrors(scenario.trajectory, scenario.bus.period_us, scenario.config.learning)
     errors.look_at(recording)
-    figure = Figure(figsize=(16, 6.5), dpi=100, facecolor="white")
-    FigureCanvasAgg(figure)
+    figure = sheet(16, 6.5, dpi=100, free=True)
     grid = figure.add_gridspec(
         3, 2, width_ratios=(1, 1.5), left=0.058, right=0.97, top=0.84, bottom=0.1, hspace=0.2, wspace=0.13
     )
     draw_periods(figure.add_subplot(grid[:, 0]), errors)
     plots = [figure.add_subplot(grid[axis, 1]) for axis in range(3)]
     draw_profile(plots, errors)
-    figure.text(0.058, 0.945, f"{summary.scenario}   ·   what was learnt", fontsize=17, color=_INK, weight="bold")
+    figure.text(
+        0.058, 0.945, f"{summary.scenario}   ·   what was learnt", fontsize=HEADING_PT, color=INK, weight="bold"
+    )
     figure.text(
         0.058, 0.9, f"plant {summary.plant}   ·   law {summary.controller}   ·   bus {summary.bus}   ·   "
-        f"{scenario.config.learning.mode}   ·   seed {summary.seed}", fontsize=10.5, color="#55606a",
+        f"{scenario.config.learning.mode}   ·   seed {summary.seed}", fontsize=LABEL_PT, color=MUTED,
     )  # fmt: skip
-    figure.savefig(out)
+    save(figure, out)
 
 
 def draw_periods(plot: Axes, errors: PeriodErrors) -> None:
     """Periodic error over periods, logarithmic, with a tenth of the first one."""
-    for values, colour, words in ((errors.sensed_nm, _SENSED, "as sensed"), (errors.true_nm, _TRUE, "true")):
+    for values, colour, words in ((errors.sensed_nm, MUTED, "as sensed"), (errors.true_nm, VERMILION, "true")):
         if values:
             plot.semilogy(np.arange(len(values)), values, "o-", color=colour, label=words, markersize=6)
     tenth = errors.sensed_nm[0] / 10.0
-    plot.axhline(tenth, color=_FAINT, linewidth=1, linestyle="--")
-    plot.annotate("a tenth of the first", (0, tenth), xytext=(0, 4), textcoords="offset points", color="#6b7780")
-    plot.axvspan(0, WITHIN, color="#eef1f4", linewidth=0, zorder=0)
+    bound(plot, tenth, "a tenth of the first")
+    plot.axvspan(0, WITHIN, color=WASH, linewidth=0, zorder=0)
     plot.xaxis.set_major_locator(MaxNLocator(integer=True))
     plot.yaxis.set_major_locator(LogLocator(subs=(1.0, 2.0, 5.0)))
     plot.yaxis.set_major_formatter(FormatStrFormatter("%g"))
     plot.yaxis.set_minor_formatter(NullFormatter())
-    plot.set_xlabel("period")
-    plot.set_ylabel("periodic error  (nm, rms over the period, all axes)")
-    plot.legend(frameon=False)
-    _dress(plot)
+    legend(plot)
+    dress(plot, "period", "periodic error  (nm, rms over the period, all axes)", grid="y")
 
 
 def draw_profile(plots: list[Axes], errors: PeriodErrors) -> None:
@@ -68,21 +75,13 @@ def draw_profile(plots: list[Axes], errors: PeriodErrors) -> None:
     last = len(errors.sensed_nm) - 1
     for axis, plot in enumerate(plots):
         for error_m, colour, words in (
-            (errors.first_m, "#bdbdbd", "period 0"), (errors.last_m, AXIS_COLOURS[axis], f"period {last}"),
+            (errors.first_m, REFERENCE, "period 0"), (errors.last_m, AXIS[axis], f"period {last}"),
         ):  # fmt: skip
             values = (error_m[:, axis] - error_m[:, axis].mean()) * 1e9
             plot.plot(t_ms, values, color=colour, linewidth=1.0, label=words)
-        plot.set_ylabel(f"{'xyz'[axis]} error\n(nm)")
-        plot.legend(frameon=False, ncols=2, fontsize=9, loc="lower right", bbox_to_anchor=(1.0, 0.9))
+        legend(plot, "lower right", columns=2, anchor=(1.0, 0.9))
+        dress(plot, "time in the period  (ms)" if axis == 2 else "", f"{'xyz'[axis]} error\n(nm)", grid="y")
         plot.tick_params(labelbottom=axis == 2)
-        _dress(plot)
-    plots[-1].set_xlabel("time in the period  (ms)")
     plots[0].set_title(
-        "error less its mean, " + ("true" if errors.true_nm else "as sensed"), fontsize=11, color=_INK, loc="left"
+        "error less its mean, " + ("true" if errors.true_nm else "as sensed"), fontsize=LABEL_PT, color=INK, loc="left"
     )
-
-
-def _dress(plot: Axes) -> None:
-    plot.spines[["top", "right"]].set_visible(False)
-    plot.grid(axis="y", which="both", color="#e4e4e4", linewidth=0.6)
-    plot.set_axisbelow(True)

@@ -4,47 +4,42 @@ from collections.abc import Sequence
 from pathlib import Path
 
 import numpy as np
-from matplotlib.backends.backend_agg import FigureCanvasAgg
-from matplotlib.figure import Figure
 from numpy.typing import NDArray
 
+from hil.pictures.style import AXIS, BAD_WASH, FAINT, INK, TITLE_PT, bound, dress, save, sheet
 from hil.studies.margins.measured import MeasuredLoop
 from pkxyz_ctrl.design.margins.margins import HALF_POWER, LoopResponse
 
 Array = NDArray[np.float64]
 
-COLOURS = ("#0072b2", "#d55e00", "#009e73")
-GREY = "#9aa5ad"
-AXES = "xyz"
+_CHANGED = {"color": FAINT, "lw": 0.4, "alpha": 0.6}
 
 
 def draw_bode(
     path: Path, title: str, nominal: LoopResponse, changed: Sequence[LoopResponse], measured: MeasuredLoop | None
 ) -> None:
     """L in size and phase, S and T in size, for each axis and MIMO; changed plants behind, measured points on top."""
-    figure = Figure(figsize=(12.5, 9.5), layout="constrained", dpi=120)
-    FigureCanvasAgg(figure)
+    words = ["colour: nominal"]
+    words += [f"grey: {len(changed)} changed plants"] if changed else []
+    words += ["points: measured in the running loop"] if measured is not None else []
+    figure = sheet(12.5, 9.5, f"{title}  ({', '.join(words)})")
     panels = figure.subplots(4, 4, sharex=True)
     rows = ("|L|", "phase of L (deg)", "|S|", "|T|")
-    for column, name in enumerate((*AXES, "MIMO")):
+    for column, name in enumerate(("x", "y", "z", "MIMO")):
         for response in changed:
-            _curves(panels[:, column], response, column, {"color": GREY, "lw": 0.4, "alpha": 0.6})
-        _curves(panels[:, column], nominal, column, {"color": (*COLOURS, "black")[column], "lw": 1.4})
+            _curves(panels[:, column], response, column, _CHANGED)
+        _curves(panels[:, column], nominal, column, {"color": (*AXIS, INK)[column], "lw": 1.4})
         if measured is not None:
-            style = {"color": "black", "marker": ".", "ms": 3, "ls": "none", "alpha": 0.7}
+            style = {"color": INK, "marker": ".", "ms": 3, "ls": "none", "alpha": 0.7}
             _curves(panels[:, column], measured.response(), column, style)
-        panels[0, column].set_title(name if column < 3 else "MIMO: singular values", fontsize=11)
-        panels[2, column].axhline(HALF_POWER, color=GREY, lw=0.8, ls="--")
-        panels[2, column].axhline(2.0, color=GREY, lw=0.8, ls=":")
-        panels[3, column].set_xlabel("frequency (Hz)")
-    for row, label in enumerate(rows):
-        panels[row, 0].set_ylabel(label)
+        panels[0, column].set_title(name if column < 3 else "MIMO: singular values", fontsize=TITLE_PT)
+        bound(panels[2, column], HALF_POWER)
+        bound(panels[2, column], 2.0, style=":")
     frequency = nominal.frequency_hz
-    for axes in panels.ravel():
+    for (row, column), axes in np.ndenumerate(panels):
         axes.set_xscale("log")
         axes.set_xlim(frequency[0], frequency[-1])
-        axes.spines[["top", "right"]].set_visible(False)
-        axes.grid(True, which="major", color="#e6eaed", lw=0.6)
+        dress(axes, "frequency (Hz)" if row == 3 else "", rows[row] if column == 0 else "")
     for row, limits in ((0, (1e-2, 1e2)), (2, (1e-2, 5.0)), (3, (1e-2, 5.0))):
         for axes in panels[row]:
             axes.set_yscale("log")
@@ -52,11 +47,7 @@ def draw_bode(
     for axes in panels[1]:
         axes.set(ylim=(-360, 0), yticks=(-360, -270, -180, -90, 0))
     panels[1, 3].set_axis_off()
-    words = ["colour: nominal"]
-    words += [f"grey: {len(changed)} changed plants"] if changed else []
-    words += ["points: measured in the running loop"] if measured is not None else []
-    figure.suptitle(f"{title}  ({', '.join(words)})", fontsize=12)
-    figure.savefig(path)
+    save(figure, path)
 
 
 def _curves(panels: Array, response: LoopResponse, column: int, style: dict[str, object]) -> None:
@@ -81,25 +72,22 @@ def draw_nyquist(
     path: Path, title: str, nominal: LoopResponse, changed: Sequence[LoopResponse], measured: MeasuredLoop | None
 ) -> None:
     """The loop of each axis about -1; shaded is what a disk margin of 0.6 keeps clear, dashed where |S| is 2."""
-    figure = Figure(figsize=(12.5, 4.6), layout="constrained", dpi=120)
-    FigureCanvasAgg(figure)
+    figure = sheet(12.5, 4.6, f"{title}: loop of an axis, the others closed")
     turn = np.exp(1j * np.linspace(0.0, 2.0 * np.pi, 300))
     edge = -(1.0 + 0.3 * turn) / (1.0 - 0.3 * turn)  # of L that some factor of the disk takes to -1
     for i, axes in enumerate(figure.subplots(1, 3)):
-        axes.fill(edge.real, edge.imag, color="#f3d9d0", lw=0)
-        axes.plot((-1.0 + 0.5 * turn).real, (0.5 * turn).imag, color=GREY, lw=0.8, ls="--")
-        axes.plot(-1, 0, "+", color="black")
+        axes.fill(edge.real, edge.imag, color=BAD_WASH, lw=0)
+        axes.plot((-1.0 + 0.5 * turn).real, (0.5 * turn).imag, color=FAINT, lw=0.8, ls="--")
+        axes.plot(-1, 0, "+", color=INK)
         for response, style in (
-            *((r, {"color": GREY, "lw": 0.4, "alpha": 0.6}) for r in changed),
-            (nominal, {"color": COLOURS[i], "lw": 1.5}),
+            *((r, _CHANGED) for r in changed),
+            (nominal, {"color": AXIS[i], "lw": 1.5}),
         ):
             loop = 1.0 / response.s[:, i, i] - 1.0
             axes.plot(loop.real, loop.imag, **style)
         if measured is not None:
             loop = 1.0 / measured.s[:, i, i] - 1.0
-            axes.plot(loop.real, loop.imag, ".", color="black", ms=3, alpha=0.7)
-        axes.set(xlim=(-3.2, 1.8), ylim=(-2.5, 2.5), xlabel="Re L", title=f"{AXES[i]}", aspect="equal")
-        axes.spines[["top", "right"]].set_visible(False)
-    figure.axes[0].set_ylabel("Im L")
-    figure.suptitle(f"{title}: loop of an axis, the others closed", fontsize=12)
-    figure.savefig(path)
+            axes.plot(loop.real, loop.imag, ".", color=INK, ms=3, alpha=0.7)
+        axes.set(xlim=(-3.2, 1.8), ylim=(-2.5, 2.5), aspect="equal")
+        dress(axes, "Re L", "Im L" if i == 0 else "", "xyz"[i])
+    save(figure, path)

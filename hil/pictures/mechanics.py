@@ -1,18 +1,15 @@
-"""The paper's figures redrawn, and those of the design tools. Lengths in um on every axis; Okabe and Ito's
-colours.
-"""
+"""The paper's figures redrawn, and those of the design tools. Lengths in um on every axis."""
 
 import math
 from pathlib import Path
 
 import numpy as np
 from matplotlib.axes import Axes
-from matplotlib.backends.backend_agg import FigureCanvasAgg
-from matplotlib.figure import Figure
 from matplotlib.lines import Line2D
 from matplotlib.patches import Circle
 from numpy.typing import NDArray
 
+from hil.pictures.style import FAINT, INK, LABEL_PT, SERIES, SMALL_PT, WASH, box, dress, legend, save, sheet
 from pkxyz_ctrl.elements.flexures import folded_spring_stiffness, link_hinge_stiffness
 from pkxyz_ctrl.mechanics.jacobians import nominal_jacobians
 from pkxyz_ctrl.mechanics.linearisation import LinearisationStudy
@@ -22,25 +19,6 @@ from pkxyz_ctrl.mechanics.stiffness import lifting_stiffness_n_per_m, nominal_st
 from pkxyz_ctrl.stage import Stage
 
 Array = NDArray[np.float64]
-
-COLOURS = ("#0072B2", "#D55E00", "#009E73", "#CC79A7", "#E69F00", "#56B4E9")
-INK, FAINT, WASH = "#2b2b2b", "#9a9a9a", "#e3edf5"
-
-
-def sheet(width_in: float, height_in: float, title: str) -> Figure:
-    """An empty white figure with a title at the top left."""
-    figure = Figure(figsize=(width_in, height_in), dpi=150, facecolor="white")
-    FigureCanvasAgg(figure)
-    figure.suptitle(title, x=0.02, ha="left", fontsize=11.5, color=INK)
-    return figure
-
-
-def dress(plot: Axes, x_label: str, y_label: str) -> None:
-    """Labels, thin grid, no box."""
-    plot.set_xlabel(x_label)
-    plot.set_ylabel(y_label)
-    plot.grid(color="#dddddd", linewidth=0.5)
-    plot.spines[["top", "right"]].set_visible(False)
 
 
 def draw_design_space(stages: dict[str, Stage], out: Path) -> None:
@@ -57,14 +35,15 @@ def draw_design_space(stages: dict[str, Stage], out: Path) -> None:
             for b in link
         ]
     )
-    figure = sheet(7.2, 5.2, f"Design space: which comb force lifts over the full {stroke * 1e6:g} µm (Eq. 24)")
+    figure = sheet(
+        7.2, 5.2, f"Design space: which comb force lifts over the full {stroke * 1e6:g} µm (Eq. 24)", free=True
+    )
     plot = figure.add_axes((0.11, 0.12, 0.86, 0.78))
     levels = [0.5, 0.75, 1.0, 1.5, 2.5, 4.0]
-    lines = plot.contour(elevation, link * 1e6, needed * 1e3, levels, colors=COLOURS, linewidths=1.6)
+    lines = plot.contour(elevation, link * 1e6, needed * 1e3, levels, colors=SERIES, linewidths=1.6)
     plot.contourf(elevation, link * 1e6, needed * 1e3, [0, 1.0], colors=[WASH], zorder=0)
-    plot.clabel(lines, fmt=lambda mn: f"{mn:g} mN", fontsize=9, inline_spacing=4)
-    plot.text(0.93, 1480, "lifts with less than 1 mN", fontsize=9, color=COLOURS[0])
-    box = {"facecolor": "white", "alpha": 0.9, "edgecolor": "none", "pad": 1.0}
+    plot.clabel(lines, fmt=lambda mn: f"{mn:g} mN", fontsize=SMALL_PT, inline_spacing=4)
+    plot.text(0.93, 1480, "lifts with less than 1 mN", fontsize=SMALL_PT, color=SERIES[0])
     for (name, stage), mark, side in zip(stages.items(), ("o", "s"), ((8, 5), (-8, -14)), strict=False):
         at = (float(stage.geometry["elevation_rest_rad"][0]), float(stage.geometry["link_m"][0]) * 1e6)
         plot.plot(*at, mark, color=INK, markersize=6, markerfacecolor="white", markeredgewidth=1.4)
@@ -73,12 +52,12 @@ def draw_design_space(stages: dict[str, Stage], out: Path) -> None:
             at,
             xytext=side,
             textcoords="offset points",
-            fontsize=9,
-            bbox=box,
+            fontsize=SMALL_PT,
+            bbox=box(),
             ha="right" if side[0] < 0 else "left",
         )
     dress(plot, "elevation of the links at rest, α₀ (rad)", "length of the links, L₂ (µm)")
-    figure.savefig(out)
+    save(figure, out)
 
 
 def draw_modes(stage: Stage, out: Path) -> None:
@@ -86,13 +65,14 @@ def draw_modes(stage: Stage, out: Path) -> None:
     found = modes(nominal_stiffness_n_per_m(stage.config), stage.config.dynamics.mass_kg)
     jacobian = nominal_jacobians(stage.config.geometry).stroke_m_per_m
     e = stage.geometry["e"][0]
-    figure = sheet(10.2, 3.9, f"Translational modes of the {stage.config.name} stage, seen from above")
+    title = f"Translational modes of the {stage.config.name} stage, seen from above"
+    figure = sheet(10.2, 3.9, title, free=True)
     for axis, words in enumerate(("two sliders in anti-phase", "one against two, twice as far", "all in phase")):
         plot = figure.add_axes((0.02 + axis * 0.325, 0.02, 0.31, 0.76))
         plot.set_aspect("equal")
         plot.axis("off")
         plot.set(xlim=(-1.5, 1.5), ylim=(-1.45, 0.95))
-        plot.set_title(f"{'xyz'[axis]}:  {found.frequency_hz[axis]:.1f} Hz\n{words}", fontsize=10.5, color=INK)
+        plot.set_title(f"{'xyz'[axis]}:  {found.frequency_hz[axis]:.1f} Hz\n{words}", fontsize=LABEL_PT, color=INK)
         for chain in range(3):
             base, slider = -1.35 * e[chain], -0.95 * e[chain]
             plot.plot(*np.stack([base, -0.3 * e[chain]], axis=1), color=FAINT, linewidth=1.0, zorder=1)
@@ -100,22 +80,22 @@ def draw_modes(stage: Stage, out: Path) -> None:
                 *slider,
                 "s",
                 color="white",
-                markeredgecolor=COLOURS[chain],
+                markeredgecolor=SERIES[chain],
                 markersize=13,
                 markeredgewidth=1.8,
                 zorder=2,
             )
             across = np.array([-e[chain][1], e[chain][0]]) * 0.2
             stroke = 0.45 * jacobian[chain, axis] / np.abs(jacobian[:, axis]).max()
-            _arrow(plot, slider + across, slider + across + stroke * e[chain], COLOURS[chain])
+            _arrow(plot, slider + across, slider + across + stroke * e[chain], SERIES[chain])
         plot.add_patch(Circle((0, 0), 0.3, facecolor="white", edgecolor=INK, linewidth=1.6, zorder=2))
         if axis < 2:
             _arrow(plot, np.zeros(2), 0.55 * np.eye(2)[axis], INK)
         else:
             plot.plot(0, 0, "o", color=INK, markersize=6, zorder=3)
             plot.add_patch(Circle((0, 0), 0.11, fill=False, edgecolor=INK, linewidth=1.6, zorder=3))
-            plot.text(0.3, -0.42, "out of the plane", fontsize=9, color=INK, zorder=3)
-    figure.savefig(out)
+            plot.text(0.3, -0.42, "out of the plane", fontsize=SMALL_PT, color=INK, zorder=3)
+    save(figure, out)
 
 
 def _arrow(plot: Axes, start: Array, end: Array, colour: str) -> None:
@@ -136,11 +116,13 @@ def draw_linearisation(study: LinearisationStudy, name: str, out: Path) -> None:
         ("at rest, then one Newton step", study.newton_m, "-."),
         (f"at the set-point, moves of ±{study.move_m * 1e6:g} µm", study.relinearised_m, ":"),
     )
-    figure = sheet(10.2, 4.6, f"What a linear model costs on the {name} stage: distance from the exact position")
+    figure = sheet(
+        10.2, 4.6, f"What a linear model costs on the {name} stage: distance from the exact position", free=True
+    )
     left = figure.add_axes((0.075, 0.13, 0.4, 0.74))
     right = figure.add_axes((0.58, 0.13, 0.4, 0.74))
     axial = np.ptp(study.strokes_m, axis=1) == 0
-    for (label, error, style), colour in zip(kinds, COLOURS, strict=False):
+    for (label, error, style), colour in zip(kinds, SERIES, strict=False):
         distance = np.sort(np.linalg.norm(error, axis=1)) * 1e9
         share = np.arange(1, len(distance) + 1) / len(distance) * 100
         shown = distance > 1e-3
@@ -152,18 +134,20 @@ def draw_linearisation(study: LinearisationStudy, name: str, out: Path) -> None:
     right.set_yscale("log")
     left.set_xlim(1e-2, 1e4)
     right.set_ylim(1e-2, 1e4)
-    left.legend(frameon=False, fontsize=8.5, loc="upper left", bbox_to_anchor=(0.0, 1.0))
+    legend(left, "upper left", anchor=(0.0, 1.0))
     left.set_ylim(0, 140)
     left.set_yticks([0, 25, 50, 75, 100])
     dress(left, "error (nm)", "share of the workspace below it (%)")
     dress(right, "height above rest on the axis (µm)", "error (nm)")
-    figure.savefig(out)
+    save(figure, out)
 
 
 def draw_selection(selection: Selection, out: Path) -> None:
     """The feasible region over (alpha_0, L1) with the border of each requirement, and the recommendation."""
     region, geometry = selection.region, selection.config.geometry
-    figure = sheet(7.6, 5.4, "Feasible dimensions: every border is one requirement, the shaded side meets all")
+    figure = sheet(
+        7.6, 5.4, "Feasible dimensions: every border is one requirement, the shaded side meets all", free=True
+    )
     plot = figure.add_axes((0.1, 0.115, 0.62, 0.79))
     x, y = region.elevation_rad, region.crank_m * 1e6
     worst = region.margin.min(axis=-1)
@@ -173,11 +157,11 @@ def draw_selection(selection: Selection, out: Path) -> None:
     for k, name in enumerate(MARGINS):
         margin = np.where(region.margin[..., 0] > 0, region.margin[..., k], np.nan if k else region.margin[..., 0])
         if np.nanmin(margin) < 0 < np.nanmax(margin):
-            colour, style = COLOURS[len(drawn) % 6], styles[len(drawn) % 6]
+            colour, style = SERIES[len(drawn) % 6], styles[len(drawn) % 6]
             plot.contour(x, y, margin, [0], colors=[colour], linewidths=1.7, linestyles=[style])
             drawn.append(plot.plot([], [], color=colour, linestyle=style, linewidth=1.7, label=name)[0])
     at = (math.atan2(geometry.height_rest_m, geometry.projection_rest_m), geometry.crank_length_m * 1e6)
     drawn.append(plot.plot(*at, "*", color=INK, markersize=12, linestyle="none", label="recommended")[0])
-    plot.legend(handles=drawn, frameon=False, fontsize=9, loc="upper left", bbox_to_anchor=(1.02, 1.0))
+    legend(plot, "upper left", anchor=(1.02, 1.0))
     dress(plot, "elevation of the links at rest, α₀ (rad)", "crank, L₁ (µm)")
-    figure.savefig(out)
+    save(figure, out)

@@ -7,7 +7,6 @@ from typing import Any
 
 import numpy as np
 from matplotlib.axes import Axes
-from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.cm import ScalarMappable
 from matplotlib.colors import Normalize
 from matplotlib.figure import Figure
@@ -15,16 +14,14 @@ from mpl_toolkits.mplot3d.art3d import Line3DCollection
 from numpy.typing import NDArray
 
 from hil.bus.load_trace import BusTrace, read_bus_trace
+from hil.pictures import style
+from hil.pictures.style import box, dress, dress_space, legend, save, sheet
 from hil.recording.recording import Recording
 from hil.runs.metrics import Verdict
 from hil.runs.summary import Summary
 
 Array = NDArray[np.float64]
 
-# Okabe and Ito's palette, told apart with any colour vision
-AXIS_COLOURS = ("#0072B2", "#D55E00", "#009E73")
-COMB_COLOURS = ("#56B4E9", "#E69F00", "#CC79A7")
-_INK, _FAINT, _WASH = "#2b2b2b", "#9a9a9a", "#eef1f4"
 _ENVELOPES = 2500  # more points than the picture has pixels across
 _PATH_POINTS = 6000
 
@@ -82,8 +79,7 @@ def draw_report(recording_path: str | Path, frame_log: str | Path | None, summar
     recording = Recording.open(recording_path)
     signals = read_signals(recording)
     bus = _bus_trace(frame_log, recording.metadata)
-    figure = Figure(figsize=(16, 11), dpi=100, facecolor="white")
-    FigureCanvasAgg(figure)
+    figure = sheet(16, 11, dpi=100, free=True)
     grid = figure.add_gridspec(
         8, 2, width_ratios=(1.5, 1), height_ratios=(1, 1, 1, 0.8, 0.8, 0.8, 1.1, 0.7),
         left=0.058, right=0.97, top=0.888, bottom=0.052, hspace=0.18, wspace=0.07,
@@ -100,27 +96,27 @@ def draw_report(recording_path: str | Path, frame_log: str | Path | None, summar
     _draw_path(figure, signals)
     _draw_figures(figure.add_subplot(grid[5:8, 1]), summary)
     _draw_title(figure, summary)
-    figure.savefig(out)
+    save(figure, out)
 
 
 def _draw_position(plot: Axes, signals: Signals, axis: int) -> None:
     for field, colour, width, label in (
-        ("reference_m", "#bdbdbd", 3.4, "reference"),
-        ("position_m", AXIS_COLOURS[axis], 1.0, "true position"),
+        ("reference_m", style.REFERENCE, 3.4, "reference"),
+        ("position_m", style.AXIS[axis], 1.0, "true position"),
     ):
         low, high = signals.low[field][:, axis] * 1e6, signals.high[field][:, axis] * 1e6
         _plot_envelope(plot, signals.t_s, low, high, colour, width, label)
     plot.set_ylabel(f"{'xyz'[axis]}  (µm)")
     plot.margins(y=0.14)
     if axis == 2:
-        plot.legend(loc="lower right", ncols=2, frameon=False, fontsize=9, handlelength=1.6)
+        legend(plot, "lower right", columns=2)
 
 
 def _draw_error(plot: Axes, signals: Signals, axis: int, limit_nm: float, summary: Summary) -> None:
     low, high = signals.low["error_nm"][:, axis], signals.high["error_nm"][:, axis]
-    _plot_envelope(plot, signals.t_s, low, high, AXIS_COLOURS[axis], 0.6, "")
+    _plot_envelope(plot, signals.t_s, low, high, style.AXIS[axis], 0.6, "")
     plot.set_ylim(-limit_nm, limit_nm)
-    plot.axhline(0, color=_INK, linewidth=0.5)
+    plot.axhline(0, color=style.INK, linewidth=0.5)
     name, rows = "xyz"[axis], summary.rows
     plot.set_ylabel(f"{name} error\n(nm)", linespacing=1.3)
     words = [
@@ -132,7 +128,6 @@ def _draw_error(plot: Axes, signals: Signals, axis: int, limit_nm: float, summar
         )
         if measured
     ]
-    box = {"facecolor": "white", "alpha": 0.8, "edgecolor": "none", "pad": 1.5}
     plot.text(
         0.995,
         0.97,
@@ -140,9 +135,9 @@ def _draw_error(plot: Axes, signals: Signals, axis: int, limit_nm: float, summar
         transform=plot.transAxes,
         ha="right",
         va="top",
-        fontsize=8.5,
-        color=_INK,
-        bbox=box,
+        fontsize=style.SMALL_PT,
+        color=style.INK,
+        bbox=box(),
     )
 
 
@@ -158,12 +153,10 @@ def _error_limit_nm(signals: Signals, windows: Sequence[tuple[float, float]]) ->
 def _draw_voltages(plot: Axes, signals: Signals) -> None:
     for comb in range(3):
         low, high = signals.low["comb_voltage_v"][:, comb], signals.high["comb_voltage_v"][:, comb]
-        _plot_envelope(plot, signals.t_s, low, high, COMB_COLOURS[comb], 0.9, f"comb {comb + 1}")
+        _plot_envelope(plot, signals.t_s, low, high, style.COMB[comb], 0.9, f"comb {comb + 1}")
     plot.set_ylabel("combs  (V)")
     plot.margins(y=0.12)
-    legend = plot.legend(loc="lower right", ncols=3, frameon=False, fontsize=9, handlelength=1.2)
-    for line in legend.get_lines():
-        line.set_linewidth(2.5)
+    legend(plot, "lower right", columns=3)
 
 
 def _draw_bus(plot: Axes, bus: BusTrace | None, summary: Summary) -> None:
@@ -172,22 +165,18 @@ def _draw_bus(plot: Axes, bus: BusTrace | None, summary: Summary) -> None:
     plot.set_yticks([0, 50, 100])
     if bus is None:
         words = "no bus in this lane" if summary.loop.bus_load is None else f"{summary.loop.bus_load:.1%} on average"
-        plot.text(0.5, 0.5, words, transform=plot.transAxes, ha="center", va="center", color=_FAINT)
+        plot.text(0.5, 0.5, words, transform=plot.transAxes, ha="center", va="center", color=style.FAINT)
         return
     plot.fill_between(bus.t_s, 0, bus.load * 100, color="#c9d3dc", linewidth=0, step="mid")
-    plot.step(bus.t_s, bus.load * 100, where="mid", color="#51626f", linewidth=0.9)
+    plot.step(bus.t_s, bus.load * 100, where="mid", color=style.MUTED, linewidth=0.9)
 
 
 def _dress_time_axes(plots: Sequence[Axes], t_s: Array, recording: Recording, begin_s: float | None) -> None:
     for plot in plots:
         plot.set_xlim(float(t_s[0]), float(t_s[-1]) if len(t_s) > 1 else 1.0)
-        plot.tick_params(labelbottom=plot is plots[-1], labelsize=9, color=_FAINT)
-        plot.spines[["top", "right"]].set_visible(False)
-        plot.spines[["left", "bottom"]].set_color(_FAINT)
-        plot.grid(axis="y", color="#e4e4e4", linewidth=0.6)
-        plot.set_axisbelow(True)
+        dress(plot, "stage time  (s)" if plot is plots[-1] else "", grid="y")
+        plot.tick_params(labelbottom=plot is plots[-1])
         plot.yaxis.set_label_coords(-0.058, 0.5)
-    plots[-1].set_xlabel("stage time  (s)")
     if begin_s is None:
         return
     for segment in recording.metadata["segments"]:
@@ -196,23 +185,23 @@ def _dress_time_axes(plots: Sequence[Axes], t_s: Array, recording: Recording, be
             continue
         a, b = (begin_s + t * 1e-6 for t in window)
         for plot in plots:
-            plot.axvspan(a, b, color=_WASH, linewidth=0, zorder=0)
+            plot.axvspan(a, b, color=style.WASH, linewidth=0, zorder=0)
         if (b - a) > 0.03 * float(t_s[-1]):
             words = "scan" if segment.get("scan_us") else "hold noise"
             plots[0].annotate(
                 words, ((a + b) / 2, 1.0), xycoords=("data", "axes fraction"), xytext=(0, 3),
-                textcoords="offset points", ha="center", fontsize=9, color="#6b7780",
+                textcoords="offset points", ha="center", fontsize=style.SMALL_PT, color=style.MUTED,
             )  # fmt: skip
 
 
 def _draw_path(figure: Figure, signals: Signals) -> None:
     points = signals.path_um
     if len(points) < 2:
-        figure.text(0.8, 0.65, "nothing was scanned", ha="center", color=_FAINT)
+        figure.text(0.8, 0.65, "nothing was scanned", ha="center", color=style.FAINT)
         return
     plot: Any = figure.add_axes((0.585, 0.40, 0.385, 0.5), projection="3d", computed_zorder=False)
     top = float(np.percentile(signals.path_error_nm, 99.5)) or 1.0
-    scale = ScalarMappable(Normalize(0.0, top), "viridis")
+    scale = ScalarMappable(Normalize(0.0, top), style.MAP)
     steps = np.stack([points[:-1], points[1:]], axis=1)
     plot.add_collection3d(Line3DCollection(steps, colors=scale.to_rgba(signals.path_error_nm[1:]), linewidths=1.4))
     middle = (points.max(axis=0) + points.min(axis=0)) / 2
@@ -220,22 +209,20 @@ def _draw_path(figure: Figure, signals: Signals) -> None:
     span = np.maximum(extent, 0.25 * extent.max())
     for axis, name in enumerate("xyz"):
         getattr(plot, f"set_{name}lim")(middle[axis] - 0.54 * span[axis], middle[axis] + 0.54 * span[axis])
-        getattr(plot, f"{name}axis").pane.set_facecolor("#fafafa")
-        getattr(plot, f"{name}axis").pane.set_edgecolor("#d9d9d9")
-        plot.tick_params(axis=name, labelsize=8, pad=1, color=_FAINT)
+        plot.tick_params(axis=name, labelsize=style.TINY_PT, pad=1, color=style.FAINT)
         plot.locator_params(axis=name, nbins=5)
     plot.grid(False)
     plot.set_box_aspect(tuple(np.maximum(span / span.max(), 0.5)), zoom=0.92)
     plot.view_init(elev=24, azim=-58)
-    plot.set_xlabel("x  (µm)", labelpad=6)
-    plot.set_ylabel("y  (µm)", labelpad=6)
-    plot.set_zlabel("z  (µm)", labelpad=5)
-    figure.text(0.79, 0.893, "true path of the scan", fontsize=11, color=_INK, ha="center", va="center")
+    dress_space(plot, "x  (µm)", "y  (µm)", "z  (µm)")
+    figure.text(
+        0.79, 0.893, "true path of the scan", fontsize=style.TITLE_PT, color=style.INK, ha="center", va="center"
+    )
     bar = figure.colorbar(
         scale, cax=figure.add_axes((0.68, 0.405, 0.22, 0.011)), orientation="horizontal", extend="max"
     )
-    bar.set_label("distance from the reference  (nm)", fontsize=9)
-    bar.ax.tick_params(labelsize=8, color=_FAINT)
+    bar.set_label("distance from the reference  (nm)", fontsize=style.SMALL_PT)
+    bar.ax.tick_params(labelsize=style.TINY_PT, color=style.FAINT)
     bar.outline.set_visible(False)
 
 
@@ -247,15 +234,16 @@ def _draw_figures(plot: Axes, summary: Summary) -> None:
     plot.set_ylim(-max(8.0, len(checks) + 1.6), 0.4)
     columns = ((0.02, "left"), (0.54, "right"), (0.78, "right"), (0.98, "right"))
     for (x, side), words in zip(columns, ("check", "value", "bound", ""), strict=True):
-        plot.text(x, 0, words, ha=side, va="center", fontsize=9, color="#6b7780")
-    plot.axhline(-0.55, xmin=0.01, xmax=0.99, color="#c8c8c8", linewidth=0.8)
+        plot.text(x, 0, words, ha=side, va="center", fontsize=style.SMALL_PT, color=style.MUTED)
+    plot.axhline(-0.55, xmin=0.01, xmax=0.99, color=style.GRID, linewidth=0.8)
     for row, check in enumerate(checks, start=1):
         ok = check.ok
-        words, colour = {True: ("holds", "#1b7f5c"), False: ("fails", "#b3371a"), None: ("no bus", _FAINT)}[ok]
+        words, colour = {True: ("holds", style.GOOD), False: ("fails", style.BAD), None: ("no bus", style.FAINT)}[ok]
         value = "none" if check.value is None else f"{check.value:.4g}"
         for (x, side), text in zip(columns, (check.name, value, bound_words(check), words), strict=True):
             plot.text(
-                x, -row, text, ha=side, va="center", fontsize=10.5, color=colour if text is words else _INK,
+                x, -row, text, ha=side, va="center", fontsize=style.LABEL_PT,
+                color=colour if text is words else style.INK,
                 fontweight="bold" if text is words and ok is False else "normal",
             )  # fmt: skip
 
@@ -270,7 +258,7 @@ def bound_words(check: Verdict) -> str:
 
 def _draw_title(figure: Figure, summary: Summary) -> None:
     heading = f"{summary.scenario}   ·   {summary.lane} lane   ·   seed {summary.seed}"
-    figure.text(0.055, 0.962, heading, fontsize=17, color=_INK, fontweight="bold", va="center")
+    figure.text(0.055, 0.962, heading, fontsize=style.HEADING_PT, color=style.INK, fontweight="bold", va="center")
     rate = f"{1e6 / summary.period_us:,.0f} ticks/s".replace(",", " ")
     parts = [
         f"stage {summary.stage}",
@@ -284,13 +272,15 @@ def _draw_title(figure: Figure, summary: Summary) -> None:
             parts.append(f"{words} " + " / ".join(f"{v:.2f}" for v in measured.values()) + " nm")
     if summary.loop.bus_load is not None:
         parts.append(f"bus load {summary.loop.bus_load:.0%}")
-    figure.text(0.055, 0.927, "   ·   ".join(parts), fontsize=10.5, color="#55606a", va="center")
-    verdict, colour = ("all checks hold", "#1b7f5c") if summary.ok else ("checks fail", "#b3371a")
+    figure.text(0.055, 0.927, "   ·   ".join(parts), fontsize=style.LABEL_PT, color=style.MUTED, va="center")
+    verdict, colour = ("all checks hold", style.GOOD) if summary.ok else ("checks fail", style.BAD)
     if summary.interrupted:
-        verdict, colour = "interrupted", "#b3371a"
+        verdict, colour = "interrupted", style.BAD
     elif summary.loop.faults:
-        verdict, colour = "fault", "#b3371a"
-    figure.text(0.965, 0.962, verdict, fontsize=13, color=colour, ha="right", va="center", fontweight="bold")
+        verdict, colour = "fault", style.BAD
+    figure.text(
+        0.965, 0.962, verdict, fontsize=style.TITLE_PT, color=colour, ha="right", va="center", fontweight="bold"
+    )
 
 
 def _plot_envelope(

@@ -12,23 +12,38 @@ from matplotlib.figure import Figure
 from mpl_toolkits.mplot3d.art3d import Poly3DCollection
 from numpy.typing import NDArray
 
-from hil.pictures.mechanics import COLOURS, INK, dress, sheet
+from hil.pictures.style import (
+    AXIS,
+    INK,
+    LABEL_PT,
+    MAP,
+    REFERENCE,
+    SMALL_PT,
+    TINY_PT,
+    box,
+    dress,
+    dress_space,
+    legend,
+    save,
+    sheet,
+)
 from pkxyz_ctrl.mechanics.workspace import stroke_box, voltage_needed_v
 from pkxyz_ctrl.stage import Stage, StageDomainError
 
 Array = NDArray[np.float64]
 
-_MAP, _LIMIT = "viridis", "white"
+_LIMIT = "white"
 
 
 def draw_workspace(stage: Stage, voltage_max_v: float, out: Path) -> None:
     """Fig. 7: the workspace with its six bounding faces, and sections at several heights with the voltage needed
     there.
     """
-    figure = sheet(12.6, 6.0, f"Workspace of the {stage.config.name} stage, and the voltage that holds it")
+    title = f"Workspace of the {stage.config.name} stage, and the voltage that holds it"
+    figure = sheet(12.6, 6.0, title, free=True)
     _draw_faces(figure, stage)
     _draw_sections(figure, stage, voltage_max_v)
-    figure.savefig(out)
+    save(figure, out)
 
 
 def face_um(stage: Stage, axis: int, bound: float, cells: int) -> Array:
@@ -47,34 +62,31 @@ def _draw_faces(figure: Figure, stage: Stage) -> None:
             p = face_um(stage, axis, bound, 12)
             quads = np.stack([p[:-1, :-1], p[1:, :-1], p[1:, 1:], p[:-1, 1:]], axis=2).reshape(-1, 4, 3)
             alpha = 0.3 if bound == low else 0.5
-            plot.add_collection3d(Poly3DCollection(quads, facecolor=COLOURS[axis], edgecolor="none", alpha=alpha))
+            plot.add_collection3d(Poly3DCollection(quads, facecolor=AXIS[axis], edgecolor="none", alpha=alpha))
             rim = np.concatenate([p[:, 0], p[-1, :], p[::-1, -1], p[0, ::-1]])
             plot.plot(*rim.T, color=INK, linewidth=0.8)
         centre = face_um(stage, axis, high, 2)[1, 1]
-        label = {"facecolor": "white", "alpha": 0.85, "edgecolor": "none", "pad": 1.5}
         outward = centre + 9 * np.append(stage.geometry["e"][0][axis], 0.4)
         plot.text(
             *outward,
             f"$q_{axis + 1}$ = {high * 1e6:g} µm",
-            fontsize=9,
-            color=COLOURS[axis],
+            fontsize=SMALL_PT,
+            color=AXIS[axis],
             ha="center",
             zorder=20,
-            bbox=label,
+            bbox=box(),
         )
     _dress_space(plot)
     plot.text2D(
-        0.5, 0.0, "each pair of opposite faces is one slider at its two limits", transform=plot.transAxes, fontsize=9,
-        ha="center", color=INK,
+        0.5, 0.0, "each pair of opposite faces is one slider at its two limits", transform=plot.transAxes,
+        fontsize=SMALL_PT, ha="center", color=INK,
     )  # fmt: skip
 
 
 def _dress_space(plot: Any) -> None:
-    plot.set(xlabel="x (µm)", ylabel="y (µm)", zlabel="z (µm)", xlim=(-20, 20), ylim=(-20, 20), zlim=(0, 40))
+    dress_space(plot, "x (µm)", "y (µm)", "z (µm)")
+    plot.set(xlim=(-20, 20), ylim=(-20, 20), zlim=(0, 40))
     plot.view_init(elev=18, azim=-58)
-    for pane in (plot.xaxis, plot.yaxis, plot.zaxis):
-        pane.pane.set_facecolor("#fafafa")
-        pane._axinfo["grid"].update(color="#e0e0e0", linewidth=0.5)
 
 
 def _draw_sections(figure: Figure, stage: Stage, voltage_max_v: float) -> None:
@@ -87,21 +99,21 @@ def _draw_sections(figure: Figure, stage: Stage, voltage_max_v: float) -> None:
         plot = figure.add_axes((0.515 + column * 0.14, 0.515 - row * 0.425, 0.122, 0.37))
         x = np.linspace(-18, 18, 181)
         inside, voltage = section(stage, height * 1e-6, x * 1e-6)
-        plot.contourf(x, x, np.where(inside > 0, voltage, np.nan), 40, cmap=_MAP, norm=scale)
+        plot.contourf(x, x, np.where(inside > 0, voltage, np.nan), 40, cmap=MAP, norm=scale)
         plot.contour(x, x, inside, [0], colors=[INK], linewidths=1.1)
         held = np.where(inside > 0, voltage, np.nan)
         plot.contour(x, x, held, [voltage_max_v], colors=[_LIMIT], linewidths=1.8)
         plot.set_aspect("equal")
         plot.set(xlim=(-18, 18), ylim=(-18, 18), xticks=(-10, 0, 10), yticks=(-10, 0, 10))
-        plot.set_title(f"z = {height:g} µm", fontsize=9.5)
+        plot.set_title(f"z = {height:g} µm", fontsize=LABEL_PT)
         dress(plot, "x (µm)" if row else "", "y (µm)" if column == 0 else "")
-        plot.tick_params(labelsize=8, labelbottom=bool(row), labelleft=column == 0)
-    bar = figure.colorbar(ScalarMappable(scale, _MAP), cax=figure.add_axes((0.935, 0.14, 0.012, 0.67)))
+        plot.tick_params(labelsize=TINY_PT, labelbottom=bool(row), labelleft=column == 0)
+    bar = figure.colorbar(ScalarMappable(scale, MAP), cax=figure.add_axes((0.935, 0.14, 0.012, 0.67)))
     bar.set_label("highest comb voltage needed (V)")
     if voltage_max_v < highest:
         bar.ax.axhline(voltage_max_v, color=_LIMIT, linewidth=2.4)
     figure.text(
-        0.515, 0.015, f"black: stroke limits; white: {voltage_max_v:g} V, held inside it", fontsize=9, color=INK
+        0.515, 0.015, f"black: stroke limits; white: {voltage_max_v:g} V, held inside it", fontsize=SMALL_PT, color=INK
     )
 
 
@@ -145,26 +157,28 @@ def draw_edge_path(stage: Stage, out: Path) -> None:
     none.
     """
     strokes, positions = edge_path(stage)
-    figure = sheet(11.0, 5.0, "Path of Appendix B along the workspace's edges (the rigid mechanism has no tilt on it)")
+    figure = sheet(
+        11.0, 5.0, "Path of Appendix B along the workspace's edges (the rigid mechanism has no tilt on it)", free=True
+    )
     plot: Any = figure.add_axes((0.0, 0.03, 0.5, 0.86), projection="3d")
     low, high = stroke_box(stage)
     for axis in range(3):
         for bound in (low, high):
             p = face_um(stage, axis, bound, 12)
             rim = np.concatenate([p[:, 0], p[-1, :], p[::-1, -1], p[0, ::-1]])
-            plot.plot(*rim.T, color="#bdbdbd", linewidth=0.8)
-    plot.plot(*(positions.T * 1e6), color=COLOURS[1], linewidth=2.6)
+            plot.plot(*rim.T, color=REFERENCE, linewidth=0.8)
+    plot.plot(*(positions.T * 1e6), color=AXIS[1], linewidth=2.6)
     corners = stage.forward_kinematics(low + (high - low) * EDGE_PATH) * 1e6
-    plot.plot(*corners.T, "o", color=COLOURS[1], markersize=5)
+    plot.plot(*corners.T, "o", color=AXIS[1], markersize=5)
     for corner, words in zip(corners, ("rest", "furthest to the side", "", "highest"), strict=True):
-        plot.text(corner[0] + 2, corner[1], corner[2] + 1.5, words, fontsize=9, color=INK)
+        plot.text(corner[0] + 2, corner[1], corner[2] + 1.5, words, fontsize=SMALL_PT, color=INK)
     _dress_space(plot)
     travelled = np.concatenate([[0], np.cumsum(np.linalg.norm(np.diff(positions, axis=0), axis=1))]) * 1e6
     for row, (values, names) in enumerate(((strokes, ("q₁", "q₂", "q₃")), (positions, "xyz"))):
         right = figure.add_axes((0.58, 0.54 - row * 0.41, 0.33, 0.34))
         for axis, style in enumerate(("-", "--", "-.")):
-            right.plot(travelled, values[:, axis] * 1e6, style, color=COLOURS[axis], linewidth=1.8, label=names[axis])
-        right.legend(frameon=False, fontsize=9, loc="center left", bbox_to_anchor=(1.0, 0.5))
+            right.plot(travelled, values[:, axis] * 1e6, style, color=AXIS[axis], linewidth=1.8, label=names[axis])
+        legend(right, "center left", anchor=(1.0, 0.5))
         dress(right, "way along the path (µm)" if row else "", ("stroke (µm)", "position (µm)")[row])
         right.tick_params(labelbottom=bool(row))
-    figure.savefig(out)
+    save(figure, out)

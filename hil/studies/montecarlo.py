@@ -183,34 +183,3 @@ def summary(results: Sequence[Result]) -> dict[str, Any]:
 def worst(results: Sequence[Result]) -> Result:
     """The plant to look at first."""
     return max(results, key=lambda r: (r.fault is not None, r.peak_s is None, r.rms_error_nm or 0.0, -r.seed))
-
-
-def draw(study: Study, results: Sequence[Result], path: Path) -> None:
-    """Histograms of the figures, and the error over the stiffness and the quality factor that were drawn."""
-    from matplotlib.backends.backend_agg import FigureCanvasAgg
-    from matplotlib.figure import Figure
-
-    figure = Figure(figsize=(12.5, 6.4), layout="constrained", dpi=120)
-    FigureCanvasAgg(figure)
-    panels = figure.subplots(2, 3)
-    for axes, (name, unit) in zip(panels[0], FIGURES.items(), strict=True):
-        values = [v for r in results if (v := getattr(r, name)) is not None]
-        axes.hist(values, bins=min(40, max(5, len(values) // 5)), color="#0072b2")
-        words = "Ms" if name == "peak_s" else f"{name.replace('_', ' ').removesuffix(' nm')} ({unit})"
-        axes.set(xlabel=words, ylabel="plants")
-    held = [r for r in results if r.rms_error_nm is not None]
-    drawn = [study.tolerances.draw(r.seed) for r in held]
-    errors = [r.rms_error_nm for r in held]
-    for axes, label, values in (
-        (panels[1, 0], "stiffness (%)", [100 * c.perturbation.stiffness for c in drawn]),
-        (panels[1, 1], "quality factor", [c.perturbation.quality_factor for c in drawn]),
-        (panels[1, 2], "spread of the combs (%)", [100 * float(np.ptp(c.perturbation.comb_gain)) for c in drawn]),
-    ):
-        axes.plot(values, errors, ".", ms=4, color="#d55e00", alpha=0.7)
-        axes.set(xlabel=label, ylabel="rms error (nm)")
-    panels[1, 1].set_xscale("log")
-    for axes in panels.ravel():
-        axes.spines[["top", "right"]].set_visible(False)
-    lost = sum(not r.ok for r in results)
-    figure.suptitle(f"{study.scenario.controller.name} on {len(results)} plants; {lost} did not hold", fontsize=12)
-    figure.savefig(path)

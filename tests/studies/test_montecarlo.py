@@ -7,9 +7,10 @@ from loop_rig import setup
 from typer.testing import CliRunner
 
 from hil.cli import app
+from hil.pictures.montecarlo import draw_montecarlo
 from hil.recording.recording import Recording
 from hil.runs.scenario import load_scenario
-from hil.studies.montecarlo import Result, Results, Study, changed_plant, draw, run_one, run_study, summary, worst
+from hil.studies.montecarlo import Result, Results, Study, changed_plant, run_one, run_study, summary, worst
 from pkxyz_ctrl.config.files import ConfigError, load
 from pkxyz_ctrl.design.margins.tolerances import Tolerances
 from pkxyz_ctrl.design.model.loop_plant import Perturbation
@@ -57,7 +58,7 @@ def test_a_study_goes_on_where_it_was_and_every_plant_runs_again_to_the_bit(tmp_
     path.write_text("no JSON\n")
     with pytest.raises(ConfigError, match="not a file of results"):
         Results(path, study)
-    draw(study, list(again.found.values()), tmp_path / "p.png")
+    draw_montecarlo(study, list(again.found.values()), tmp_path / "p.png")
     assert (tmp_path / "p.png").stat().st_size > 10_000
 
 

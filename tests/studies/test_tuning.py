@@ -8,10 +8,11 @@ from loop_rig import MIDDLE, bus, rows_of, setup, stage
 from typer.testing import CliRunner
 
 from hil.cli import app
+from hil.pictures.tuning import draw_tuning
 from hil.studies.margins.loop import Loop, over_changed_plants
 from hil.studies.spread.workers import as_done, hands
 from hil.studies.tune.search import UNUSABLE, evaluate, load_problem
-from hil.studies.tune.tuning import best, draw, nearest, open_study, rounded, search, write_controller
+from hil.studies.tune.tuning import best, importances, nearest, open_study, rounded, search, write_controller
 from pkxyz_ctrl.config.controller import ControllerConfig
 from pkxyz_ctrl.config.files import CONFIG_DIR, ConfigError, load, names
 from pkxyz_ctrl.design.law import design_law
@@ -107,7 +108,9 @@ def test_a_study_goes_on_where_it_was_and_its_best_is_a_controller_that_runs(tmp
     assert controller.regulator.force_n == found.numbers["regulator.force_n"]
     loop = Loop(stage(), bus(), design_law(stage(), controller, bus(), autostart=True))
     assert loop.margins(MIDDLE).mimo.bandwidth_hz == pytest.approx(found.value, rel=1e-9)
-    assert draw(study, problem, tmp_path).keys() <= {n.key for n in problem.search.number}
+    importance = importances(study)
+    assert importance.keys() <= {n.key for n in problem.search.number}
+    draw_tuning(study, problem, importance, tmp_path)
     assert (tmp_path / "history.png").stat().st_size > 5000
     with pytest.raises(ConfigError, match="another problem"):
         open_study(problem_with(tmp_path, *BY_MARGINS, ("peak_s_max = 2.0", "peak_s_max = 1.9")), storage, 1)

@@ -179,55 +179,17 @@ def write_controller(problem: Problem, found: Best, path: Path) -> None:
         raise ConfigError(f"{path}: {(error.strerror or str(error)).lower()}; give another --out") from None
 
 
-_WORDS = {
-    "rms_error_nm": "rms error while scanning, mean of the plants (nm)",
-    "bandwidth_hz": "|S| < -3 dB up to (Hz)",
-}
+def importances(study: optuna.Study) -> dict[str, float]:
+    """How much each number matters among the trials that keep every goal (PED-ANOVA); empty where fewer than four
+    do.
+    """
+    if len(finished(study)) < 4:
+        return {}
+    evaluator = optuna.importance.PedAnovaImportanceEvaluator()
+    found = optuna.importance.get_param_importances(study, evaluator=evaluator)
+    return {name: float(value) for name, value in found.items()}
 
 
-def draw(study: optuna.Study, problem: Problem, folder: Path) -> dict[str, float]:
-    """history.png and importance.png; returns the importances, empty with fewer than four values to judge by."""
-    from matplotlib.backends.backend_agg import FigureCanvasAgg
-    from matplotlib.figure import Figure
-
-    finished = [t for t in study.get_trials(deepcopy=False) if t.state == _STATE.COMPLETE]
-    importance: dict[str, Any] = {}
-    if len(finished) >= 4:
-        evaluator = optuna.importance.PedAnovaImportanceEvaluator()
-        importance = optuna.importance.get_param_importances(study, evaluator=evaluator)
-    figure = Figure(figsize=(9, 4.2), layout="constrained", dpi=120)
-    FigureCanvasAgg(figure)
-    axes = figure.subplots()
-    _history(axes, study, finished, problem.maximise)
-    axes.set(
-        xlabel="trial",
-        ylabel=_WORDS[problem.search.objective],
-        title=f"{problem.search.name}: {len(judged(study))} trials, {len(finished)} of them keep every goal",
-    )
-    figure.savefig(folder / "history.png")
-    if importance:
-        figure = Figure(figsize=(8, 0.5 * len(importance) + 1.3), layout="constrained", dpi=120)
-        FigureCanvasAgg(figure)
-        axes = figure.subplots()
-        names = list(importance)[::-1]
-        axes.barh(names, [importance[name] for name in names], color="#0072b2")
-        axes.set(xlabel="importance (PED-ANOVA), among the trials that keep every goal", title=problem.search.name)
-        axes.spines[["top", "right"]].set_visible(False)
-        figure.savefig(folder / "importance.png")
-    return {name: float(value) for name, value in importance.items()}
-
-
-def _history(axes: Any, study: optuna.Study, finished: list[Any], maximise: bool) -> None:
-    numbers, values = np.array([t.number for t in finished]), np.array([t.value for t in finished], dtype=np.float64)
-    if len(values):
-        axes.plot(numbers, values, ".", color="#9aa5ad", label="tried")
-        axes.step(numbers, (np.maximum if maximise else np.minimum).accumulate(values), where="post", color="#0072b2",
-                  label="best so far")  # fmt: skip
-        low, high = np.percentile(values, [0, 90] if not maximise else [10, 100])
-        low, high = min(low, values[0]), max(high, values[0])  # where it began stays in sight
-        axes.set_ylim(low - 0.1 * (high - low) - 1e-9, high + 0.1 * (high - low) + 1e-9)
-    missed = [t.number for t in study.get_trials(deepcopy=False) if t.state == _STATE.PRUNED]
-    if missed:
-        axes.plot(missed, np.full(len(missed), axes.get_ylim()[0]), "|", color="#d55e00", ms=5, label="misses a margin")
-    axes.legend(frameon=False, fontsize=9)
-    axes.spines[["top", "right"]].set_visible(False)
+def finished(study: optuna.Study) -> list[optuna.trial.FrozenTrial]:
+    """The trials that keep every goal."""
+    return [t for t in study.get_trials(deepcopy=False) if t.state == _STATE.COMPLETE]

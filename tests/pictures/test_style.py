@@ -1,0 +1,69 @@
+"""One style for all pictures: none brings colours, sheets or type of its own, and what is drawn twice is equal."""
+
+import ast
+import re
+from pathlib import Path
+
+import pytest
+
+from hil.pictures.style import AXIS, COMB, SERIES, bound, dress, legend, save, sheet
+
+ROOT = Path(__file__).parents[2]
+DRAWING = sorted(
+    path
+    for folder in ("hil", "docs", "benchmarks")
+    for path in (ROOT / folder).rglob("*.py")
+    if path.name != "style.py" and re.search("matplotlib|pictures.style", path.read_text(encoding="utf-8"))
+)
+SHADES = {"docs/figures/margins.py": 1, "hil/pictures/faults.py": 3, "hil/pictures/report.py": 1}
+"""Colours that mean something in one picture alone: a law's, degrees of lateness, the area under a line."""
+
+
+def style_of_its_own(source: str) -> list[str]:
+    """What a source does that is the style's: open a sheet, set sizes of type by number, hide a box, write a file."""
+    found = []
+    for node in ast.walk(ast.parse(source)):
+        if isinstance(node, ast.Call):
+            called = ast.unparse(node.func)
+            if called in ("plt.subplots", "plt.figure", "matplotlib.use") or called.endswith(".savefig"):
+                found.append(called)
+            if any(keyword.arg == "figsize" for keyword in node.keywords):
+                found.append("figsize")
+            found += [
+                keyword.arg
+                for keyword in node.keywords
+                if keyword.arg in ("fontsize", "labelsize") and isinstance(keyword.value, ast.Constant)
+            ]
+    return found
+
+
+def test_the_search_finds_each_of_them():
+    source = 'f = Figure(figsize=(1, 2))\nf.savefig("x")\nplot.text(0, 0, "", fontsize=9)\nplt.subplots(2)\n'
+    assert sorted(style_of_its_own(source)) == ["f.savefig", "figsize", "fontsize", "plt.subplots"]
+    assert len(DRAWING) > 20
+
+
+@pytest.mark.parametrize("path", DRAWING, ids=lambda path: path.name)
+def test_no_picture_has_a_style_of_its_own(path):
+    source = path.read_text(encoding="utf-8")
+    assert style_of_its_own(source) == []
+    colours = re.findall(r"[\"']#[0-9a-fA-F]{6}[\"']|[\"']tab:\w+[\"']", source)
+    assert len(colours) == SHADES.get(str(path.relative_to(ROOT)), 0), colours
+
+
+def test_axes_and_combs_are_never_told_by_the_same_colour():
+    assert not set(AXIS) & set(COMB)
+    assert len(set(SERIES)) == len(SERIES)
+
+
+@pytest.mark.parametrize("kind", ["png", "svg", "pdf"])
+def test_the_same_picture_has_the_same_bytes(tmp_path, kind):
+    for name in ("a", "b"):
+        figure = sheet(4, 3, "title")
+        plot = figure.subplots()
+        plot.plot([1, 2], [3, 5], label="line")
+        bound(plot, 4.0, "four", 1.0)
+        dress(plot, "x (um)", "y (um)")
+        legend(plot)
+        save(figure, tmp_path / f"{name}.{kind}")
+    assert (tmp_path / f"a.{kind}").read_bytes() == (tmp_path / f"b.{kind}").read_bytes()
