@@ -7,12 +7,20 @@ import tomllib
 from pathlib import Path
 from typing import Annotated, Self
 
-from pydantic import BaseModel, ConfigDict, Field
+from pydantic import AfterValidator, BaseModel, ConfigDict, Field
 
 from sim.device import Device, Finite, Positive
 
 __all__ = ["Device", "PlantConfig"]
 
+
+def _one_file(name: str) -> str:
+    if any(c in "/\\" or not c.isprintable() for c in name):
+        raise ValueError("names files and folders: no slash, backslash or control character")
+    return name
+
+
+Name = Annotated[str, Field(min_length=1, max_length=100), AfterValidator(_one_file)]
 NotNegative = Annotated[float, Field(ge=0, allow_inf_nan=False)]
 Relative = Annotated[float, Field(gt=-0.9, lt=9.0)]
 PerChain = tuple[Finite, Finite, Finite]
@@ -227,7 +235,7 @@ class Feedthrough(_Model):
 class PlantConfig(_Model):
     """All effects of one plant. The defaults are the nominal plant."""
 
-    name: Annotated[str, Field(min_length=1)] = "nominal"
+    name: Name = "nominal"
     stiffness_mismatch: StiffnessMismatch = StiffnessMismatch()
     mass_error: MassError = MassError()
     damping: Damping = Damping()

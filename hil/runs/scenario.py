@@ -56,7 +56,7 @@ class Bound(FrozenModel):
 class ScenarioConfig(FrozenModel):
     """A scenario file."""
 
-    name: Text
+    name: config.Name
     description: str = ""
     duration_s: Annotated[float, Field(gt=0, le=36_000)]
     """stage time from power-on, start-up and homing included"""
@@ -66,7 +66,7 @@ class ScenarioConfig(FrozenModel):
     plant: Text
     controller: Text
     bus: Text
-    reference: Annotated[tuple[Segment, ...], Field(min_length=1)]
+    reference: Annotated[tuple[Segment, ...], Field(min_length=1, max_length=10_000)]
     """starts when the controller starts to track"""
     faults: tuple[Fault, ...] = ()
     """what goes wrong, at times after the first tick"""

@@ -5,7 +5,7 @@ from typing import Annotated, Self
 from pydantic import Field, model_validator
 
 from pkxyz_ctrl.can.driver_config import DriverConfig
-from pkxyz_ctrl.config.files import FrozenModel
+from pkxyz_ctrl.config.files import FrozenModel, Name
 
 Positive = Annotated[float, Field(gt=0)]
 
@@ -55,7 +55,7 @@ class AnalogConfig(FrozenModel):
 class BusConfig(FrozenModel):
     """One way to reach a stage: the period of the loop and what lies between a sample and its consequence."""
 
-    name: Annotated[str, Field(min_length=1)]
+    name: Name
     period_us: Annotated[int, Field(ge=20, le=100_000)]
     delay_periods: Annotated[int, Field(ge=1, le=2)] = 1
     """Periods from a sample to the start of the action that it causes; 2 for adapters that cannot answer within one."""

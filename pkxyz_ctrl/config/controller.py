@@ -4,7 +4,7 @@ from typing import Annotated, Self
 
 from pydantic import Field, model_validator
 
-from pkxyz_ctrl.config.files import FrozenModel
+from pkxyz_ctrl.config.files import FrozenModel, Name
 from pkxyz_ctrl.config.laws import LAWS, SECTIONS, Hinf, Irc, Linear, Mpc, PiNotch
 from pkxyz_ctrl.safety.thresholds import (
     FORCE_CHANGE_MAX_N,
@@ -86,7 +86,7 @@ class MonitorConfig(FrozenModel):
 class ControllerConfig(FrozenModel):
     """One controller."""
 
-    name: Annotated[str, Field(min_length=1)]
+    name: Name
     law: LAWS
     """lqg: Kalman filter and state feedback; open_loop: feed-forward alone; mpc: lqg that plans ahead inside limits;
     pi_notch, irc, hinf: linear laws, designed; linear: one of the user's own.

@@ -8,16 +8,21 @@ import difflib
 import hashlib
 import json
 import math
+import reprlib
 import tomllib
 from pathlib import Path
-from typing import Any, TypeVar
+from typing import Annotated, Any, TypeVar
 
 import tomlkit
-from pydantic import BaseModel, ConfigDict, ValidationError
+from pydantic import AfterValidator, BaseModel, ConfigDict, Field, ValidationError
 
 _PACKAGED = Path(__file__).parents[1] / "configs"
 CONFIG_DIR = _PACKAGED if _PACKAGED.is_dir() else Path(__file__).parents[2] / "configs"
 """Where the shipped configuration files live: inside an installed wheel, or beside the packages in a checkout."""
+
+
+TOML_MAX_BYTES = 1_000_000
+"""Of a configuration file: one is read in a second, and 10 000 segments of a reference fit."""
 
 
 class ConfigError(ValueError):
@@ -35,6 +40,16 @@ class FrozenModel(BaseModel):
 Model = TypeVar("Model", bound=BaseModel)
 
 
+def _one_file(name: str) -> str:
+    if any(c in "/\\" or not c.isprintable() for c in name):
+        raise ValueError("names files and folders: no slash, backslash or control character")
+    return name
+
+
+Name = Annotated[str, Field(min_length=1, max_length=100), AfterValidator(_one_file)]
+"""What something is called, in tables and in the names of the files that are written about it."""
+
+
 def find(kind: str, name_or_path: str | Path) -> Path:
     """Path of the file meant by a path (anything with a suffix or a separator) or the name of a shipped one.
 
@@ -43,17 +58,24 @@ def find(kind: str, name_or_path: str | Path) -> Path:
     text = str(name_or_path)
     if text.endswith(".toml") or "/" in text or "\\" in text:
         path = Path(text)
-        if not path.is_file():
+        if not _is_file(path):
             raise ConfigError(f"{path}: no such file; give the path of a TOML file or one of: {_known(kind)}")
         return path
     path = CONFIG_DIR / kind / f"{text}.toml"
-    if not path.is_file():
+    if not _is_file(path):
         near = difflib.get_close_matches(text, names(kind), n=1)
         hint = f"did you mean {near[0]!r}? " if near else ""
         raise ConfigError(
             f"{kind}: no configuration named {text!r}; {hint}known: {_known(kind)}; or give the path of a TOML file"
         )
     return path
+
+
+def _is_file(path: Path) -> bool:
+    try:
+        return path.is_file()
+    except (OSError, ValueError):  # a name too long, a NUL in it
+        return False
 
 
 def names(kind: str) -> list[str]:
@@ -65,16 +87,41 @@ def _known(kind: str) -> str:
     return ", ".join(names(kind)) or "none"
 
 
+def read_bounded(path: str | Path, most_bytes: int) -> bytes:
+    """Content of a file of somebody's. Raises ``ConfigError`` for one that isn't there, is no file (a device, a pipe),
+    is larger than ``most_bytes`` or can't be read.
+    """
+    path = Path(path)
+    try:
+        if path.exists() and not path.is_file():
+            raise ConfigError(f"{path}: cannot be read: is not a file")
+        with path.open("rb") as file:
+            content = file.read(most_bytes + 1)
+    except FileNotFoundError:
+        raise ConfigError(f"{path}: no such file") from None
+    except (OSError, ValueError) as error:  # ValueError: a NUL in the path
+        if isinstance(error, ConfigError):
+            raise
+        raise ConfigError(f"{str(path)!r}: cannot be read: {getattr(error, 'strerror', None) or error}") from None
+    if len(content) > most_bytes:
+        raise ConfigError(f"{path}: is larger than {most_bytes * 1e-6:g} MB, the most that is read; give a smaller file")
+    return content
+
+
 def read_toml(path: str | Path) -> dict[str, Any]:
     """Parsed content of a TOML file; a ``ConfigError`` that names the file and the line if it can't be read."""
     try:
-        return tomllib.loads(Path(path).read_text(encoding="utf-8"))
-    except FileNotFoundError:
-        raise ConfigError(f"{path}: no such file") from None
-    except (OSError, UnicodeDecodeError) as error:
+        return tomllib.loads(read_bounded(path, TOML_MAX_BYTES).decode("utf-8"))
+    except UnicodeDecodeError as error:
         raise ConfigError(f"{path}: cannot be read: {error}") from None
     except tomllib.TOMLDecodeError as error:
         raise ConfigError(f"{path}: not valid TOML: {error}") from None
+    except RecursionError:
+        raise ConfigError(f"{path}: not valid TOML: {_TOO_DEEP}") from None
+    except ValueError as error:
+        if isinstance(error, ConfigError):
+            raise
+        raise ConfigError(f"{path}: not valid TOML: a number has too many digits") from None
 
 
 def load(kind: str, name_or_path: str | Path, model: type[Model]) -> Model:
@@ -87,12 +134,17 @@ def parse(data: dict[str, Any], model: type[Model], source: str) -> Model:
     """Validate plain data against a model; ``source`` is the file that errors name."""
     try:
         return model.model_validate(_listed_as_tuples(data))
+    except RecursionError:
+        raise ConfigError(f"{source}: {_TOO_DEEP}") from None
     except ValidationError as error:
         items = error.errors(include_url=False)
         inner = {item["loc"][:n] for item in items for n in range(len(item["loc"]))}
         # A list whose items are wrong also counts as too short; only the items are worth a line.
         lines = [_explain(source, dict(item), model) for item in items if item["loc"] not in inner or not item["loc"]]
         raise ConfigError("\n".join(dict.fromkeys(lines))) from None
+
+
+_TOO_DEEP = "brackets or dotted keys are nested too deeply"
 
 
 def _listed_as_tuples(value: Any) -> Any:
@@ -114,10 +166,13 @@ def _explain(source: str, item: dict[str, Any], model: type[BaseModel]) -> str:
         return f"{source}: {key}: missing; add this key{_unit_hint(location[-1])}"
     message = str(item["msg"]).removeprefix("Value error, ")
     shown = item.get("input")
-    got = "" if isinstance(shown, dict | BaseModel) else f" (got {shown!r})"
+    got = "" if isinstance(shown, dict | BaseModel) else f" (got {_SHORT.repr(shown)})"
     unit = _unit_hint(location[-1]) if location else ""
     return f"{source}: {key or 'file'}: {message[:1].lower() + message[1:]}{got}{unit}"
 
+
+_SHORT = reprlib.Repr()
+_SHORT.maxstring = _SHORT.maxother = _SHORT.maxlong = 80
 
 _UNITS = {
     "m": "metres",

@@ -6,7 +6,7 @@ from typing import Annotated, Literal, Self
 from pydantic import Field, model_validator
 
 from pkxyz_ctrl.config.calibration import Calibration
-from pkxyz_ctrl.config.files import FrozenModel
+from pkxyz_ctrl.config.files import FrozenModel, Name
 
 Positive = Annotated[float, Field(gt=0)]
 
@@ -137,7 +137,7 @@ class LimitsConfig(FrozenModel):
 class StageConfig(FrozenModel):
     """One device."""
 
-    name: Annotated[str, Field(min_length=1)]
+    name: Name
     geometry: GeometryConfig
     flexures: FlexureConfig
     drive_comb: CombConfig

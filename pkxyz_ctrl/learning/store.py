@@ -8,6 +8,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from pkxyz_ctrl.config.files import ConfigError, read_bounded
 from pkxyz_ctrl.learning.config import LearningError
 from pkxyz_ctrl.learning.timetable import Timetable
 from pkxyz_ctrl.trajectory import Trajectory
@@ -16,6 +17,8 @@ Array = NDArray[np.float64]
 Complex = NDArray[np.complex128]
 
 _FORMAT = "pkxyz learning 1"
+STORED_MAX_BYTES = 10_000_000
+"""Far above 450 harmonics."""
 _MARKS = 64
 """Instants of the period at which the file says where the scan is."""
 _SAME_M = 1e-12
@@ -73,10 +76,10 @@ def save(stored: Stored, path: Path) -> None:
 def load(path: Path) -> Stored:
     """Read it. Raises ``LearningError`` for what is no such file."""
     try:
-        data = json.loads(path.read_text(encoding="utf-8"))
-    except FileNotFoundError:
-        raise LearningError(f"{path}: no such file; learn first: a run with --learn leaves learnt.json") from None
-    except (OSError, ValueError) as error:
+        data = json.loads(read_bounded(path, STORED_MAX_BYTES).decode("utf-8"))
+    except ConfigError as error:
+        raise LearningError(f"{error}; learn first: a run with --learn leaves learnt.json") from None
+    except (RecursionError, ValueError) as error:
         raise LearningError(f"{path}: cannot be read as a stored correction: {error}") from None
     if not isinstance(data, dict) or data.get("format") != _FORMAT:
         raise LearningError(f"{path}: is not a stored correction ({_FORMAT!r}); a run with --learn leaves learnt.json")
@@ -87,7 +90,7 @@ def load(path: Path) -> Stored:
         if cosine.shape != sine.shape:
             raise ValueError("cosines and sines are not as many")
         stored = Stored(belongs, np.asarray(0.5 * (cosine - 1j * sine), np.complex128), dict(data["provenance"]))
-    except (KeyError, TypeError, ValueError) as error:
+    except (KeyError, TypeError, ValueError, OverflowError) as error:
         raise LearningError(f"{path}: is damaged: {type(error).__name__}: {error}; learn anew") from None
     shapes = marks.shape == (_MARKS, 3) and cosine.ndim == 2 and cosine.shape[1] == 3
     if not shapes or not (np.isfinite(cosine).all() and np.isfinite(sine).all()):

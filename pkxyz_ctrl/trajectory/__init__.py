@@ -17,9 +17,9 @@ from pydantic import Field
 
 from pkxyz_ctrl.trajectory.motion import Array, Motion, TrajectoryError
 from pkxyz_ctrl.trajectory.periodic import Circle, Lissajous, Rosette, Sine
-from pkxyz_ctrl.trajectory.pieces import still
+from pkxyz_ctrl.trajectory.pieces import Pieces, still
 from pkxyz_ctrl.trajectory.raster import Raster
-from pkxyz_ctrl.trajectory.segments import Hold, Move
+from pkxyz_ctrl.trajectory.segments import Hold, Move, Plan
 from pkxyz_ctrl.trajectory.spiral import Spiral
 from pkxyz_ctrl.trajectory.steps import Staircase, Steps
 from pkxyz_ctrl.trajectory.sweep import Sweep
@@ -38,6 +38,11 @@ Segment = Annotated[AnySegment, Field(discriminator="kind")]
 """Any segment of a reference, told apart by ``kind``."""
 
 Window = tuple[int, int]
+
+LONGEST_S = 36_000.0
+"""The longest trajectory that is planned: ten hours."""
+PIECES_MAX = 2_000_000
+"""The most pieces of constant jerk, over all segments: 200 MB."""
 
 
 @dataclass(frozen=True)
@@ -71,7 +76,7 @@ class Trajectory:
         if not segments:
             raise TrajectoryError("reference: has no segments; give at least one [[reference]]")
         position = np.zeros(3)
-        start_us = 0
+        start_us = pieces = 0
         motions: list[Motion] = []
         starts_us: list[float] = []
         timed: list[TimedSegment] = []
@@ -81,6 +86,7 @@ class Trajectory:
             except TrajectoryError as error:
                 raise TrajectoryError(f"reference.{n} ({segment.kind}): {error}") from None
             position = plan.end_m
+            pieces += _require_bounded(f"reference.{n} ({segment.kind})", plan, start_us * 1e-6, pieces)
             t_s = 0.0
             for motion in plan.motions:
                 motions.append(motion)
@@ -134,6 +140,22 @@ class Trajectory:
         t_us = _instants_us(first_tick, count, period_us)
         index = np.searchsorted(self._segment_start_us, t_us, side="right") - 1
         return np.where(t_us < self.duration_us, index, -1).astype(np.int16)
+
+
+def _require_bounded(where: str, plan: Plan, start_s: float, before: int) -> int:
+    """How many pieces a plan has; ``TrajectoryError`` if with it the trajectory has too many or is too long."""
+    total_s = sum(motion.total_s for motion in plan.motions)
+    if not (start_s + total_s <= LONGEST_S and np.isfinite(plan.end_m).all()):  # not a number, too, is refused
+        raise TrajectoryError(
+            f"{where}: would end {start_s + total_s:.4g} s after the start; at most {LONGEST_S:g} s are planned"
+        )
+    pieces = sum(len(motion.duration_s) for motion in plan.motions if isinstance(motion, Pieces))
+    if before + pieces > PIECES_MAX:
+        raise TrajectoryError(
+            f"{where}: up to here the reference has {before + pieces} pieces of constant jerk; at most {PIECES_MAX} are "
+            "planned; give fewer lines, steps or points"
+        )
+    return pieces
 
 
 def _instants_us(first_tick: int, count: int, period_us: int) -> NDArray[np.int64]:

@@ -155,8 +155,9 @@ def _first_too_fast(
     change = np.abs(voltage[lag:] - voltage[:-lag])
     share_v = drive.slew_max_v_per_s * drive.period_us * 1e-6
     now_us, before_us = t_us[known][lag:], t_us[known][:-lag]
-    for jump_us in (t for segment in trajectory.segments for t in segment.jumps_us):
-        change[(before_us < jump_us) & (jump_us <= now_us)] = 0.0
+    jumps_us = np.array([t for segment in trajectory.segments for t in segment.jumps_us], np.int64)
+    passed = np.searchsorted(jumps_us, now_us, side="right") > np.searchsorted(jumps_us, before_us, side="right")
+    change[passed] = 0.0
     broken = np.argwhere(change > share_v)
     if not len(broken):
         return None

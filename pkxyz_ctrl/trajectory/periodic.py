@@ -8,15 +8,18 @@ from fractions import Fraction
 from typing import Annotated, Literal, Self
 
 import numpy as np
-from pydantic import Field, model_validator
+from pydantic import AfterValidator, Field, model_validator
 
 from pkxyz_ctrl.config.files import FrozenModel
 from pkxyz_ctrl.trajectory.motion import Array
-from pkxyz_ctrl.trajectory.segments import NotNegative, Plan, Position, Positive
+from pkxyz_ctrl.trajectory.segments import Plan, Position, Positive, far_from_underflow
 from pkxyz_ctrl.trajectory.tones import Tones
 
 Axis = Literal["x", "y", "z"]
-Frequencies = tuple[NotNegative, NotNegative, NotNegative]
+Angle = Annotated[float, Field(ge=-1e6, le=1e6)]
+Angles = tuple[Angle, Angle, Angle]
+Frequency = Annotated[float, Field(ge=0), AfterValidator(far_from_underflow)]
+Frequencies = tuple[Frequency, Frequency, Frequency]
 Lead = Annotated[float, Field(gt=0, le=10)]
 
 LEAD_S = 0.02
@@ -67,7 +70,7 @@ class Lissajous(FrozenModel):
     amplitude_m: Position
     """0 for an axis that stands still"""
     frequency_hz: Frequencies
-    phase_rad: Position = (0.0, 0.0, 0.0)
+    phase_rad: Angles = (0.0, 0.0, 0.0)
     """of each sine at the start of the full amplitude"""
     duration_s: Positive
     """at full amplitude"""

@@ -9,7 +9,7 @@ from pydantic import model_validator
 from pkxyz_ctrl.config.files import FrozenModel
 from pkxyz_ctrl.trajectory.motion import Array, TrajectoryError, at_rest
 from pkxyz_ctrl.trajectory.pieces import Phases, Pieces, from_phases, joined
-from pkxyz_ctrl.trajectory.segments import Count, Limits, NotNegative, Plan, Position, Positive, travel
+from pkxyz_ctrl.trajectory.segments import COUNT_MAX, Count, Limits, NotNegative, Plan, Position, Positive, travel
 
 
 class Raster(FrozenModel):
@@ -36,6 +36,12 @@ class Raster(FrozenModel):
     velocity_max_m_per_s: Positive
     acceleration_max_m_per_s2: Positive
     jerk_max_m_per_s3: Positive
+
+    @model_validator(mode="after")
+    def _not_too_many(self) -> Self:
+        if (total := self.lines * self.layers * self.frames) > COUNT_MAX:
+            raise ValueError(f"{total} lines in all layers and frames; at most {COUNT_MAX} are planned")
+        return self
 
     @model_validator(mode="after")
     def _comes_back(self) -> Self:

@@ -10,16 +10,30 @@ from typing import Annotated, Literal, NamedTuple
 
 import numpy as np
 import ruckig
-from pydantic import Field
+from pydantic import AfterValidator, Field
 
 from pkxyz_ctrl.config.files import FrozenModel
 from pkxyz_ctrl.trajectory.motion import Array, Motion, TrajectoryError
 from pkxyz_ctrl.trajectory.pieces import Phases, Pieces, from_phases, still
 
-Positive = Annotated[float, Field(gt=0)]
-NotNegative = Annotated[float, Field(ge=0)]
-Count = Annotated[int, Field(ge=1)]
-Position = tuple[float, float, float]
+_LEAST, _MOST = 1e-12, 1e12
+_FARTHEST_M = 1e-3
+COUNT_MAX = 100_000
+"""Lines of a raster, steps of a staircase, ...: half an hour at 60 lines/s, planned in some seconds."""
+
+
+def far_from_underflow(value: float) -> float:
+    """``value`` of 0 or of a magnitude whose cube and whose inverse a float can hold; else ``ValueError``."""
+    if value != 0 and not _LEAST <= abs(value) <= _MOST:
+        raise ValueError(f"must be between {_LEAST:g} and {_MOST:g}")
+    return value
+
+
+Positive = Annotated[float, Field(gt=0), AfterValidator(far_from_underflow)]
+NotNegative = Annotated[float, Field(ge=0, le=_MOST)]
+Count = Annotated[int, Field(ge=1, le=COUNT_MAX)]
+Coordinate = Annotated[float, Field(ge=-_FARTHEST_M, le=_FARTHEST_M)]
+Position = tuple[Coordinate, Coordinate, Coordinate]
 
 
 class Plan(NamedTuple):

@@ -8,10 +8,12 @@ import numpy as np
 from pydantic import model_validator
 
 from pkxyz_ctrl.config.files import FrozenModel
-from pkxyz_ctrl.trajectory.motion import Array, at_rest
+from pkxyz_ctrl.trajectory.motion import Array, TrajectoryError, at_rest
 from pkxyz_ctrl.trajectory.periodic import LEAD_S, Axis, Lead, unit
 from pkxyz_ctrl.trajectory.segments import Plan, Positive
 from pkxyz_ctrl.trajectory.tones import envelope, enveloped, sin_cos
+
+_LEAD_MAX_DECADES = 6
 
 
 class Sweep(FrozenModel):
@@ -40,6 +42,12 @@ class Sweep(FrozenModel):
 
     def plan(self, start_m: Array) -> Plan:
         """The scan is the full amplitude, exactly from one frequency to the other."""
+        decades = abs(math.log10(self.to_hz / self.from_hz)) * self.lead_s / self.duration_s
+        if self.law == "logarithmic" and decades > _LEAD_MAX_DECADES:
+            raise TrajectoryError(
+                f"by its law the frequency runs over {decades:.3g} decades in lead-in and lead-out of {self.lead_s:g} s "
+                f"each; at most {_LEAD_MAX_DECADES}: give a shorter lead_s or a longer duration_s"
+            )
         motion = Chirp(
             start_m, unit(self.axis) * self.amplitude_m, self.from_hz, self.to_hz, self.law == "logarithmic",
             self.lead_s, self.duration_s,

@@ -10,7 +10,7 @@ from typing import Annotated, Any, Literal
 import numpy as np
 from pydantic import Field
 
-from pkxyz_ctrl.config.files import FrozenModel
+from pkxyz_ctrl.config.files import ConfigError, FrozenModel, read_bounded
 from pkxyz_ctrl.trajectory.motion import Array, TrajectoryError, at_rest
 from pkxyz_ctrl.trajectory.pieces import Pieces
 from pkxyz_ctrl.trajectory.segments import Limits, Plan, Positive, travel
@@ -25,6 +25,8 @@ _COLUMNS = {
 }
 """Quantity and factor to SI of every column that a file may have."""
 _SLACK = 1 + 1e-9
+TABLE_MAX_BYTES = 20_000_000
+"""Half a million rows, which are read in some seconds."""
 
 
 class Table(FrozenModel):
@@ -75,11 +77,9 @@ def in_folder(segments: Sequence[Any], folder: Path) -> list[Any]:
 
 def _content(file: str) -> bytes:
     try:
-        return Path(file).read_bytes()
-    except FileNotFoundError:
-        raise TrajectoryError(f"{file}: no such file") from None
-    except OSError as error:
-        raise TrajectoryError(f"{file}: cannot be read: {error}") from None
+        return read_bounded(file, TABLE_MAX_BYTES)
+    except ConfigError as error:
+        raise TrajectoryError(str(error)) from None
 
 
 def _rows(file: str, content: bytes, start_m: Array) -> tuple[list[int], Array, Array]:

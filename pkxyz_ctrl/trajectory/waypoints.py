@@ -20,7 +20,7 @@ class Waypoints(FrozenModel):
     """Through the points in order, from where the stage stands, and to rest at the last; limits hold for each axis."""
 
     kind: Literal["waypoints"]
-    points_m: Annotated[tuple[Position, ...], Field(min_length=1)]
+    points_m: Annotated[tuple[Position, ...], Field(min_length=1, max_length=10_000)]
     deviation_m: NotNegative = 0.0
     """how far the path may pass by a point to round its corner off; 0: stop at each"""
     velocity_max_m_per_s: Positive

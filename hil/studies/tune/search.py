@@ -69,7 +69,7 @@ class Goals(FrozenModel):
 class SearchConfig(FrozenModel):
     """A file of configs/searches."""
 
-    name: Text
+    name: config.Name
     controller: Text
     stage: Text
     bus: Text
