@@ -33,6 +33,7 @@ from hil.lanes.lane import InProcessLane, Lane
 from hil.screen.first_run import say_if_compiling
 from hil.screen.outputs import what_to_do
 from hil.screen.tables import error_lines, print_whole
+from pkxyz_ctrl.compiled.kernel_cache import forget_damaged
 from pkxyz_ctrl.config.files import CONFIG_DIR, ConfigError, find, names
 
 if TYPE_CHECKING:
@@ -74,6 +75,8 @@ def main() -> NoReturn:
             _notes.print("interrupted")
             sys.exit(130)
         if isinstance(error, OSError) and (line := what_to_do(error)) is not None:
+            _fail(line)
+        if (line := forget_damaged(error)) is not None:
             _fail(line)
         if (message := getattr(error, "format_message", None)) is None:
             raise

@@ -104,7 +104,9 @@ def read_bounded(path: str | Path, most_bytes: int) -> bytes:
             raise
         raise ConfigError(f"{str(path)!r}: cannot be read: {getattr(error, 'strerror', None) or error}") from None
     if len(content) > most_bytes:
-        raise ConfigError(f"{path}: is larger than {most_bytes * 1e-6:g} MB, the most that is read; give a smaller file")
+        raise ConfigError(
+            f"{path}: is larger than {most_bytes * 1e-6:g} MB, the most that is read; give a smaller file"
+        )
     return content
 
 

@@ -12,7 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from pkxyz_ctrl.learning import update
-from pkxyz_ctrl.learning.config import LearningConfig
+from pkxyz_ctrl.learning.config import LearningConfig, LearningError
 from pkxyz_ctrl.learning.harmonics import count_up_to, fade, harmonics, noise, period_rows, weighted
 from pkxyz_ctrl.learning.store import Stored
 from pkxyz_ctrl.learning.timetable import FADE_TICKS, Timetable
@@ -73,6 +73,7 @@ class Learner:
         start = np.zeros((count, 3), np.complex128)
         if stored is not None:
             start[: len(stored.harmonics_m)] = stored.harmonics_m[:count]
+            require_followed(self._reference + self._period(start), within_limits)
         self._known = update.beginning(start, config.gain)
         # (first tick of fading in, rows of a period), in order; older ones have faded out
         self._changes: list[tuple[int, Array]] = [(table.begin - FADE_TICKS, self._period(start))]
@@ -192,8 +193,20 @@ class Learner:
         self.steps.append(Step(window, lesson.learnt, lesson.reverted, share))
 
     def _looked_at(self, shift: Array) -> Iterator[bool]:
-        """Whether each piece of the shifted period, and of its way on into the next one, is within the limits."""
-        rows = self._reference + shift
-        length = -(-len(rows) // PIECES)
-        for begin in range(0, len(rows), length):
-            yield self._within_limits(np.take(rows, np.arange(begin, begin + length + 1), axis=0, mode="wrap"))
+        return _looked_at(self._reference + shift, self._within_limits)
+
+
+def require_followed(rows: Array, within_limits: Callable[[Array], bool]) -> None:
+    """Raise ``LearningError`` if a period (N, 9) of a corrected scan passes a limit: files come from anywhere."""
+    if not all(_looked_at(rows, within_limits)):
+        raise LearningError(
+            "the stored correction carries the scan beyond what the stage can follow: a stroke, a pull, a voltage or "
+            "its slew; learn anew (--learn)"
+        )
+
+
+def _looked_at(rows: Array, within_limits: Callable[[Array], bool]) -> Iterator[bool]:
+    """Whether each piece of a period, and of its way on into the next one, is within the limits."""
+    length = -(-len(rows) // PIECES)
+    for begin in range(0, len(rows), length):
+        yield within_limits(np.take(rows, np.arange(begin, begin + length + 1), axis=0, mode="wrap"))

@@ -152,8 +152,8 @@ def _require_bounded(where: str, plan: Plan, start_s: float, before: int) -> int
     pieces = sum(len(motion.duration_s) for motion in plan.motions if isinstance(motion, Pieces))
     if before + pieces > PIECES_MAX:
         raise TrajectoryError(
-            f"{where}: up to here the reference has {before + pieces} pieces of constant jerk; at most {PIECES_MAX} are "
-            "planned; give fewer lines, steps or points"
+            f"{where}: up to here the reference has {before + pieces} pieces of constant jerk; at most {PIECES_MAX} "
+            "are planned; give fewer lines, steps or points"
         )
     return pieces
 

@@ -45,8 +45,8 @@ class Sweep(FrozenModel):
         decades = abs(math.log10(self.to_hz / self.from_hz)) * self.lead_s / self.duration_s
         if self.law == "logarithmic" and decades > _LEAD_MAX_DECADES:
             raise TrajectoryError(
-                f"by its law the frequency runs over {decades:.3g} decades in lead-in and lead-out of {self.lead_s:g} s "
-                f"each; at most {_LEAD_MAX_DECADES}: give a shorter lead_s or a longer duration_s"
+                f"by its law the frequency runs over {decades:.3g} decades in lead-in and lead-out of {self.lead_s:g} "
+                f"s each; at most {_LEAD_MAX_DECADES}: give a shorter lead_s or a longer duration_s"
             )
         motion = Chirp(
             start_m, unit(self.axis) * self.amplitude_m, self.from_hz, self.to_hz, self.law == "logarithmic",

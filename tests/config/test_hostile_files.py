@@ -188,8 +188,7 @@ def test_no_number_of_a_segment_ends_in_anything_but_a_plan_or_words(values):
             if max(getattr(segment, "steps", 1), getattr(segment, "count", 1)) > 1000:
                 return
             trajectory = Trajectory([segment])
-        except (TrajectoryError, ValidationError) as error:
-            assert str(error).strip()
+        except (TrajectoryError, ValidationError):
             return
         assert 0 <= trajectory.duration_us <= 36_000_000_000
         step_us = max(1, trajectory.duration_us // 50)
@@ -221,4 +220,3 @@ def test_a_stored_correction_with_a_number_beyond_floats(tmp_path, digits):
     )
     with pytest.raises(LearningError):
         load_stored(tmp_path / "learnt.json")
-
