@@ -8,6 +8,7 @@ import difflib
 import hashlib
 from collections.abc import Sequence
 from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, Self
 
@@ -21,11 +22,12 @@ from pkxyz_ctrl.config.bus import BusConfig
 from pkxyz_ctrl.config.controller import ControllerConfig
 from pkxyz_ctrl.config.files import ConfigError, FrozenModel
 from pkxyz_ctrl.config.stage import StageConfig
-from pkxyz_ctrl.learning import LearningConfig
+from pkxyz_ctrl.learning import LearningConfig, LearningError
+from pkxyz_ctrl.learning.learner import require_followed
 from pkxyz_ctrl.learning.store import Stored
 from pkxyz_ctrl.stage import Stage
 from pkxyz_ctrl.trajectory import Segment, Trajectory, TrajectoryError
-from pkxyz_ctrl.trajectory.check import DriveLimits, check_against
+from pkxyz_ctrl.trajectory.check import DriveLimits, check_against, within_limits
 from pkxyz_ctrl.trajectory.table import Table, in_folder
 from sim.config import Device, PlantConfig
 
@@ -113,11 +115,21 @@ class Scenario:
         )  # fmt: skip
 
     def stored(self) -> Stored | None:
-        """The correction that the run begins with. Raises ``LearningError`` for one that belongs to another run."""
+        """The correction that the run begins with. Raises ``LearningError`` for one that belongs to another run, or
+        that would carry the scan beyond what the stage can follow.
+        """
         if self.config.learning is None:
             return None
         here = belongs(self.trajectory, self.stage, self.controller, self.bus)
-        return stored_for(self.config.learning, self.stored_file, here)
+        stored = stored_for(self.config.learning, self.stored_file, here)
+        if stored is not None:
+            follows = partial(within_limits, Stage(self.stage), drive=_drive_limits(self.controller, self.bus))
+            cutoff_hz, period_us = self.config.learning.cutoff_hz, self.bus.period_us
+            try:
+                require_followed(stored, cutoff_hz, self.trajectory, period_us, follows)
+            except LearningError as error:
+                raise LearningError(f"{self.stored_file}: {error}") from None
+        return stored
 
 
 def load_scenario(
@@ -166,9 +178,7 @@ def load_scenario(
     try:
         trajectory = Trajectory(in_folder(scenario.reference, source.parent))
         _check_duration(source, scenario, trajectory)  # first: to sample one of 10^18 s would never end
-        limits = parts["controller"].limits
-        drive = DriveLimits(limits.voltage_max_v, limits.slew_max_v_per_s, parts["bus"].period_us)
-        check_against(Stage(parts["stage"]), trajectory, drive)
+        check_against(Stage(parts["stage"]), trajectory, _drive_limits(parts["controller"], parts["bus"]))
     except TrajectoryError as error:
         raise TrajectoryError(f"{source}: {error}") from None
     file = scenario.learning.file if scenario.learning is not None else None
@@ -176,6 +186,10 @@ def load_scenario(
     loaded = Scenario(source, scenario, trajectory=trajectory, stored_file=stored_file, **parts)
     loaded.stored()
     return loaded
+
+
+def _drive_limits(controller: ControllerConfig, bus: BusConfig) -> DriveLimits:
+    return DriveLimits(controller.limits.voltage_max_v, controller.limits.slew_max_v_per_s, bus.period_us)
 
 
 def _part(kind: str, name_or_path: str, model: type[BaseModel], folder: Path) -> BaseModel:

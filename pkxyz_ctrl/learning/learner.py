@@ -15,7 +15,7 @@ from pkxyz_ctrl.learning import update
 from pkxyz_ctrl.learning.config import LearningConfig, LearningError
 from pkxyz_ctrl.learning.harmonics import count_up_to, fade, harmonics, noise, period_rows, weighted
 from pkxyz_ctrl.learning.store import Stored
-from pkxyz_ctrl.learning.timetable import FADE_TICKS, Timetable
+from pkxyz_ctrl.learning.timetable import FADE_TICKS, Timetable, timetable
 from pkxyz_ctrl.safety.modes import Mode
 from pkxyz_ctrl.safety.monitors import SenseStatus
 from pkxyz_ctrl.trajectory import Trajectory
@@ -70,10 +70,9 @@ class Learner:
         count = count_up_to(config.cutoff_hz, table.period, self._tick_s)
         self._reference = trajectory.sample(table.begin, table.period, period_us)
         self._lag_m = sense_delay_s * self._reference[:, 3:6]
-        start = np.zeros((count, 3), np.complex128)
+        start = _beginning(stored, count)
         if stored is not None:
-            start[: len(stored.harmonics_m)] = stored.harmonics_m[:count]
-            require_followed(self._reference + self._period(start), within_limits)
+            _require_followed(self._reference + self._period(start), within_limits)
         self._known = update.beginning(start, config.gain)
         # (first tick of fading in, rows of a period), in order; older ones have faded out
         self._changes: list[tuple[int, Array]] = [(table.begin - FADE_TICKS, self._period(start))]
@@ -196,8 +195,28 @@ class Learner:
         return _looked_at(self._reference + shift, self._within_limits)
 
 
-def require_followed(rows: Array, within_limits: Callable[[Array], bool]) -> None:
-    """Raise ``LearningError`` if a period (N, 9) of a corrected scan passes a limit: files come from anywhere."""
+def require_followed(
+    stored: Stored, cutoff_hz: float, trajectory: Trajectory, period_us: int, within_limits: Callable[[Array], bool]
+) -> None:
+    """Raise ``LearningError`` if a stored correction carries the scan beyond a limit: files come from anywhere.
+
+    A ``Learner`` asks the same; who reads the file asks before anything has begun.
+    """
+    table, tick_s = timetable(trajectory, period_us), period_us * 1e-6
+    start = _beginning(stored, count_up_to(cutoff_hz, table.period, tick_s))
+    rows = trajectory.sample(table.begin, table.period, period_us) + period_rows(start, table.period, tick_s)
+    _require_followed(rows, within_limits)
+
+
+def _beginning(stored: Stored | None, count: int) -> Complex:
+    """(count, 3): the harmonics that a run begins with."""
+    start = np.zeros((count, 3), np.complex128)
+    if stored is not None:
+        start[: len(stored.harmonics_m)] = stored.harmonics_m[:count]
+    return start
+
+
+def _require_followed(rows: Array, within_limits: Callable[[Array], bool]) -> None:
     if not all(_looked_at(rows, within_limits)):
         raise LearningError(
             "the stored correction carries the scan beyond what the stage can follow: a stroke, a pull, a voltage or "

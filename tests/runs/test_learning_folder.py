@@ -1,5 +1,6 @@
 """A run that learns, from its file to its folder and back: stored, replayed, refreshed, played again bit for bit."""
 
+import dataclasses
 import json
 
 import pytest
@@ -128,3 +129,28 @@ def test_options_say_one_thing():
     assert learning_of(False, None, "a.json") == {"mode": "refresh", "file": "a.json"}
     with pytest.raises(ConfigError, match="give one of them"):
         learning_of(True, "a.json", None)
+
+
+@pytest.mark.parametrize(
+    ("changed", "why"),
+    [
+        (lambda cosine: cosine[0].__setitem__(0, 1e-3), "1 mm"),
+        (lambda cosine: cosine[2].__setitem__(2, 13e-6), "a stroke"),
+        (lambda cosine: cosine[-1].__setitem__(1, 6e-6), "the slew of a voltage: 6 um at 400 Hz"),
+    ],
+)
+def test_a_correction_that_the_stage_cannot_follow_is_refused_before_anything_moves(learnt, tmp_path, changed, why):
+    """Whoever can hand over a file could else drive the stage into its stop: the 1 mm of issue 15."""
+    root, folder, _ = learnt
+    data = json.loads(folder.learnt.read_text())
+    changed(data["cosine_m"])
+    path = tmp_path / "mine.json"
+    path.write_text(json.dumps(data))
+    with pytest.raises(
+        LearningError, match=r"mine\.json: the stored correction carries the scan beyond what the stage"
+    ):
+        load_scenario(root / "short.toml", learning={"mode": "replay", "file": str(path)})
+    scenario = load_scenario(root / "short.toml", learning={"mode": "replay", "file": str(folder.learnt)})
+    handed_over = dataclasses.replace(scenario.setup(), stored=load(path))
+    with pytest.raises(LearningError, match="carries the scan beyond"):
+        handed_over.new_learner()
