@@ -1,5 +1,6 @@
 """Every frame on the wire, streamed to a candump log (``candump -L``): python-can, cantools and can-utils read it."""
 
+import re
 from pathlib import Path
 from types import TracebackType
 from typing import Self
@@ -14,6 +15,13 @@ ERROR_FLAG = 0x2000_0000  # CAN_ERR_FLAG of linux/can.h
 
 _THREE_DIGITS = tuple(f"{n:03d}" for n in range(1000))
 _UNSEEN = (-1, "")
+_NAME_LENGTH = 15  # IFNAMSIZ of linux/if.h without its zero: canplayer takes no longer name
+
+
+def interface_name(channel: str) -> str:
+    """What a log calls a channel: the channel, or of a path its end, without what no interface's name may hold."""
+    end = re.sub(r"[^A-Za-z0-9_.-]+", "_", channel.rstrip("/").rpartition("/")[2])
+    return end[-_NAME_LENGTH:] or "can"
 
 
 class FrameLog:
@@ -23,10 +31,8 @@ class FrameLog:
     """
 
     def __init__(self, path: str | Path, channel: str) -> None:
-        if not channel or any(c.isspace() for c in channel):
-            raise ValueError(f"channel {channel!r}: the log's columns are separated by blanks")
         self.path = Path(path)
-        self.channel = channel
+        self.channel = interface_name(channel)
         self.frames = 0
         self._rows: list[tuple[Frame, int]] = []
         self._middles: dict[int, tuple[int, str]] = {}  # of an identifier: flags, text before the data

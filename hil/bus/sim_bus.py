@@ -55,7 +55,8 @@ class SimBus(can.BusABC):
     """One endpoint of the wire published as ``channel``; if there is none, a wire with a clock of its own is made.
 
     ``fd``, ``bitrate`` and ``data_bitrate`` (bit/s) describe a new wire: 1 Mbit/s, and 5 Mbit/s for data if ``fd``.
-    Given for an existing wire they must agree with it. The wire lives as long as someone holds it.
+    Given for an existing wire they must agree with it; ``timing`` gives the same. ``single_handle``, which python-can's
+    tools give to every interface, means nothing here. The wire lives as long as someone holds it.
     """
 
     def __init__(
@@ -69,8 +70,14 @@ class SimBus(can.BusABC):
         receive_error_frames: bool = True,
         listen_only: bool = False,
         queue_limit: int = 4096,
+        timing: can.BitTiming | can.BitTimingFd | None = None,
+        single_handle: bool = True,
     ) -> None:
         channel = str(channel)
+        if isinstance(timing, can.BitTimingFd):
+            fd, bitrate, data_bitrate = True, timing.nom_bitrate, timing.data_bitrate
+        elif timing is not None:
+            bitrate = timing.bitrate
         self.wire = _existing_or_new_wire(channel, fd, bitrate, data_bitrate)
         self._inbox: deque[tuple[Frame, int, bool]] = deque()
         self._queue_limit = queue_limit

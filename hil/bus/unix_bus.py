@@ -31,7 +31,8 @@ from hil.bus.unix_folder import (
     sockets_in,
 )
 
-# time of day in ns, identifier with the flags of linux/can.h, length, flags of the FD frame; then the data
+# ns of CLOCK_MONOTONIC, which all processes of a machine share; identifier with the flags of linux/can.h; length;
+# flags of the FD frame; then the data
 _HEAD = struct.Struct("<qIBB")
 _EXTENDED, _REMOTE, _ERROR = 0x8000_0000, 0x4000_0000, 0x2000_0000
 _BIT_RATE_SWITCH, _ERROR_STATE, _FD = 0x01, 0x02, 0x04
@@ -48,7 +49,8 @@ _numbers = count(1)
 class UnixBus(can.BusABC):
     """One participant. ``fd``: whether FD frames are carried; ``dropped`` counts frames that a full receiver lost.
 
-    ``bitrate`` and ``data_bitrate`` are taken and mean nothing.
+    ``bitrate``, ``data_bitrate``, ``timing`` and ``single_handle`` are what python-can's tools give to every interface:
+    taken, and without a meaning here.
     """
 
     def __init__(
@@ -59,6 +61,8 @@ class UnixBus(can.BusABC):
         receive_own_messages: bool = False,
         bitrate: int | None = None,
         data_bitrate: int | None = None,
+        timing: can.BitTiming | can.BitTimingFd | None = None,
+        single_handle: bool = True,
     ) -> None:
         self._folder = folder_of(str(channel))
         self._path = self._folder / socket_name(next(_numbers))
@@ -221,7 +225,7 @@ def _pack(msg: can.Message) -> bytes:
         | (_BIT_RATE_SWITCH if msg.bitrate_switch else 0)
         | (_ERROR_STATE if msg.error_state_indicator else 0)
     )
-    return _HEAD.pack(time.time_ns(), can_id, msg.dlc, flags) + (b"" if msg.is_remote_frame else bytes(msg.data))
+    return _HEAD.pack(time.monotonic_ns(), can_id, msg.dlc, flags) + (b"" if msg.is_remote_frame else bytes(msg.data))
 
 
 def _unpack(datagram: bytes, channel: str) -> can.Message:
@@ -232,7 +236,7 @@ def _unpack(datagram: bytes, channel: str) -> can.Message:
     if length > (64 if is_fd else 8) or (len(data) != length and not is_remote):
         raise ValueError("not a frame")
     return can.Message(
-        timestamp=sent_ns * 1e-9,
+        timestamp=time.time() - (time.monotonic_ns() - sent_ns) * 1e-9,
         arbitration_id=can_id & (0x1FFF_FFFF if can_id & _EXTENDED else 0x7FF),
         is_extended_id=bool(can_id & _EXTENDED),
         is_remote_frame=is_remote,

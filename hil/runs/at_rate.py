@@ -55,7 +55,7 @@ def run_into(folder: RunFolder, scenario: Scenario, say: Callable[[str], object]
     setup = scenario.setup()
     watched = _Watched()
     with Ending() as ending:
-        channel = can_config.channel.replace(" ", "_")
+        channel = can_config.channel
         recorder = WallRecorder(folder.recording, folder.frames, begun.metadata, channel)
         try:
             _run(WallRig(setup, recorder, ending), watched, say)

@@ -66,7 +66,7 @@ class CanPort:
 
     ``refused`` counts frames that the bus did not take (queue full, bus-off): they are lost, and it is for the monitors
     to say when that is too much. ``last_us`` is the time of the frame received last, by the stamp of its interface
-    where that is a time of day, as python-can wants it, else when it was read.
+    where that is a time of day, as python-can wants it, else when it was read; it never runs backwards.
 
     ``receive`` looks again and again for ``spin_us`` before it sleeps: an answer that comes within that time, as a
     sense frame does, is not delayed by a wake-up, some 50 us. It reckons by ``clock``, and leaves python-can's own
@@ -110,7 +110,8 @@ class CanPort:
             return None
         now_us = clock.now_us
         age_s = time.time() - message.timestamp
-        self.last_us = now_us - round(age_s * 1e6) if 0 <= age_s < _STAMP_MAX_AGE_S else now_us
+        stamp_us = now_us - round(age_s * 1e6) if 0 <= age_s < _STAMP_MAX_AGE_S else now_us
+        self.last_us = max(self.last_us, stamp_us)
         return to_frame(message)
 
     def _read_once(self, timeout_s: float) -> can.Message | None:

@@ -108,9 +108,3 @@ def test_cantools_on_the_command_line_decodes_it(tmp_path: Path) -> None:
     )
     assert "Drive(volt: 130.0 V)" in done.stdout
     assert "Drive(volt: -1.5 V)" in done.stdout
-
-
-def test_a_channel_with_blanks_would_spoil_the_columns(tmp_path: Path) -> None:
-    with pytest.raises(ValueError, match="blanks"):
-        FrameLog(tmp_path / "frames.log", "sim 0")
-    assert not (tmp_path / "frames.log").exists()

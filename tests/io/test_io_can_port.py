@@ -74,6 +74,21 @@ def test_waiting_ends_at_the_deadline_and_not_before(tmp_path):
         assert port.unsent() == 0
 
 
+def test_when_a_frame_was_sent_is_known_though_the_time_of_day_was_set_meanwhile(tmp_path, monkeypatch):
+    """A machine that asks for the time now and then sets it by some milliseconds: the node's time is that of frames."""
+    clock, of_day = WallClock(), time.time
+    with UnixBus(f"{tmp_path}/bus") as a, UnixBus(f"{tmp_path}/bus") as b:
+        port = CanPort(b, clock)
+        begin_us = clock.now_us
+        for step_s in (-3.0, 0.0, -0.02, 0.2):
+            a.send(can.Message(arbitration_id=1, is_extended_id=False))
+            sent_us = clock.now_us
+            monkeypatch.setattr(time, "time", lambda step_s=step_s: of_day() + step_s)
+            assert port.receive(clock.now_us + 1_000_000) is not None
+            assert begin_us - 5 <= port.last_us <= sent_us + 5
+            begin_us = port.last_us
+
+
 def test_a_classic_bus_refuses_fd_frames_and_does_not_see_them(tmp_path):
     clock = WallClock()
     with UnixBus(f"{tmp_path}/bus", fd=False) as classic, UnixBus(f"{tmp_path}/bus") as flexible:
