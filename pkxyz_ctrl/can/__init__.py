@@ -1,0 +1,1 @@
+"""What is said over CAN, without a socket: frames, codec, start-up dialogue, amplifier driver."""

@@ -1,0 +1,1 @@
+"""PURE, compiled: kinematics, elasticity, filter, law, allocation, voltage; ``tick`` composes them."""

@@ -1,0 +1,1 @@
+"""What makes a law's numbers offline, and checks them against other libraries."""

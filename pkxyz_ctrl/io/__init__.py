@@ -1,0 +1,1 @@
+"""Clocks and ports of this machine; the only room of the controller that knows python-can."""

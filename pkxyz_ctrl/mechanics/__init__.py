@@ -1,0 +1,1 @@
+"""The paper: stiffness, modes, workspace, linearisation, the choice of dimensions."""
