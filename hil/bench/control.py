@@ -14,6 +14,7 @@ from hil.bench.rigs.motions import MIDDLE_M, error_m, run, settled_s, setup_of
 from hil.lanes.fast import run_block_in_steps
 from pkxyz_ctrl.loop.cycle import new_memory
 from pkxyz_ctrl.loop.period import period_of
+from pkxyz_ctrl.loop.reference import reference_rows
 from pkxyz_ctrl.loop.row import ROW
 from pkxyz_ctrl.safety.modes import Mode
 from pkxyz_ctrl.trajectory import Circle, Hold, Move, Raster, Sine, Steps
@@ -190,7 +191,7 @@ def mpc_tick_us(repeats: int = REPEATS) -> dict[str, NDArray[np.float64]]:
     """
     jump = Steps(kind="steps", by_m=(0.0, 0.0, WAY_M), count=1, dwell_s=0.04)
     setup, _ = setup_of([jump], "mpc", "nominal", LOW_M)
-    reference = setup.trajectory.sample(0, setup.ticks + 25, setup.bus.period_us)
+    reference = reference_rows(setup.trajectory.sample(0, setup.ticks + 25, setup.bus.period_us))
     at_us = setup.bus.period_us * np.arange(setup.ticks, dtype=np.int64)
     best = np.full(setup.ticks, np.inf)
     rows = np.zeros(setup.ticks, ROW)

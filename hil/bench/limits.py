@@ -7,6 +7,7 @@ from hil.bench.rigs.closed_loop import scan
 from hil.bench.rigs.kernels import no_argument, one_array, three_arrays, two_arrays
 from hil.bus.frame_time import INTERFRAME_BITS, frame_range_us
 from pkxyz_ctrl.can import cob_id
+from pkxyz_ctrl.loop.reference import REFERENCE
 
 
 def limits() -> list[Figure]:
@@ -18,7 +19,7 @@ def limits() -> list[Figure]:
 
     names = {
         "empty": empty, "none": no_argument, "one": one_array, "two": two_arrays, "three": three_arrays,
-        "law": loop.setup.law, "memory": loop.memory.copy(), "reference": np.zeros((8, 9)),
+        "law": loop.setup.law, "memory": loop.memory.copy(), "reference": np.zeros(8, REFERENCE),
     }  # fmt: skip
     statements = {
         "python_call": "empty()",

@@ -11,6 +11,7 @@ from numpy.typing import NDArray
 
 from hil.lanes.excitation import Excitation
 from pkxyz_ctrl.learning import Learner
+from pkxyz_ctrl.loop.reference import reference_rows
 from pkxyz_ctrl.loop.row import ROW
 from pkxyz_ctrl.trajectory import Trajectory
 
@@ -23,9 +24,9 @@ the intervals after them."""
 
 
 @lru_cache(maxsize=4)
-def _sampled(trajectory: Trajectory, first: int, count: int, period_us: int) -> NDArray[np.float64]:
+def _sampled(trajectory: Trajectory, first: int, count: int, period_us: int) -> NDArray[np.void]:
     """Rows that nobody writes to: a study runs one scan again and again."""
-    return trajectory.sample(first, count, period_us)
+    return reference_rows(trajectory.sample(first, count, period_us), first)
 
 
 class Handout:
@@ -50,20 +51,19 @@ class Handout:
         left = self._learner.due - int(memory["reference_tick"][0])
         return min(most, left) if left > 0 else most  # a hold has carried the path past it: nothing is learnt then
 
-    def rows(self, memory: NDArray[np.void], ticks: int) -> NDArray[np.float64]:
-        """Rows (n, 9) of the trajectory that so many ticks may need, (n, 12) with an excitation, (n, 15) with learning;
-        says in ``memory`` (1,) where they begin.
-        """
+    def rows(self, memory: NDArray[np.void], ticks: int) -> NDArray[np.void]:
+        """Rows (n,) of ``REFERENCE`` that so many ticks may need, from where ``memory`` (1,) says that the path is."""
         first, count = int(memory["reference_tick"][0]), ticks + PREVIEW_ROWS
-        memory["input"]["reference_base"] = first
         rows = _sampled(self._trajectory, first, count, self._period_us)
         if self._excitation is None and self._learner is None:
             return rows
-        added = np.zeros((count, 3)) if self._excitation is None else self._excitation.sample(first, count)
-        if self._learner is None:
-            return np.hstack([rows, added])
-        self._learner.finish()
-        return np.hstack([rows + self._learner.shift(first, count), added, rows[:, 0:3]])
+        rows = rows.copy()
+        if self._excitation is not None:
+            rows["added_m"] = self._excitation.sample(first, count)
+        if self._learner is not None:
+            self._learner.finish()
+            rows["motion"] += self._learner.shift(first, count)
+        return rows
 
     def see(self, rows: NDArray[np.void]) -> None:
         """The rows of the record that came of it, in order."""
@@ -95,7 +95,7 @@ class Blocks:
         """Ticks of the next block, 0 at the end."""
         return self._handout.ticks(memory, min(BLOCK_TICKS, self.ticks - self.done))
 
-    def reference(self, memory: NDArray[np.void]) -> NDArray[np.float64]:
+    def reference(self, memory: NDArray[np.void]) -> NDArray[np.void]:
         """``Handout.rows`` of the next block."""
         return self._handout.rows(memory, min(BLOCK_TICKS, self.ticks - self.done))
 

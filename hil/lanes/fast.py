@@ -15,6 +15,7 @@ from hil.plant.truth import observe
 from pkxyz_ctrl.core.tick import PREDICTIVE
 from pkxyz_ctrl.loop.cycle import cycle
 from pkxyz_ctrl.loop.period import Period, period_of
+from pkxyz_ctrl.loop.reference import standing_still
 from sim import kernels
 
 Array = NDArray[np.float64]
@@ -28,14 +29,14 @@ def runner_of(law: Records) -> RunBlock:
     if law["tick"]["kind"][0] != PREDICTIVE:
         runner: RunBlock = run_block
         return runner
-    return partial(run_block_in_steps, period_of(law, np.zeros((1, 9))))
+    return partial(run_block_in_steps, period_of(law, standing_still()))
 
 
 @njit(cache=True, error_model="numpy")
 def run_block(
     law: np.void,
     memory: np.void,
-    reference: Array,
+    reference: Records,
     plant_params: Records,
     plant_state: Records,
     sample_us: NDArray[np.int64],
@@ -63,7 +64,7 @@ def run_block_in_steps(
     period: Period,
     law: Records,
     memory: Records,
-    reference: Array,
+    reference: Records,
     plant_params: Records,
     plant_state: Records,
     sample_us: NDArray[np.int64],

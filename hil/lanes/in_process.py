@@ -18,6 +18,7 @@ from hil.lanes.setup import Setup
 from pkxyz_ctrl.can.frame import Frame
 from pkxyz_ctrl.learning import Learner
 from pkxyz_ctrl.loop.cycle import new_memory
+from pkxyz_ctrl.loop.reference import standing_still
 from pkxyz_ctrl.safety.modes import Mode
 from pkxyz_ctrl.safety.trips import explain
 from sim.plant import Plant
@@ -61,7 +62,7 @@ def run(
     if lane == Lane.FAST:
         plant, memory = setup.new_plant(), new_memory(Mode.IDLE)
         run_block = runner_of(law)
-        run_block(law, memory, np.zeros((1, 9)), plant.params, plant.state, np.zeros(0, np.int64), blocks.rows, 0)
+        run_block(law, memory, standing_still(), plant.params, plant.state, np.zeros(0, np.int64), blocks.rows, 0)
         _sample_us(setup, 0, 0)
         begin_s = time.perf_counter()
         missed, load, faults = 0, None, _run_fast(setup, run_block, memory, plant, blocks)

@@ -9,6 +9,7 @@ from numpy.typing import NDArray
 from hil.lanes.blocks import PREVIEW_ROWS
 from pkxyz_ctrl.learning import Learner
 from pkxyz_ctrl.learning.timetable import FADE_TICKS, LEAD_TICKS
+from pkxyz_ctrl.loop.reference import reference_rows
 from pkxyz_ctrl.trajectory import Trajectory
 
 _CHUNK = 16
@@ -18,13 +19,13 @@ assert _AHEAD + _CHUNK < LEAD_TICKS, "what is written ahead of the end of a wind
 
 
 class LiveReference:
-    """``rows`` (n, 15): the whole trajectory, whose shift is filled in as it becomes known."""
+    """``rows`` (n,) of ``REFERENCE``: the whole trajectory, whose shift is filled in as it becomes known."""
 
     def __init__(self, trajectory: Trajectory, period_us: int, learner: Learner) -> None:
         self.learner = learner
         count = trajectory.duration_us // period_us + PREVIEW_ROWS + FADE_TICKS + 1
         self._base = trajectory.sample(0, count, period_us)
-        self.rows = np.hstack([self._base, np.zeros((count, 3)), self._base[:, 0:3]])
+        self.rows = reference_rows(self._base)
         self._written = 0
         self._due = learner.due
         while self._written < _AHEAD:
@@ -45,5 +46,5 @@ class LiveReference:
     def _write(self) -> None:
         rows = slice(self._written, min(self._written + _CHUNK, len(self.rows)))
         shift = self.learner.shift(rows.start, rows.stop - rows.start)
-        self.rows[rows, 0:9] = self._base[rows] + shift
+        self.rows["motion"][rows] = self._base[rows] + shift
         self._written = rows.stop

@@ -29,6 +29,7 @@ from pkxyz_ctrl.can.frame import Frame
 from pkxyz_ctrl.config.bus import CanConfig
 from pkxyz_ctrl.config.files import CONFIG_DIR, ConfigError
 from pkxyz_ctrl.loop.controller import Controller
+from pkxyz_ctrl.loop.reference import REFERENCE
 from pkxyz_ctrl.loop.row import ROW
 from pkxyz_ctrl.loop.runtime import Clock, Port, run, start
 
@@ -184,9 +185,9 @@ class _Reference:
         self._blocks = blocks
         self._finish = recorder.finish
         self._next = 0
-        self._rows: NDArray[np.float64] = np.empty((0, 9))
+        self._rows = np.zeros(0, REFERENCE)
 
-    def __call__(self, tick: int) -> NDArray[np.float64]:
+    def __call__(self, tick: int) -> NDArray[np.void]:
         if tick == self._next:
             self._finish()
             self._next += self._blocks.next_count(self._memory)

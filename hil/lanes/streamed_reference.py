@@ -4,6 +4,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from hil.lanes.blocks import PREVIEW_ROWS
+from pkxyz_ctrl.loop.reference import REFERENCE, write_rows
 from pkxyz_ctrl.trajectory import Trajectory
 
 BLOCK_ROWS = 1024
@@ -19,18 +20,16 @@ class StreamedReference:
     """
 
     def __init__(self, trajectory: Trajectory, period_us: int, memory: NDArray[np.void]) -> None:
-        """``memory``: the controller's, (1,) of ``cycle.MEMORY``; says where the trajectory is, and is told where the
-        rows begin.
-        """
+        """``memory``: the controller's, (1,) of ``cycle.MEMORY``; says where the path is."""
         self._trajectory = trajectory
         self._period_us = period_us
         self._memory = memory
-        self._rows, self._next = (np.empty((BLOCK_ROWS + PREVIEW_ROWS, 9)) for _ in range(2))
+        self._rows, self._next = (np.zeros(BLOCK_ROWS + PREVIEW_ROWS, REFERENCE) for _ in range(2))
         self._base = self._filled = 0
         self._begin(0)
 
-    def __call__(self, tick: int) -> NDArray[np.float64]:
-        """Rows (n, 9) for this tick."""
+    def __call__(self, tick: int) -> NDArray[np.void]:
+        """Rows (n,) of ``REFERENCE`` for this tick."""
         at = int(self._memory["reference_tick"][0])
         ahead = at - self._base
         if ahead == BLOCK_ROWS and self._filled == len(self._next):
@@ -45,14 +44,13 @@ class StreamedReference:
         begin, end = self._filled, min(self._filled + PIECE_ROWS, len(self._next))
         if begin < end:
             first = self._base + BLOCK_ROWS + begin
-            self._next[begin:end] = self._trajectory.sample(first, end - begin, self._period_us)
+            write_rows(self._next[begin:end], self._trajectory.sample(first, end - begin, self._period_us), first)
             self._filled = end
 
     def _begin(self, at: int) -> None:
-        self._rows[:] = self._trajectory.sample(at, len(self._rows), self._period_us)
+        write_rows(self._rows, self._trajectory.sample(at, len(self._rows), self._period_us), at)
         self._take(at)
 
     def _take(self, at: int) -> None:
         """The rows in use begin at trajectory tick ``at``; of those after them there is none yet."""
         self._base, self._filled = at, 0
-        self._memory["input"]["reference_base"] = at

@@ -18,6 +18,7 @@ from pkxyz_ctrl.io.can_port import CanPort, open_bus
 from pkxyz_ctrl.io.clocks import TickClock, WallClock
 from pkxyz_ctrl.loop import cycle as cycling
 from pkxyz_ctrl.loop.controller import Controller
+from pkxyz_ctrl.loop.reference import standing_still
 from pkxyz_ctrl.loop.row import TRUTH_FIELDS
 from pkxyz_ctrl.loop.runtime import run, start
 from pkxyz_ctrl.safety.gate import GateConfig
@@ -77,7 +78,7 @@ class WallRig:
         law = setup.law
         learner = setup.new_learner()
         self.live = None if learner is None else LiveReference(setup.trajectory, setup.bus.period_us, learner)
-        _warm_up(law, np.zeros((1, 9)) if self.live is None else self.live.rows)
+        _warm_up(law, standing_still() if self.live is None else self.live.rows)
         self._bus = open_bus(can_config, setup.bus.name)
         self.clock = WallClock()
         self.can_port = CanPort(self._bus, self.clock, can_config.sense_deadline_us // 2)

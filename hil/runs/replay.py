@@ -20,6 +20,7 @@ from hil.runs.versions import versions
 from pkxyz_ctrl.config.controller import ControllerConfig
 from pkxyz_ctrl.loop import cycle as cycling
 from pkxyz_ctrl.loop.period import period_of
+from pkxyz_ctrl.loop.reference import standing_still
 from pkxyz_ctrl.loop.row import CONTROLLER_FIELDS, ROW, columns
 from pkxyz_ctrl.safety.modes import Mode
 from pkxyz_ctrl.safety.monitors import SenseStatus
@@ -110,7 +111,7 @@ class _Player:
         self._law = setup.law
         self._memory = cycling.new_memory(Mode.IDLE)
         self._handout = Handout(scenario.trajectory, scenario.bus.period_us, learner=setup.new_learner())
-        self._cycle = period_of(self._law, np.zeros((1, 9)))
+        self._cycle = period_of(self._law, standing_still())
 
     def play(self, recorded: Rows) -> Rows:
         """The rows (n,) that the inputs of these rows (n,), which follow those of the last call, lead to."""
@@ -125,7 +126,6 @@ class _Player:
         while begin < len(recorded):
             count = self._handout.ticks(memory, len(recorded) - begin)
             reference = self._handout.rows(memory, count)
-            inputs["reference_base"] = seen["reference_base"]
             for n in range(begin, begin + count):
                 seen[0] = inputs[n]
                 cycle(law, memory, reference)

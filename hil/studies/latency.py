@@ -32,6 +32,7 @@ from pkxyz_ctrl.io.clocks import TickClock, WallClock, percentile_us
 from pkxyz_ctrl.io.realtime import FIFO_PRIORITY, go_real_time, leave_real_time, settle_memory
 from pkxyz_ctrl.loop import cycle as cycling
 from pkxyz_ctrl.loop.controller import Controller
+from pkxyz_ctrl.loop.reference import reference_rows
 from pkxyz_ctrl.loop.runtime import run
 from pkxyz_ctrl.safety.modes import Mode
 
@@ -135,7 +136,7 @@ def measure(period_us: int, seconds: float, cyclictest: str | None = None) -> La
     controller = Controller(setup.law, setup.bus, wall_gate(setup.gate), amplifier.send)
     controller.mode = int(Mode.IDLE)  # as after the start-up, which a played amplifier cannot answer
     controller.memory["mode"] = Mode.IDLE
-    reference = setup.trajectory.sample(0, setup.ticks + PREVIEW_ROWS, period_us)
+    reference = reference_rows(setup.trajectory.sample(0, setup.ticks + PREVIEW_ROWS, period_us))
     cycling.cycle(setup.law, cycling.new_memory(), reference)
     beside = _start_cyclictest(cyclictest or shutil.which("cyclictest"), period_us, seconds)
     with Ending() as ending:

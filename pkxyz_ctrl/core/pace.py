@@ -15,6 +15,7 @@ from numba import njit
 from numpy.typing import NDArray
 
 Array = NDArray[np.float64]
+Records = NDArray[np.void]
 
 SLOWING, STEADY, STARTING = -1, 0, 1
 """What the path speed does: it falls to 0, stays, rises to 1."""
@@ -38,9 +39,9 @@ def advance(direction: int, age: int, ramp_ticks: int) -> tuple[float, float, fl
 
 
 @njit(cache=True, error_model="numpy")
-def sample(rows: Array, phase: float, speed: float, change_per_tick: float, period_s: float, out: Array) -> None:
-    """Row (9,) of a path at a phase between two of its rows (n, 9 or more), constant jerk between them, taken at a path
-    speed.
+def sample(rows: Records, phase: float, speed: float, change_per_tick: float, period_s: float, out: Array) -> None:
+    """Row (9,) of a path at a phase between two of its rows, constant jerk between them, at a path speed.
+    ``rows`` (n,) of a record with ``motion`` (9,).
 
     Phases before the first and past the last row are taken as these.
     """
@@ -48,9 +49,10 @@ def sample(rows: Array, phase: float, speed: float, change_per_tick: float, peri
     index = math.floor(bounded)
     following = min(index + 1, len(rows) - 1)
     h = (bounded - index) * period_s
+    here, there = rows[index]["motion"], rows[following]["motion"]
     for i in range(3):
-        x, v, a = rows[index, i], rows[index, 3 + i], rows[index, 6 + i]
-        jerk = (rows[following, 6 + i] - a) / period_s
+        x, v, a = here[i], here[3 + i], here[6 + i]
+        jerk = (there[6 + i] - a) / period_s
         velocity = v + h * (a + 0.5 * h * jerk)
         out[i] = x + h * (v + h * (0.5 * a + h * jerk / 6.0))
         out[3 + i] = speed * velocity

@@ -14,14 +14,13 @@ from pkxyz_ctrl.can.other_traffic import OtherTraffic
 from pkxyz_ctrl.config.bus import BusConfig, CanConfig
 from pkxyz_ctrl.loop import cycle as cycling
 from pkxyz_ctrl.loop.period import period_on
+from pkxyz_ctrl.loop.reference import REFERENCE, standing_still
 from pkxyz_ctrl.loop.row import ROW
 from pkxyz_ctrl.safety.gate import GateConfig, TransmitGate
 from pkxyz_ctrl.safety.modes import Event, Mode, next_mode
 from pkxyz_ctrl.safety.trips import Trip, explain
 
-Array = NDArray[np.float64]
 Send = Callable[[Frame], object]
-_WIDTHS = (9, 12, 15)  # of a reference: trajectory; and excitation; and what was asked for, where that is shifted
 
 _IDLE = int(Mode.IDLE)
 
@@ -69,7 +68,7 @@ class Controller:
         self._sense = self.driver.sense
         self._others = OtherTraffic(bus.can.driver.node_id)
         self._begun_us = 0
-        self._reference: Array = np.zeros((1, 9))  # the latest that was handed in
+        self._reference = standing_still()  # the latest that was handed in
         self._drive_counts = (0, 0, 0)
         self._cycle = period_on(law, self._reference)
         self._cycle(law, cycling.new_memory(Mode.BOOT), self._reference, *[0] * 7)  # loaded now, not in the first tick
@@ -137,8 +136,8 @@ class Controller:
         self._others.note(frame, t_us)
         return False
 
-    def compute(self, reference: Array, overrun: int) -> None:
-        """Run the cycle on what has come since the SYNC. ``reference`` (n, 9) float64, row after row in memory;
+    def compute(self, reference: NDArray[np.void], overrun: int) -> None:
+        """Run the cycle on what has come since the SYNC. ``reference`` (n,) of ``REFERENCE``;
         ``overrun`` ticks skipped before this one. Raises ValueError for another reference.
         """
         if self._clearing:
@@ -228,11 +227,9 @@ class Controller:
             self.faults.append(f"at {row['t_us'] * 1e-6:.4f} s: {reason}{detail}{emergencies}{self._others.complaint}")
 
 
-def _require_rows(reference: Array) -> None:
+def _require_rows(reference: NDArray[np.void]) -> None:
     """The compiled cycle doesn't look at what it is given, so it is looked at here, once for each block of rows."""
-    if reference.dtype != np.float64 or reference.ndim != 2 or reference.shape[1] not in _WIDTHS or len(reference) == 0:
-        raise ValueError(
-            f"a reference is (n, 9), (n, 12) or (n, 15) float64 with n > 0, not {reference.shape} {reference.dtype}"
-        )
+    if reference.dtype != REFERENCE or reference.ndim != 1 or len(reference) == 0:
+        raise ValueError(f"a reference is (n,) of REFERENCE with n > 0, not {reference.shape} {reference.dtype}")
     if not reference.flags.c_contiguous:
         raise ValueError("the rows of a reference must follow one another in memory (numpy.ascontiguousarray)")

@@ -37,7 +37,6 @@ INPUT = np.dtype(
         ("overrun", "i4"),
         ("sense_count", "i4", (3,)),
         ("trips", "i8"),  # Trip bits raised outside: a frame that the gate blocked, an operator's stop
-        ("reference_base", "i8"),  # trajectory tick of row 0 of the reference handed in
     ],
     align=True,
 )
@@ -86,7 +85,6 @@ MEMORY = np.dtype(
 )
 
 _ROW_LENGTH = 9
-_ASKED = 12  # column of the reference from which on the unshifted position stands
 _UNUSABLE = int(SenseStatus.MISSING | SenseStatus.CRC | SenseStatus.LENGTH | SenseStatus.DUPLICATE)
 _IMPLAUSIBLE = int(SenseStatus.IMPLAUSIBLE)
 _NONE, _HOME, _HOMED, _ENABLE, _TRACK, _TRIP, _CLEAR = (
@@ -105,20 +103,20 @@ def new_memory(mode: Mode = Mode.BOOT) -> NDArray[np.void]:
 
 
 @njit(cache=True, error_model="numpy")
-def cycle(law_array: Records, memory_array: Records, reference: Array) -> None:
-    """One period. ``law_array`` (1,) of ``LAW``, ``memory_array`` (1,) of ``MEMORY``, ``reference`` (n, 9) rows of
-    the trajectory, or (n, 12) with an excitation, or (n, 15) where the rows are shifted: last the position asked for.
+def cycle(law_array: Records, memory_array: Records, reference: Records) -> None:
+    """One period. ``law_array`` (1,) of ``LAW``, ``memory_array`` (1,) of ``MEMORY``, ``reference`` (n,) of
+    ``REFERENCE``.
 
-    Row ``reference_tick - reference_base`` is the set-point at this sample; the law looks up to four rows further.
-    Rows before the first and past the last are taken as the first and the last. The excitation, in m, is added to
-    what is measured while tracking, and so passes round the loop: seen over added is the sensitivity.
+    The row of ``reference_tick`` is the set-point at this sample; the law looks up to four rows further. Ticks before
+    the first and past the last row are taken as these. What is added to the measurement while tracking passes round
+    the loop: seen over added is the sensitivity.
     """
     observe(law_array, memory_array, reference)
     respond(law_array, memory_array)
 
 
 @njit(cache=True, error_model="numpy")
-def observe(law_array: Records, memory_array: Records, reference: Array) -> None:
+def observe(law_array: Records, memory_array: Records, reference: Records) -> None:
     """First part of the period: event and mode, measurement, estimate, the rows of the reference that count."""
     law, memory = law_array[0], memory_array[0]
     _handle(law, memory, _asked(law, memory))
@@ -131,7 +129,7 @@ def observe(law_array: Records, memory_array: Records, reference: Array) -> None
         tick.measure(law["tick"], memory["tick"], seen["sense_count"])
         if memory["mode"] == _HOMING:
             _average(law, memory)
-        if reference.shape[1] > _ROW_LENGTH and memory["mode"] == _TRACKING:
+        if memory["mode"] == _TRACKING:
             _excite(memory, reference)
         memory["suspects"] = _suspects(law, memory)
     believed = usable and memory["suspects"] == 0
@@ -174,7 +172,7 @@ def respond(law_array: Records, memory_array: Records) -> None:
 def cycle_on(
     law_array: Records,
     memory_array: Records,
-    reference: Array,
+    reference: Records,
     event: int,
     sense_status: int,
     node_events: int,
@@ -183,7 +181,7 @@ def cycle_on(
     count_2: int,
     count_3: int,
 ) -> tuple[int, int, int, int]:
-    """``cycle`` with its ``INPUT`` handed in, trips and reference base excepted. Returns the mode and the drive counts.
+    """``cycle`` with its ``INPUT`` handed in, trips excepted. Returns the mode and the drive counts.
 
     A call from Python for all that passes between the two: each number costs less than a look into the memory.
     """
@@ -304,18 +302,20 @@ def _average(law: np.void, memory: np.void) -> None:
 
 
 @njit(cache=True, error_model="numpy")
-def _excite(memory: np.void, reference: Array) -> None:
+def _excite(memory: np.void, reference: Records) -> None:
     """Add the excitation of this sample to the measurement; outside the rows handed in there is none."""
-    index = memory["reference_tick"] - memory["input"]["reference_base"]
+    index = memory["reference_tick"] - reference[0]["tick"]
     if 0 <= index < len(reference):
+        added = reference[index]["added_m"]
         for i in range(3):
-            memory["tick"]["measurement_m"][i] += reference[index, _ROW_LENGTH + i]
+            if added[i] != 0.0:
+                memory["tick"]["measurement_m"][i] += added[i]
 
 
 @njit(cache=True, error_model="numpy")
-def reference_row(law: np.void, memory: np.void, reference: Array, ahead: int, out: Array) -> None:
+def reference_row(law: np.void, memory: np.void, reference: Records, ahead: int, out: Array) -> None:
     """Write the row (9,) of the set-point ``ahead`` ticks from this one to ``out``."""
-    base = memory["input"]["reference_base"]
+    base = reference[0]["tick"]
     if memory["pace"] != pace.STEADY:
         gone, speed, change = pace.advance(memory["pace"], memory["pace_age"] + ahead, law["pace_ticks"])
         at = memory["pace_phase"] - base + gone
@@ -325,22 +325,22 @@ def reference_row(law: np.void, memory: np.void, reference: Array, ahead: int, o
         pace.sample(reference, at, 1.0, 0.0, law["period_us"] * 1e-6, out)
     elif memory["mode"] == _TRACKING:
         index = memory["reference_tick"] - base + ahead
-        index = min(max(index, 0), len(reference) - 1)
+        motion = reference[min(max(index, 0), len(reference) - 1)]["motion"]
         for i in range(_ROW_LENGTH):
-            out[i] = reference[index, i]
+            out[i] = motion[i]
     else:
         for i in range(_ROW_LENGTH):
             out[i] = memory["setpoint"][i]
 
 
 @njit(cache=True, error_model="numpy")
-def _asked_for(memory: np.void, reference: Array) -> None:
+def _asked_for(memory: np.void, reference: Records) -> None:
     """Note the position asked for at this sample, for the record; while the path stops or starts, with its shift."""
     on_time = memory["pace"] == pace.STEADY and memory["phase"] == 0.0
-    shifted = reference.shape[1] > _ASKED and memory["mode"] == _TRACKING and on_time
-    index = min(max(memory["reference_tick"] - memory["input"]["reference_base"], 0), len(reference) - 1)
+    from_row = memory["mode"] == _TRACKING and on_time
+    index = min(max(memory["reference_tick"] - reference[0]["tick"], 0), len(reference) - 1)
     for i in range(3):
-        memory["asked_m"][i] = reference[index, _ASKED + i] if shifted else memory["here"][i]
+        memory["asked_m"][i] = reference[index]["asked_m"][i] if from_row else memory["here"][i]
 
 
 @njit(cache=True, error_model="numpy")

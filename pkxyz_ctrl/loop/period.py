@@ -16,7 +16,7 @@ Period = Callable[..., Any]
 """Called as ``cycle.cycle`` is, or as ``cycle.cycle_on``."""
 
 
-def period_of(law: Records, reference: Array) -> Period:
+def period_of(law: Records, reference: Records) -> Period:
     """``cycle.cycle`` for ``law``, a (1,) array of ``cycle.LAW``, and references of the type of ``reference``.
 
     A new one for each controller: that of the predictive law remembers its last plan.
@@ -26,7 +26,7 @@ def period_of(law: Records, reference: Array) -> Period:
     return direct(cycling.cycle, law, cycling.new_memory(), reference)
 
 
-def period_on(law: Records, reference: Array) -> Period:
+def period_on(law: Records, reference: Records) -> Period:
     """``cycle.cycle_on`` for a law, as ``period_of``."""
     if law["tick"]["kind"][0] == PREDICTIVE:
         on: Period = _planning(law).on

@@ -19,6 +19,7 @@ from pkxyz_ctrl.core.linear3 import multiply3, multiply3_transposed
 from pkxyz_ctrl.core.tick import feedforward
 from pkxyz_ctrl.loop import cycle as cycling
 from pkxyz_ctrl.loop.predictive_problem import FORCE_UNIT_N, STROKE_UNIT_M, Problem
+from pkxyz_ctrl.loop.reference import standing_still
 from pkxyz_ctrl.safety.modes import LOOP_CLOSED
 
 Array = NDArray[np.float64]
@@ -47,13 +48,13 @@ class PredictiveCycle:
         self._cold = np.zeros(3 * n + 1), np.zeros(9 * n - 3)
         self._is_cold, self._free_ticks = True, 0
         self._solution()
-        memory, reference = cycling.new_memory(), np.zeros((1, 9))
+        memory, reference = cycling.new_memory(), standing_still()
         self._observe = direct(cycling.observe, law, memory, reference)
         self._respond = direct(cycling.respond, law, memory)
         self._plan = direct(plan, law, memory, reference, self._fixed, self._tried, self._vectors)
         self._adopt = direct(adopt, law, memory, self._fixed, self._tried, self._v, 1)
 
-    def __call__(self, law: Records, memory: Records, reference: Array) -> None:
+    def __call__(self, law: Records, memory: Records, reference: Records) -> None:
         """One period."""
         self._observe(law, memory, reference)
         found = self._plan(law, memory, reference, self._fixed, self._tried, self._vectors)
@@ -67,7 +68,7 @@ class PredictiveCycle:
         self._respond(law, memory)
 
     def on(
-        self, law: Records, memory: Records, reference: Array, event: int, sense_status: int, node_events: int,
+        self, law: Records, memory: Records, reference: Records, event: int, sense_status: int, node_events: int,
         overrun: int, count_1: int, count_2: int, count_3: int,
     ) -> tuple[int, int, int, int]:  # fmt: skip
         """One period with its input handed in, as ``cycle.cycle_on``: mode and drive counts."""
@@ -117,7 +118,7 @@ def _solver(problem: Problem, numbers: np.void) -> Any:
 
 
 @njit(cache=True, error_model="numpy")
-def plan(law_array: Records, memory_array: Records, reference: Array, fixed: Any, tried: Any, vectors: Any) -> int:
+def plan(law_array: Records, memory_array: Records, reference: Records, fixed: Any, tried: Any, vectors: Any) -> int:
     """The plan without limits, which is adopted if it keeps them, else the vectors of the problem of this tick:
     ``predictive.FREE`` or ``LIMITED``, or ``NO_PLAN`` with an open loop or where the links do not reach.
     """

@@ -15,8 +15,8 @@ from pkxyz_ctrl.loop.controller import Controller
 _POLL_US = 1000
 _UNPOLLED_MOST_US = 20_000  # of a start-up in which frame after frame comes, none of them the one that is waited for
 
-Reference = Callable[[int], NDArray[np.float64]]
-"""Rows of the trajectory for the tick of an index; it sets ``reference_base`` when it hands out another block."""
+Reference = Callable[[int], NDArray[np.void]]
+"""Rows of ``REFERENCE`` for the tick of an index."""
 
 
 class Clock(Protocol):

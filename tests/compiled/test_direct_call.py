@@ -7,6 +7,7 @@ from numba import njit
 from hil.runs.scenario import load_scenario
 from pkxyz_ctrl.compiled.direct_call import direct
 from pkxyz_ctrl.loop.controller import Controller
+from pkxyz_ctrl.loop.reference import REFERENCE
 
 ROW = np.dtype([("a", "f8"), ("n", "i4", (3,))], align=True)
 
@@ -31,19 +32,18 @@ def test_a_direct_call_does_what_the_kernel_does(kernel) -> None:
 @pytest.mark.parametrize(
     ("reference", "words"),
     [
-        (np.zeros((20, 18))[:, ::2], "follow one another"),
-        (np.asfortranarray(np.zeros((20, 9))), "follow one another"),
-        (np.zeros((20, 9), np.float32), "float64"),
-        (np.zeros((20, 8)), "float64"),
-        (np.zeros(9), "float64"),
-        (np.zeros((0, 9)), "n > 0"),
+        (np.zeros(20, REFERENCE)[::2], "follow one another"),
+        (np.zeros((20, 9)), "REFERENCE"),
+        (np.zeros(20, np.dtype(REFERENCE.descr[1:])), "REFERENCE"),
+        (np.zeros((2, 10), REFERENCE), "REFERENCE"),
+        (np.zeros(0, REFERENCE), "n > 0"),
     ],
-    ids=["every other", "columns first", "float32", "eight columns", "one row", "none"],
+    ids=["every other", "no record", "another record", "two dimensions", "none"],
 )
 def test_the_controller_refuses_a_reference_that_the_cycle_would_misread(reference: np.ndarray, words: str) -> None:
     setup = load_scenario("raster").setup()
     controller = Controller(setup.law, setup.bus, setup.gate, lambda frame: None)
     with pytest.raises(ValueError, match=words):
         controller.compute(reference, 0)
-    controller.compute(np.zeros((1, 9)), 0)
+    controller.compute(np.zeros(1, REFERENCE), 0)
     assert controller.memory["tick_index"][0] == 1

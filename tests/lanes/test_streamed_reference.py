@@ -11,6 +11,7 @@ from hil.lanes.blocks import PREVIEW_ROWS
 from hil.lanes.streamed_reference import BLOCK_ROWS, PIECE_ROWS, StreamedReference
 from hil.runs.scenario import load_scenario
 from pkxyz_ctrl.loop.cycle import new_memory
+from pkxyz_ctrl.loop.reference import reference_rows
 from pkxyz_ctrl.trajectory import Trajectory
 
 
@@ -22,7 +23,7 @@ def trajectory():
 def rows_seen(reference, memory):
     """The rows that the cycle would read in this tick."""
     rows = reference(0)
-    at = int(memory["reference_tick"][0] - memory["input"]["reference_base"][0])
+    at = int(memory["reference_tick"][0] - rows["tick"][0])
     assert 0 <= at <= len(rows) - PREVIEW_ROWS
     return rows[at : at + PREVIEW_ROWS].copy()
 
@@ -34,7 +35,7 @@ def test_every_tick_sees_its_rows(trajectory, data):
     period_us = data.draw(st.sampled_from([200, 333, 1000]))
     waits = set(data.draw(st.lists(st.integers(0, 3 * BLOCK_ROWS), max_size=5)))
     anew = set(data.draw(st.lists(st.integers(1, 3 * BLOCK_ROWS), max_size=2)))
-    whole = trajectory.sample(0, 3 * BLOCK_ROWS + PREVIEW_ROWS, period_us)
+    whole = reference_rows(trajectory.sample(0, 3 * BLOCK_ROWS + PREVIEW_ROWS, period_us))
     memory = new_memory()
     reference = StreamedReference(trajectory, period_us, memory)
     for tick in range(3 * BLOCK_ROWS):
@@ -54,7 +55,7 @@ def test_the_end_of_the_trajectory_stands_still(trajectory):
         memory["reference_tick"] = at
         last = rows_seen(reference, memory)
         reference.prepare()
-    assert (last == np.array([*trajectory.end_m, *np.zeros(6)])).all()
+    assert (last["motion"] == np.array([*trajectory.end_m, *np.zeros(6)])).all()
 
 
 def test_no_tick_samples_more_than_a_piece(trajectory, monkeypatch):

@@ -207,7 +207,7 @@ def test_node_events_and_numbers_that_are_none():
         assert row["mode"] == Mode.FAULT
         assert row["trips"] == trip
     c = in_the_middle()
-    c.reference[:] = np.nan
+    c.reference["motion"] = np.nan
     row = c.tick(noisy(counts_at(MIDDLE), 1))
     assert row["mode"] == Mode.FAULT
     assert row["trips"] & Trip.NOT_FINITE
@@ -394,7 +394,7 @@ def test_disable_opens_the_loop_at_once_and_enable_begins_at_rest():
 def test_voltages_never_change_faster_than_the_slew_limit_but_for_a_release():
     """A reference that jumps by 12 um asks for everything at once and gets 20 V a tick; a fault gets 160 V at once."""
     c = in_the_middle()
-    c.reference[:, 2] -= 12e-6
+    c.reference["motion"][:, 2] -= 12e-6
     last, steps = c.memory["tick"]["count"][0, 0].copy(), []
     for k in range(4):
         row = c.tick(noisy(counts_at(MIDDLE), k + 1))

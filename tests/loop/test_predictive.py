@@ -25,6 +25,7 @@ from pkxyz_ctrl.loop import cycle as cycling
 from pkxyz_ctrl.loop import predictive_cycle
 from pkxyz_ctrl.loop.predictive_cycle import PredictiveCycle
 from pkxyz_ctrl.loop.predictive_problem import FORCE_UNIT_N, STROKE_UNIT_M, Problem
+from pkxyz_ctrl.loop.reference import REFERENCE, reference_rows
 from pkxyz_ctrl.loop.row import ROW
 from pkxyz_ctrl.safety.modes import Mode
 from pkxyz_ctrl.safety.trips import Trip
@@ -117,7 +118,7 @@ def test_one_tick_of_it_asks_for_what_lqg_asks_for():
     """
     run = setup()
     plant, memory = run.new_plant(), cycling.new_memory(Mode.IDLE)
-    reference = run.trajectory.sample(0, run.ticks + 25, 200)
+    reference = reference_rows(run.trajectory.sample(0, run.ticks + 25, 200))
     rows, numbers = np.zeros(2000, ROW), law()["tick"][0]
     filter_, feedback = numbers["estimator"], numbers["feedback"]
     gains = np.hstack([feedback["position_gain_n_per_m"], feedback["velocity_gain_n_s_per_m"]])
@@ -204,7 +205,7 @@ def test_rehearsals_change_no_bit(monkeypatch):
 
 def test_where_the_links_do_not_reach_there_is_no_plan():
     """An estimate out of this world: no square root of a negative number, no plan."""
-    period, memory, reference = PredictiveCycle(law()), cycling.new_memory(Mode.TRACKING), np.zeros((4, 9))
+    period, memory, reference = PredictiveCycle(law()), cycling.new_memory(Mode.TRACKING), np.zeros(4, REFERENCE)
     for far_m in (0.0, 1e-3):
         memory["tick"]["estimate"]["ahead"][0, 2] = far_m - law()["tick"][0]["estimator"]["operating_point_m"][2]
         found = predictive_cycle.plan(law(), memory, reference, period._fixed, period._tried, period._vectors)
@@ -227,7 +228,7 @@ def test_solutions_are_osqps_to_many_digits():
 
     period._solve = types.MethodType(keep, period)
     plant, memory = run.new_plant(), cycling.new_memory(Mode.IDLE)
-    rows, reference = np.zeros(run.ticks, ROW), run.trajectory.sample(0, run.ticks + 25, 200)
+    rows, reference = np.zeros(run.ticks, ROW), reference_rows(run.trajectory.sample(0, run.ticks + 25, 200))
     at_us = 200 * np.arange(run.ticks, dtype=np.int64)
     run_block_in_steps(period, run.law, memory, reference, plant.params, plant.state, at_us, rows, run.ticks)
     assert len(problems) > 30
@@ -284,5 +285,5 @@ def test_every_horizon_fits(horizon):
     assert matrix.shape == (9 * horizon - 3, 3 * horizon + 1)
     assert np.linalg.eigvalsh(problem.hessian)[0] > 0.0
     period, memory = PredictiveCycle(record), cycling.new_memory(Mode.IDLE)
-    period(record, memory, np.zeros((4, 9)))
+    period(record, memory, np.zeros(4, REFERENCE))
     assert memory["mode"][0] == Mode.HOMING

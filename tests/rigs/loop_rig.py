@@ -17,6 +17,7 @@ from pkxyz_ctrl.config.files import load, plain
 from pkxyz_ctrl.core import tick
 from pkxyz_ctrl.design.law import design_law
 from pkxyz_ctrl.loop import cycle as cycling
+from pkxyz_ctrl.loop.reference import reference_rows
 from pkxyz_ctrl.loop.row import ROW
 from pkxyz_ctrl.safety.modes import Event, Mode
 from pkxyz_ctrl.stage import Stage
@@ -82,7 +83,8 @@ class Cycle:
     def __init__(self, law_array: NDArray[np.void], reference: Array | None = None, mode: Mode = Mode.IDLE) -> None:
         self.law = law_array
         self.memory = cycling.new_memory(mode)
-        self.reference = np.zeros((16, 9)) if reference is None else reference
+        """``reference`` (n, 9)"""
+        self.reference = reference_rows(np.zeros((16, 9)) if reference is None else reference)
 
     def tick(
         self,
@@ -99,7 +101,7 @@ class Cycle:
         seen = self.memory["input"]
         seen["sense_count"], seen["sense_status"], seen["event"] = counts, status, int(event)
         seen["trips"], seen["node_events"], seen["overrun"] = trips, node_events, overrun
-        seen["reference_base"] = base
+        self.reference["tick"] = base + np.arange(len(self.reference))
         cycling.cycle(self.law, self.memory, self.reference)
         row: np.void = self.memory["row"].copy()[0]
         return row

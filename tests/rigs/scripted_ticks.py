@@ -8,6 +8,7 @@ from loop_rig import MIDDLE, Cycle, Rows, bus, controller_with, counts_at, law, 
 from hil.lanes.fast import run_block
 from pkxyz_ctrl.design.law import design_law
 from pkxyz_ctrl.loop.cycle import new_memory
+from pkxyz_ctrl.loop.reference import reference_rows
 from pkxyz_ctrl.loop.row import ROW
 from pkxyz_ctrl.safety.modes import Event, Mode
 from pkxyz_ctrl.trajectory import Move, Trajectory
@@ -38,7 +39,7 @@ def from_rest() -> Rows:
     limits = {"velocity_max_m_per_s": 1e-3, "acceleration_max_m_per_s2": 1.0, "jerk_max_m_per_s3": 1000.0}
     move = Move.model_validate({"kind": "move", "to_m": (0.2e-6, -0.1e-6, 4e-6), **limits})
     plant, memory, rows = setup().new_plant(), new_memory(Mode.IDLE), np.zeros(80, ROW)
-    reference, sample_us = Trajectory([move]).sample(0, 90, 200), np.arange(80, dtype=np.int64) * 200
+    reference, sample_us = reference_rows(Trajectory([move]).sample(0, 90, 200)), np.arange(80, dtype=np.int64) * 200
     run_block(brief, memory, reference, plant.params, plant.state, sample_us, rows, 80)
     return rows
 

@@ -11,6 +11,7 @@ from hil.lanes.fast import run_block
 from hil.lanes.setup import Setup
 from hil.runs.scenario import load_scenario
 from pkxyz_ctrl.loop.cycle import new_memory
+from pkxyz_ctrl.loop.reference import reference_rows
 from pkxyz_ctrl.loop.row import ROW
 from pkxyz_ctrl.safety.modes import Mode
 from sim.plant import Plant
@@ -24,7 +25,7 @@ class ClosedLoop:
     """The first ``SCAN_S`` of the default scenario's scan, sampled every period exactly."""
 
     setup: Setup
-    reference: NDArray[np.float64]
+    reference: NDArray[np.void]
     """rows (n, 9) of the whole trajectory"""
     memory: NDArray[np.void]
     """(1,) of ``cycle.MEMORY`` before the first tick; a copy of it is what a replay works on"""
@@ -47,7 +48,7 @@ def scan() -> ClosedLoop:
     period_us = setup.bus.period_us
     begins_us = min(s.scan_us[0] for s in setup.trajectory.segments if s.scan_us)
     count = round(SCAN_S * 1e6 / period_us)
-    reference = setup.trajectory.sample(0, setup.ticks + PREVIEW_ROWS, period_us)
+    reference = reference_rows(setup.trajectory.sample(0, setup.ticks + PREVIEW_ROWS, period_us))
     law, plant, memory = setup.law, setup.new_plant(), new_memory(Mode.IDLE)
     rows = np.zeros(1, ROW)
 

@@ -11,6 +11,7 @@ from hil.lanes.setup import Setup
 from pkxyz_ctrl.can import cob_id
 from pkxyz_ctrl.can.frame import Frame
 from pkxyz_ctrl.loop.controller import Controller
+from pkxyz_ctrl.loop.reference import reference_rows
 from pkxyz_ctrl.loop.runtime import run, start
 
 Stamped = tuple[Frame, int]
@@ -105,7 +106,7 @@ class Played:
         self.setup = setup
         self.port = port
         self.controller = Controller(setup.law, setup.bus, setup.gate, port.send)
-        self._reference = setup.trajectory.sample(0, setup.ticks + PREVIEW_ROWS, setup.bus.period_us)
+        self._reference = reference_rows(setup.trajectory.sample(0, setup.ticks + PREVIEW_ROWS, setup.bus.period_us))
         start(port, port, self.controller)
 
     def run(self) -> None:
