@@ -136,7 +136,7 @@ def test_options_say_one_thing():
     [
         (lambda cosine: cosine[0].__setitem__(0, 1e-3), "1 mm"),
         (lambda cosine: cosine[2].__setitem__(2, 13e-6), "a stroke"),
-        (lambda cosine: cosine[-1].__setitem__(1, 6e-6), "the slew of a voltage: 6 um at 400 Hz"),
+        (lambda cosine: cosine[-1].__setitem__(0, 9e-6), "a stroke, at 400 Hz"),
     ],
 )
 def test_a_correction_that_the_stage_cannot_follow_is_refused_before_anything_moves(learnt, tmp_path, changed, why):
