@@ -94,8 +94,7 @@ class Injection:
 
     def _look(self) -> tuple[float, float, float]:
         """Voltages at the combs now."""
-        self._plant.advance_to(self._clock.now_us)
-        self._plant.settle()
+        self._plant.look(self._clock.now_us)
         a, b, c = self._plant.plant.voltage_v.tolist()
         return a, b, c
 

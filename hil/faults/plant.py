@@ -43,15 +43,24 @@ class FaultyPlant(PlantOnBus):
         super().drive(self._through_amplifier(counts) if self._on else counts)
 
     def sample(self) -> Counts:
-        """Sample the sense combs now; here time passes for the faults."""
-        origin_us = self._now_us if self._origin_us is None else self._origin_us
+        """Sample the sense combs now; here and in ``look`` time passes for the faults."""
+        self._pass_time(self._now_us if self._origin_us is None else self._origin_us)
+        counts = super().sample()
+        return self._through_sense(counts) if self._on else counts
+
+    def look(self, t_us: int) -> None:
+        """Without a sample, too, time passes for the faults."""
+        self.advance_to(t_us)
+        if self._origin_us is not None:
+            self._pass_time(self._origin_us)
+        super().look(t_us)
+
+    def _pass_time(self, origin_us: int) -> None:
         self._t_us = self._now_us - origin_us
         if self._t_us >= self._change_us:
             self._change()
         if self._on:
             super().drive(self._through_amplifier(self._commanded))
-        counts = super().sample()
-        return self._through_sense(counts) if self._on else counts
 
     def _change(self) -> None:
         """Faults begin or end with this sample."""

@@ -162,11 +162,15 @@ class _Recorder:
         self._rows = blocks.rows.view(np.uint8).data
         self._row = rig.controller.row[:_TRUTH_AT]
         self._truth = rig.plant.exchange.view(np.uint8).data[:TRUTH_BYTES]
+        self._plant, self._clock = rig.plant, rig.clock
         self._at = 0
 
     def __call__(self, tick: int) -> None:
         rows, at = self._rows, self._at
         truth_at, end = at + _TRUTH_AT, at + _ROW_BYTES
+        if not self._plant.was_sampled:  # a node that is not operational does not sample; what is true goes on
+            self._plant.look(self._clock.now_us)
+        self._plant.was_sampled = False
         rows[at:truth_at] = self._row
         rows[truth_at:end] = self._truth
         self._at = end  # last: a row counts once it is whole

@@ -62,11 +62,15 @@ class Setup:
     def gate(self) -> GateConfig:
         """What the transmit gate holds frames to: the same limits, handed over as numbers of counts."""
         assert self.bus.can is not None
-        driver = self.bus.can.driver
+        driver, period_us = self.bus.can.driver, self.bus.period_us
+        latest_us = self.bus.can.sense_deadline_us + self.bus.can.compute_us
         return GateConfig(
             count_max=count_max(Stage(self.stage), self.controller, self.bus),
             count_slew_max=slew_counts(self.controller, self.bus),
-            period_us=self.bus.period_us,
+            period_us=period_us,
+            spacing_min_us=min(
+                period_us // 2, period_us - latest_us
+            ),  # behind a tick that waited for its frame in vain
             node_id=driver.node_id,
             controller_node_id=driver.controller_node_id,
             protection=driver.protection,

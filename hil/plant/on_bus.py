@@ -60,6 +60,7 @@ class PlantOnBus:
         self.exchange = np.zeros(1, EXCHANGE)
         self._counts: Sequence[int] = (0, 0, 0)
         self._is_driven = False  # the counts wait to be applied, and the time to pass
+        self.was_sampled = False  # since somebody last set it to False
         self._origin_us: int | None = None
         self._plant_us = plant.t_us
         self._now_us = 0
@@ -91,7 +92,14 @@ class PlantOnBus:
         )
         self._plant_us = target_us
         self._is_driven = False
+        self.was_sampled = True
         return counts
+
+    def look(self, t_us: int) -> None:
+        """It is ``t_us``, and no sample brings the truth in ``exchange`` to it: bring it there."""
+        self.advance_to(t_us)
+        self.settle()
+        observe(self._params[0], self._state[0], self.exchange[0])
 
     def settle(self) -> None:
         """Carry out what waits: move the plant to now, and apply the counts that came without a sample after them."""

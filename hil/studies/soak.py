@@ -19,10 +19,12 @@ from numpy.typing import NDArray
 from hil.faults.fault import Fault, parse
 from hil.lanes.blocks import Blocks
 from hil.lanes.lockstep import LockstepRig
+from hil.lanes.setup import Setup
 from hil.recording.recording import Recording, RecordingWriter
 from hil.runs.scenario import load_scenario
-from hil.studies.faults.matrix import CASES
-from pkxyz_ctrl.safety.modes import Mode
+from hil.studies.faults.matrix import CASES, NODE_MS
+from hil.studies.faults.outcome import DISCHARGED_V, RISE_V, largest_rise_v, largest_step_v
+from pkxyz_ctrl.safety.modes import MAY_ENERGISE, Mode
 from pkxyz_ctrl.safety.trips import Trip
 
 SCENARIO = "faults"
@@ -51,8 +53,13 @@ class Soaked:
     """how often it was tracking again after a fault decision"""
     reasons: dict[str, int] = field(default_factory=dict)
     voltage_max_v: float = 0.0
+    """of combs that do what the node tells them; so are the next three"""
     slew_max_v: float = 0.0
-    """most that a comb's voltage rose in a tick; releases fall at once"""
+    """most that a comb's voltage changed in a tick, releases to 0 V excepted"""
+    rise_max_v: float = 0.0
+    """most that it rose in a tick while no voltage was allowed"""
+    zero_ticks: int = 0
+    """longest that a comb was above 0 V after the end of a mode with voltages"""
     damaged: bool = False
     """fingers snapped or the mechanism broken"""
     memory_mb: list[float] = field(default_factory=list)
@@ -114,7 +121,7 @@ def soak(
         soaked.faults = sum(f.at_us < blocks.done * setup.bus.period_us for f in setup.faults)
     log.close()
     soaked.realtime_factor = blocks.done * setup.bus.period_s / (time.perf_counter() - begin_s)
-    _judge(soaked, setup.controller.limits.voltage_max_v, setup.controller.limits.slew_max_v_per_s * setup.bus.period_s)
+    _judge(soaked, setup)
     return soaked
 
 
@@ -126,8 +133,7 @@ class _Log:
         self._reasons: Counter[str] = Counter()
         self._writer: RecordingWriter | None = None
         self._last_mode = int(Mode.IDLE)
-        self._last_v: NDArray[np.float64] = np.zeros(3)
-        self._was_faulted = False
+        self._voltages = _Voltages(soaked, rig.setup)
         self._parts = 0
 
     def take(self, rows: NDArray[np.void]) -> None:
@@ -170,26 +176,77 @@ class _Log:
         soaked.decisions += len(entered)
         soaked.returns += int(np.count_nonzero((mode[1:] == Mode.TRACKING) & (mode[:-1] == Mode.ENABLED)))
         soaked.reasons = dict(self._reasons.most_common())
-        volts = np.concatenate([[self._last_v], rows["comb_voltage_v"]])
-        soaked.voltage_max_v = max(soaked.voltage_max_v, float(volts.max()))
-        soaked.slew_max_v = max(soaked.slew_max_v, float(np.diff(volts, axis=0).max()))
+        self._voltages.look_at(rows)
         state = self._rig.plant.plant.state[0]
         soaked.damaged = soaked.damaged or bool(state["broken"] or state["held"].any())
         self._rig.controller.faults.clear()  # counted; the words of a thousand faults are of no use
-        self._last_mode, self._last_v = int(mode[-1]), volts[-1].copy()
+        self._last_mode = int(mode[-1])
 
 
-def _judge(soaked: Soaked, voltage_max_v: float, step_max_v: float) -> None:
-    problems = soaked.problems
+class _Voltages:
+    """Holds the combs' voltages to what is allowed, block by block. A comb whose amplifier channel does not obey is not
+    asked, from the beginning of that fault to a few ticks after it.
+    """
+
+    _AFTER = 4  # ticks: the rest of a release that a fault has held up
+
+    def __init__(self, soaked: Soaked, setup: Setup) -> None:
+        self._soaked = soaked
+        self._period_us = setup.bus.period_us
+        self._disobedient = [f for f in setup.faults if f.family == "amplifier" and f.kind != "trip"]
+        self._volts: NDArray[np.float64] = np.zeros((3, 3))  # the last ticks of the block before
+        self._obeys: NDArray[np.bool_] = np.ones((3, 3), bool)
+        self._forbidden: NDArray[np.bool_] = np.ones(3, bool)
+        self._forbidden_for = 3
+        self._skipped = 0  # ticks that the controller missed: the bus has gone on meanwhile
+
+    def look_at(self, rows: NDArray[np.void]) -> None:
+        """Take the next rows of the run."""
+        soaked = self._soaked
+        volts = np.concatenate([self._volts, rows["comb_voltage_v"]])
+        skipped = self._skipped + np.cumsum(rows["overrun"])
+        self._skipped = int(skipped[-1])
+        obeys = np.concatenate([self._obeys, self._obedience(rows["tick"] + skipped)])
+        forbidden = np.concatenate([self._forbidden, MAY_ENERGISE[rows["mode"]] == 0])
+        soaked.voltage_max_v = max(soaked.voltage_max_v, float(volts[obeys].max(initial=0.0)))
+        for comb in range(3):
+            asked = volts[:, comb : comb + 1].copy()
+            asked[~obeys[:, comb]] = np.nan  # and so are the steps to and from there: none
+            soaked.slew_max_v = max(soaked.slew_max_v, largest_step_v(asked[:-1], asked[-1]))
+            soaked.rise_max_v = max(soaked.rise_max_v, largest_rise_v(asked, forbidden))
+        for k in range(3, len(forbidden)):
+            self._forbidden_for = self._forbidden_for + 1 if forbidden[k] else 0
+            if self._forbidden_for > soaked.zero_ticks and (volts[k][obeys[k]] >= DISCHARGED_V).any():
+                soaked.zero_ticks = self._forbidden_for
+        self._volts, self._obeys, self._forbidden = volts[-3:].copy(), obeys[-3:], forbidden[-3:]
+
+    def _obedience(self, ticks: NDArray[np.int64]) -> NDArray[np.bool_]:
+        """(n, 3), for ticks of the bus's time."""
+        obeys = np.ones((len(ticks), 3), bool)
+        t_us = ticks * self._period_us
+        for fault in self._disobedient:
+            end_us = (fault.end_us or 0) + self._AFTER * self._period_us
+            if fault.at_us <= t_us[-1] and end_us >= t_us[0]:
+                obeys[(fault.at_us - self._period_us <= t_us) & (t_us <= end_us), fault.channel] = False
+        return obeys
+
+
+def _judge(soaked: Soaked, setup: Setup) -> None:
+    problems, limits = soaked.problems, setup.controller.limits
+    voltage_max_v, step_max_v = limits.voltage_max_v, limits.slew_max_v_per_s * setup.bus.period_s
+    zero_ticks_max = round(NODE_MS * 1e3 / setup.bus.period_us) + 1
     if soaked.recorded_ticks != soaked.ticks:
         problems.append(f"{soaked.recorded_ticks} ticks recorded of {soaked.ticks}")
     if soaked.damaged:
         problems.append("the stage is damaged")
-    offsets_v = 31.0  # what an amplifier with an offset of 30 V adds by itself
-    if soaked.voltage_max_v > voltage_max_v + offsets_v:
+    if soaked.voltage_max_v > voltage_max_v * (1 + 1e-9):
         problems.append(f"{soaked.voltage_max_v:.1f} V at a comb")
-    if soaked.slew_max_v > step_max_v + offsets_v:
-        problems.append(f"a comb's voltage rose by {soaked.slew_max_v:.1f} V in a tick")
+    if soaked.slew_max_v > step_max_v * (1 + 1e-3):
+        problems.append(f"a comb's voltage changed by {soaked.slew_max_v:.1f} V in a tick")
+    if soaked.rise_max_v > RISE_V:
+        problems.append(f"a comb's voltage rose by {soaked.rise_max_v:.1f} V while none was allowed")
+    if soaked.zero_ticks > zero_ticks_max:
+        problems.append(f"a voltage {soaked.zero_ticks} ticks after the end of a mode with voltages")
     if soaked.decisions == 0 or soaked.returns == 0:
         problems.append("no fault was decided, or none recovered from")
     if len(soaked.memory_mb) > 4:

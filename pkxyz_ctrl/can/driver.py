@@ -41,6 +41,8 @@ class DriverState(Enum):
     STARTING = auto()
     OPERATIONAL = auto()
     FAILED = auto()
+    RELEASING = auto()
+    RELEASED = auto()
 
 
 class AmplifierDriver:
@@ -132,6 +134,19 @@ class AmplifierDriver:
         self.state = DriverState.OFF
         return self.drive((0, 0, 0), t_us), self._nmt(NmtCommand.PRE_OPERATIONAL)
 
+    def release(self, t_us: int) -> Frames:
+        """What takes the node out of operational, where its outputs are at 0 V without any SYNC: to be sent again and
+        again while nobody may want a voltage, until a heartbeat of the node's own says that it has left (RELEASED).
+
+        Until then ours is not sent, so that a node that can't be told goes to 0 V by its consumer, too. ``start``
+        begins anew.
+        """
+        if self.state is DriverState.RELEASED:
+            return _NOTHING
+        self._fall_silent()
+        self.state = DriverState.RELEASING
+        return (self._nmt(NmtCommand.PRE_OPERATIONAL),)
+
     def acknowledge(self) -> None:
         """Takes note of the emergencies: clears NODE_EMERGENCY, keeps the list."""
         self.node_events &= ~NODE_EMERGENCY
@@ -195,6 +210,9 @@ class AmplifierDriver:
             return _NOTHING
         node_state = data[0] & 0x7F  # bit 7 is the toggle bit of node guarding
         self.node_state = node_state
+        if self.state in (DriverState.RELEASING, DriverState.RELEASED):
+            self._on_heartbeat_after_release(node_state, t_us)
+            return _NOTHING
         if node_state == NmtState.BOOT_UP:
             return self._on_boot_up(t_us)
         if self.state is DriverState.STARTING and node_state == NmtState.OPERATIONAL:
@@ -210,6 +228,14 @@ class AmplifierDriver:
                     f"{_state_name(node_state)}; look at its emergencies, then start it again"
                 )
         return _NOTHING
+
+    def _on_heartbeat_after_release(self, node_state: int, t_us: int) -> None:
+        if node_state == NmtState.OPERATIONAL:  # not yet, or somebody has started it again
+            self._fall_silent()
+            self.state = DriverState.RELEASING
+        elif self.state is DriverState.RELEASING:
+            self.state = DriverState.RELEASED
+            self._heartbeat_next_us = t_us
 
     def _keep_away(self) -> None:
         """A tick has room for one heartbeat: where ours would meet one of the node's, it goes out a little earlier."""

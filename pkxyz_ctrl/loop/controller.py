@@ -22,7 +22,7 @@ from pkxyz_ctrl.safety.trips import Trip, explain
 
 Send = Callable[[Frame], object]
 
-_IDLE = int(Mode.IDLE)
+_IDLE, _FAULT = int(Mode.IDLE), int(Mode.FAULT)
 
 
 class StartUpError(RuntimeError):
@@ -121,11 +121,16 @@ class Controller:
     # -- one tick ---------------------------------------------------------------------------------------------------
 
     def begin(self, t_us: int) -> None:
-        """The tick begins: SYNC, on which the amplifier applies the last voltages and samples."""
+        """The tick begins: SYNC, on which the amplifier applies the last voltages and samples. In FAULT the node is
+        taken out of operational besides.
+        """
         if self.mode < _IDLE:
             self._go_on_starting(t_us)
         self._begun_us = t_us
         self.send(self.driver.sync(t_us), t_us)
+        if self.mode == _FAULT:  # 0 V in a drive frame acts at a SYNC only
+            for frame in self.driver.release(t_us):
+                self.send(frame, t_us)
 
     def receive(self, frame: Frame, t_us: int) -> bool:
         """Take a frame from the bus; True once this tick's sense values are there."""

@@ -195,6 +195,49 @@ frames = st.builds(
 )
 
 
+# -- release ----------------------------------------------------------------------------------------------------------
+
+
+def test_a_release_is_repeated_until_the_node_says_that_it_has_left_operational():
+    driver = started()
+    assert text(driver.release(100)) == [PRE_OP]
+    assert text(driver.release(300)) == [PRE_OP]
+    assert driver.state is DriverState.RELEASING
+    driver.receive(heartbeat(OPERATIONAL), 400)  # from before
+    assert text(driver.release(500)) == [PRE_OP]
+    assert driver.heartbeat_due(10**9) is None  # the node's consumer is to miss us
+    driver.receive(heartbeat(PRE_OPERATIONAL), 600)
+    assert driver.state is DriverState.RELEASED
+    assert driver.release(700) == ()
+    assert text((driver.heartbeat_due(700),)) == [OUR_HEARTBEAT]
+    driver.heartbeat_sent(700)
+    assert driver.heartbeat_due(20_599) is None
+    assert driver.heartbeat_due(20_600) is not None
+    assert (driver.failure, driver.node_events) == ("", 0)  # all this is as it should be
+
+
+@pytest.mark.parametrize("left", [PRE_OPERATIONAL, STOPPED, BOOT_UP])
+def test_whatever_leaves_operational_ends_the_release_and_a_node_that_is_started_again_begins_it_anew(left):
+    driver = started()
+    driver.release(0)
+    driver.receive(heartbeat(left), 100)
+    assert driver.release(200) == ()
+    driver.receive(heartbeat(OPERATIONAL), 300)  # somebody else did that
+    assert text(driver.release(400)) == [PRE_OP]
+    assert driver.heartbeat_due(10**9) is None
+
+
+def test_a_release_ends_a_start_up_and_a_start_begins_anew():
+    driver = AmplifierDriver(DriverConfig())
+    driver.start(0)
+    driver.receive(heartbeat(BOOT_UP), 100)
+    assert text(driver.release(200)) == [PRE_OP]
+    assert driver.receive(frame("58a 43 00 10 00 91 01 0c 00"), 300) == ()  # an answer that is not waited for
+    assert driver.poll(10**9) == ()
+    assert text(driver.start(400)) == ["000 81 0a"]
+    assert driver.state is DriverState.RESETTING
+
+
 @settings(max_examples=150, deadline=None)
 @given(st.lists(st.tuples(frames, st.integers(0, 300_000)), max_size=40), st.booleans())
 def test_no_frame_whatsoever_upsets_the_driver(traffic, from_operational):

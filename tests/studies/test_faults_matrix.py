@@ -1,5 +1,6 @@
 """Every fault of the matrix under the default law: noticed in time, by its cause, within limits, and recovered from."""
 
+import dataclasses
 from functools import cache
 
 import numpy as np
@@ -7,10 +8,16 @@ import pytest
 from loop_rig import first_difference, rows_of
 
 from hil.faults.catalogue import KINDS
+from hil.faults.fault import parse
+from hil.lanes.blocks import Blocks
+from hil.lanes.lockstep import LockstepRig
+from hil.runs.scenario import load_scenario
 from hil.studies.faults.matrix import CASES, CLEAR_S, ONSET_S
-from hil.studies.faults.outcome import run_case, setup_for
+from hil.studies.faults.outcome import largest_rise_v, largest_step_v, run_case, setup_for
+from pkxyz_ctrl.config.bus import BusConfig
+from pkxyz_ctrl.config.files import CONFIG_DIR, load, names
 from pkxyz_ctrl.loop.controller import StartUpError
-from pkxyz_ctrl.safety.modes import LOOP_CLOSED, Mode
+from pkxyz_ctrl.safety.modes import LOOP_CLOSED, MAY_ENERGISE, Mode
 from pkxyz_ctrl.safety.monitors import default_limits
 from pkxyz_ctrl.safety.trips import Trip
 
@@ -21,10 +28,6 @@ def scan():
 
 
 def with_faults(text, **changes):
-    import dataclasses
-
-    from hil.faults.fault import parse
-
     run = dataclasses.replace(scan(), faults=tuple(parse(t) for t in text.split()), **changes)
     vars(run)["law"] = scan().law
     return run
@@ -35,6 +38,93 @@ def test_without_a_fault_the_scan_is_clean():
     assert result.faults == ()
     assert result.missed_ticks == 0
     assert rows["mode"][-1] == Mode.TRACKING
+
+
+OTHER_BUSES = ("classic_2k", "socketcan_classic", "socketcan_fd", "unix_1k", "unix_2k")
+
+
+def test_every_bus_file_with_frames_is_among_those_that_are_broken():
+    with_frames = {name for name in names("buses") if load("buses", name, BusConfig).can is not None}
+    assert with_frames == {"fd_5k", *OTHER_BUSES}
+
+
+@pytest.mark.parametrize("lasting", [False, True], ids=["ends", "lasts"])
+@pytest.mark.parametrize("bus", OTHER_BUSES)
+def test_every_fault_is_survived_on_every_bus(bus, lasting):
+    setup = setup_for("lqg", bus=bus)
+    problems = {}
+    for case in CASES:
+        outcome = run_case("lqg", setup, case.lasting if lasting else case)
+        assert 135.0 < outcome.voltage_max_v < 175.0
+        if outcome.problems:
+            problems[case.text] = outcome.problems
+    assert problems == {}
+
+
+@pytest.mark.parametrize("case", CASES, ids=[case.text for case in CASES])
+def test_a_fault_that_never_ends_leaves_0_v_to_the_end_of_the_run(case):
+    outcome = run_case("lqg", scan(), case.lasting)
+    assert outcome.problems == ()
+    assert outcome.ticks is not None or case.may_go_on or case.text == "controller:killed"
+
+
+@pytest.mark.parametrize("bus", ["fd_5k", *OTHER_BUSES])
+def test_a_fault_decision_needs_no_sync_to_reach_0_v(bus):
+    """133 V stayed at all combs for good: 0 V in a drive frame acts at a SYNC, and none came any more."""
+    case = next(case for case in CASES if case.text == "bus.sync:drop").lasting
+    outcome = run_case("lqg", setup_for("lqg", bus=bus), case)
+    assert outcome.problems == ()
+    period_ms = load("buses", bus, BusConfig).period_us * 1e-3
+    assert outcome.zero_ms == period_ms  # the tick behind the decision, which begins with NMT pre-operational
+
+
+def fast_move(tmp_path, texts, seed):
+    """The default raster, its first move as fast as the combs can make it."""
+    text = (CONFIG_DIR / "scenarios" / "raster.toml").read_text(encoding="utf-8")
+    for slow, fast in (("= 0.5e-3", "= 3e-3"), ("_s2 = 0.05", "_s2 = 3.0"), ("_s3 = 10.0", "_s3 = 2e4")):
+        text = text.replace(slow, fast, 1)
+    file = tmp_path / "fast.toml"
+    file.write_text(text, encoding="utf-8")
+    setup = load_scenario(file, seed=seed, faults=[parse(t) for t in texts]).setup()
+    return dataclasses.replace(setup, duration_s=0.12)
+
+
+def voltages_of(setup):
+    """At the end of each tick, where none is allowed, and the largest that was asked for."""
+    rig, blocks = LockstepRig(setup), []
+    rig.injection.watched = []
+    rig.run(
+        Blocks(
+            setup.trajectory,
+            setup.bus.period_us,
+            setup.ticks,
+            lambda b: blocks.append(b.copy()),
+            lambda *_: None,
+        )
+    )
+    rows = np.concatenate(blocks)
+    return np.array(rig.injection.watched), MAY_ENERGISE[rows["mode"]] == 0, rows["voltage_v"].max()
+
+
+@pytest.mark.parametrize("lost_s", [0.0002, 0.0004, 0.0006, 0.0008, 0.001])
+def test_lost_syncs_make_no_step_of_what_was_sent_meanwhile(tmp_path, lost_s):
+    """A comb stepped by 33.7 V where 20 are allowed, after four."""
+    volts, forbidden, asked = voltages_of(fast_move(tmp_path, [f"bus.sync:drop@0.0702+{lost_s}"], 1))
+    assert asked > 7.0  # in this time, and at 0.8 ms 33.7 V
+    assert largest_step_v(volts) < 20.0
+    assert largest_rise_v(volts, forbidden) == 0.0
+    assert not volts[-1].any()
+
+
+@pytest.mark.parametrize("seed", [12, 3])
+def test_no_comb_rises_after_the_decision_whatever_is_lost(tmp_path, seed):
+    """With seed 12, from 9.6 to 39.7 V: what waited at the node was applied at a SYNC that was not its own."""
+    volts, forbidden, asked = voltages_of(fast_move(tmp_path, ["bus:drop@0.0703+0.02,probability=0.4"], seed))
+    assert asked > 20.0
+    assert forbidden[-1]
+    assert largest_step_v(volts) < 20.0
+    assert largest_rise_v(volts, forbidden) == 0.0
+    assert not volts[-1].any()
 
 
 @pytest.mark.parametrize("case", CASES, ids=[case.text for case in CASES])
@@ -111,8 +201,6 @@ def test_a_controller_that_is_killed_leaves_0_v_at_the_node_within_the_time_of_i
 @pytest.mark.parametrize("protection", [True, False])
 def test_a_single_late_sense_frame_shifts_none_behind_it(protection):
     """One frame 70 us late, which is after its tick gave up: that tick has none, every other has its own sample."""
-    import dataclasses
-
     late = with_faults("bus.sense:delay@0.2+0.0002,delay_us=70")
     driver = late.bus.can.driver.model_copy(update={"protection": protection})
     changed = late.bus.model_copy(update={"can": late.bus.can.model_copy(update={"driver": driver})})

@@ -5,9 +5,12 @@ import pytest
 
 from hil.bus.endpoint import Endpoint
 from hil.faults.catalogue import KINDS
+from hil.faults.fault import parse
+from hil.node.amplifier import AmplifierNode
 from hil.node.drive import DriveReceiver
 from hil.recording.recording import Recording
 from hil.runs.scenario import load_scenario
+from hil.studies.faults.outcome import RISE_V
 from hil.studies.soak import random_faults, soak
 
 
@@ -25,7 +28,10 @@ def test_nothing_is_lost_and_nothing_breaks(soaked):
     assert found.decisions >= 4
     assert found.returns >= 4
     assert sum(found.reasons.values()) >= found.decisions
-    assert 100.0 < found.voltage_max_v < 231.0
+    assert 135.0 < found.voltage_max_v < 145.0  # the scan's own voltages, as without a fault
+    assert 0.9 < found.slew_max_v < 5.0
+    assert found.rise_max_v < RISE_V
+    assert 1 <= found.zero_ticks <= 106  # 20 ms where no frame reaches the node
     parts = sorted(folder.glob("*.parquet"))
     assert len(parts) == len(found.memory_mb) == 3
     for total, each in (
@@ -80,5 +86,40 @@ def test_no_voltage_of_before_follows_a_blocked_bus(tmp_path, monkeypatch, missi
         monkeypatch.setattr(DriveReceiver, "demand_zero", lambda self: None)
     found = soak(3.2, 1, "lqg", tmp_path)
     assert found.decisions >= 3
-    assert found.voltage_max_v > 100.0
-    assert found.slew_max_v < 31.0  # an amplifier's offset of 30 V is among the faults
+    assert found.problems == []
+    assert 135.0 < found.voltage_max_v < 145.0
+    assert 0.9 < found.slew_max_v < 5.0
+
+
+def steps_now_and_then(self, counts, t_us):
+    """25 V too much at comb 1, in one of 500 SYNCs."""
+    self.applied = getattr(self, "applied", 0) + 1
+    a, b, c = counts
+    applied_as_shipped(self, (a + 4096, b, c) if a and self.applied % 500 == 0 else counts, t_us)
+
+
+def exceeds(self, counts, t_us):
+    a, b, c = counts
+    applied_as_shipped(self, (40_000, b, c) if a > 20_000 else counts, t_us)
+
+
+def applied_as_shipped(self, counts, t_us):
+    self._drive.pending, self._silent_syncs, self.outputs = None, 0, counts
+    self._plant.drive(counts)
+
+
+@pytest.mark.parametrize(
+    ("part", "defect", "words"),
+    [
+        ("_apply", steps_now_and_then, "changed by 25"),
+        ("_apply", exceeds, "V at a comb"),
+        ("_outputs_to_error_value", lambda self: None, "ticks after the end of a mode with voltages"),
+    ],
+)
+def test_a_soak_sees_what_a_node_does_that_it_must_not(tmp_path, monkeypatch, part, defect, words):
+    """Its verdicts are no wider than the limits: each of these passed while an amplifier's offset was allowed for."""
+    monkeypatch.setattr(AmplifierNode, part, defect)
+    monkeypatch.setattr("hil.studies.soak.random_faults", lambda *_: (parse("bus.sync:drop@0.3"),))
+    monkeypatch.setattr("hil.studies.soak.CLEAR_S", 10.0)
+    found = soak(0.5, 1, "lqg", tmp_path)
+    assert any(words in problem for problem in found.problems), found.problems

@@ -11,13 +11,16 @@ from hil.lanes.blocks import Blocks
 from hil.lanes.lockstep import LockstepRig
 from hil.lanes.setup import Setup
 from hil.runs.scenario import load_scenario
-from hil.studies.faults.matrix import CLEAR_S, Case
+from hil.studies.faults.matrix import CLEAR_S, USUAL_PERIOD_US, Case
 from pkxyz_ctrl.loop.controller import StartUpError
-from pkxyz_ctrl.safety.modes import LOOP_CLOSED, Mode
+from pkxyz_ctrl.safety.modes import LOOP_CLOSED, MAY_ENERGISE, Mode
 from pkxyz_ctrl.safety.trips import Trip
 
 SCENARIO = "faults"
 DISCHARGED_V = 1.0
+RISE_V = 0.1
+"""Less than any step that was ever sent; offsets of some counts may come with the end of a fault."""
+_START_UP_TICKS = 150  # after a clear: an SDO exchange a tick, and 0 V for a while; a slow bus needs the longer for it
 _ZERO_TICKS = 2  # from the tick of the decision, whose frame acts at the next SYNC
 
 
@@ -33,7 +36,9 @@ class Outcome:
     """from the beginning of the fault to the decision; None: not noticed"""
     voltage_max_v: float
     slew_max_v: float
-    """most that the voltage of a comb that obeys changed in a tick, releases to 0 V excepted"""
+    """most that the voltage of a comb that obeys changed in a tick of the whole run, releases to 0 V excepted"""
+    rise_max_v: float
+    """most that the voltage of a comb that obeys rose in a tick while none was allowed"""
     zero_ms: float | None
     """from the decision, or from the end of the controller, to 0 V at all combs that obey; None: they stayed driven"""
     excursion_um: float
@@ -51,13 +56,19 @@ class Outcome:
         return not self.problems
 
 
-def setup_for(law: str, seed: int | None = None) -> Setup:
-    """The scan that is broken, under a law of ``configs/controllers`` or of a file. Raises ``ConfigError``."""
-    return load_scenario(SCENARIO, controller=law, seed=seed).setup()
+def setup_for(law: str, seed: int | None = None, bus: str | None = None) -> Setup:
+    """The scan that is broken, under a law of ``configs/controllers`` or of a file, on a bus.
+
+    Raises ``ConfigError``.
+    """
+    setup = load_scenario(SCENARIO, controller=law, seed=seed, bus=bus).setup()
+    slower_s = max(0.0, setup.bus.period_s - USUAL_PERIOD_US * 1e-6)
+    return dataclasses.replace(setup, duration_s=setup.duration_s + _START_UP_TICKS * slower_s)
 
 
 def run_case(law: str, setup: Setup, case: Case) -> Outcome:
     """Run one case in the lockstep lane and judge it."""
+    case = case.on(setup.bus.period_us)
     fault = case.fault
     run_setup = dataclasses.replace(setup, faults=(fault,), clear_s=CLEAR_S)
     vars(run_setup)["law"] = setup.law  # designed once
@@ -71,7 +82,7 @@ def run_case(law: str, setup: Setup, case: Case) -> Outcome:
                    lambda done, total: None)
         )  # fmt: skip
     except StartUpError as error:
-        return Outcome(law, case.text, (), None, 0.0, 0.0, 0.0, 0.0, (), None, (f"did not start: {error}",))
+        return Outcome(law, case.text, (), None, 0.0, 0.0, 0.0, 0.0, 0.0, (), None, (f"did not start: {error}",))
     return _judge(law, case, run_setup, rig, np.concatenate(blocks))
 
 
@@ -83,7 +94,8 @@ def _judge(law: str, case: Case, setup: Setup, rig: LockstepRig, rows: NDArray[n
     trips = Trip(int(rows["trips"][decision])) if decision is not None else Trip(0)
     assert rig.injection is not None
     voltage = np.array(rig.injection.watched)  # at the end of each tick
-    held = voltage[: len(rows) if decision is None else decision + 1]
+    obeying = voltage[:, list(case.obeys)]
+    forbidden = MAY_ENERGISE[rows["mode"][: len(voltage)]] == 0
     closed = np.flatnonzero(LOOP_CLOSED[rows["mode"][: len(rows) if decision is None else decision]])
     strokes = rows["stroke_m"][closed] - _strokes_of(setup, rows["reference_m"][closed])
     zero_ms = _zero_ms(case, rig, voltage, decision, period_us)
@@ -95,7 +107,8 @@ def _judge(law: str, case: Case, setup: Setup, rig: LockstepRig, rows: NDArray[n
         reason=tuple(str(t.name) for t in Trip if t & trips),
         ticks=None if decision is None else decision - onset,
         voltage_max_v=float(voltage.max()),
-        slew_max_v=_slew_v(held[:, list(case.obeys)]),
+        slew_max_v=largest_step_v(obeying),
+        rise_max_v=largest_rise_v(obeying, forbidden),
         zero_ms=zero_ms,
         excursion_um=float(np.abs(strokes).max()) * 1e6 if len(closed) else 0.0,
         events=tuple(sorted({e.kind for e in rig.plant.plant.events})),
@@ -103,7 +116,11 @@ def _judge(law: str, case: Case, setup: Setup, rig: LockstepRig, rows: NDArray[n
         problems=(),
     )
     return dataclasses.replace(
-        outcome, problems=tuple(_problems(case, setup, rows, outcome, onset, decision, released))
+        outcome,
+        problems=(
+            *_problems(case, setup, rows, outcome, onset, decision, released),
+            *_problems_of_releases(case, setup, obeying, forbidden),
+        ),
     )
 
 
@@ -121,18 +138,20 @@ def _problems(
             problems.append(f"a fault {onset - decision} ticks before anything was wrong")
         elif not case.reasons & Trip(int(rows["trips"][decision])):
             problems.append(f"latched {' and '.join(outcome.reason)}, which is not the cause")
-        ends = round(case.lasts_s * 1e6) // setup.bus.period_us
+        ends = 0 if case.lasts_s is None else round(case.lasts_s * 1e6) // setup.bus.period_us
         if decision - onset > case.within_ticks and not (case.may_go_on and decision - onset >= ends):
             problems.append(f"noticed after {decision - onset} ticks instead of {case.within_ticks}")
         problems += _problems_after(rows, decision)
-        if not outcome.recovered:
+        if not outcome.recovered and case.lasts_s is not None:
             problems.append("did not track again after the clear")
     if outcome.voltage_max_v > limits.voltage_max_v * (1 + 1e-9):
         problems.append(f"{outcome.voltage_max_v:.1f} V at a comb, beyond {limits.voltage_max_v:g} V")
     step_v = limits.slew_max_v_per_s * setup.bus.period_s
     if outcome.slew_max_v > step_v * (1 + 1e-3):
         problems.append(f"a step of {outcome.slew_max_v:.1f} V in a tick, beyond {step_v:g} V")
-    allowed_ms = case.discharged_within_ms or _ZERO_TICKS * setup.bus.period_us * 1e-3
+    if outcome.rise_max_v > RISE_V:
+        problems.append(f"a comb rose by {outcome.rise_max_v:.1f} V after the decision")
+    allowed_ms = _allowed_ms(case, setup)
     if released and (outcome.zero_ms is None or outcome.zero_ms > allowed_ms + 1e-9):
         after = "never" if outcome.zero_ms is None else f"{outcome.zero_ms:g} ms"
         problems.append(f"0 V after {after}, not within {allowed_ms:g} ms")
@@ -146,17 +165,55 @@ def _problems_after(rows: NDArray[np.void], decision: int) -> list[str]:
     cleared = np.flatnonzero(rows["mode"][decision:] != Mode.FAULT)
     until = decision + (int(cleared[0]) if len(cleared) else len(rows) - decision)
     problems = []
-    if rows["drive_count"][decision:until].any():
-        problems.append("a voltage was commanded after the decision")
+    if rows["drive_count"][MAY_ENERGISE[rows["mode"]] == 0].any():
+        problems.append("a voltage was commanded in a mode that allows none")
     if len(cleared) and rows["mode"][until] != Mode.BOOT:
         problems.append(f"left FAULT for {Mode(int(rows['mode'][until])).name} without a clear")
     return problems
 
 
-def _slew_v(voltage: NDArray[np.float64]) -> float:
-    """Most that a voltage changed in a tick. A release to 0 V does not count: it may come at once, from anywhere."""
-    steps = np.abs(np.diff(voltage, axis=0))
-    return float(steps[voltage[1:] > DISCHARGED_V].max(initial=0.0))
+def largest_step_v(voltage: NDArray[np.float64], after: NDArray[np.float64] | None = None) -> float:
+    """Most that a voltage changed in a tick. A release to 0 V does not count: it may come at once, from anywhere, and
+    may be looked at in the middle of its fall. ``voltage`` (n, combs), NaN where a comb is not asked; ``after``
+    (combs,): the voltages of the tick behind, where they are known.
+    """
+    steps = np.diff(voltage, axis=0)
+    released = voltage[1:] < DISCHARGED_V
+    last = released[-1:] if after is None else (after < DISCHARGED_V)[np.newaxis]
+    falling = np.vstack([released[1:], last]) & (steps < 0)
+    counted = np.abs(steps[~released & ~falling])
+    return float(counted[~np.isnan(counted)].max(initial=0.0))
+
+
+def largest_rise_v(voltage: NDArray[np.float64], forbidden: NDArray[np.bool_]) -> float:
+    """Most that a voltage rose in a tick after two in which none was allowed, over the whole run. After the first, a
+    SYNC that is late may be on its way that still applies what was sent before the decision.
+    """
+    steps = np.diff(voltage, axis=0)[1:]
+    rises = steps[forbidden[:-2] & forbidden[1:-1] & forbidden[2:]]
+    return float(rises[~np.isnan(rises)].max(initial=0.0))
+
+
+def _allowed_ms(case: Case, setup: Setup) -> float:
+    return case.discharged_within_ms or _ZERO_TICKS * setup.bus.period_us * 1e-3
+
+
+def _problems_of_releases(
+    case: Case, setup: Setup, voltage: NDArray[np.float64], forbidden: NDArray[np.bool_]
+) -> list[str]:
+    """Whether after each end of a mode with voltages, not only after the first, the combs were at 0 V in time, and
+    stayed there until the next such mode, or to the end of the run.
+    """
+    edges = np.flatnonzero(np.diff(forbidden.astype(np.int8)))
+    problems = []
+    for begin in edges[forbidden[edges + 1]] + 1:
+        later = edges[edges >= begin]
+        end = int(later[0]) + 1 if len(later) else len(voltage)
+        due = begin + round(_allowed_ms(case, setup) * 1e3 / setup.bus.period_us)
+        if due < end and (voltage[due:end] >= DISCHARGED_V).any():
+            at = due + int(np.flatnonzero((voltage[due:end] >= DISCHARGED_V).any(axis=1))[-1])
+            problems.append(f"{voltage[at].max():.1f} V at tick {at}, {at - begin} after the release at {begin}")
+    return problems
 
 
 def _zero_ms(
@@ -186,4 +243,13 @@ def as_json(outcome: Outcome) -> dict[str, Any]:
     return dataclasses.asdict(outcome) | {"ok": outcome.ok}
 
 
-__all__ = ["DISCHARGED_V", "Outcome", "as_json", "run_case", "setup_for"]
+__all__ = [
+    "DISCHARGED_V",
+    "RISE_V",
+    "Outcome",
+    "as_json",
+    "largest_rise_v",
+    "largest_step_v",
+    "run_case",
+    "setup_for",
+]
