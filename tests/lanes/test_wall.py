@@ -30,7 +30,7 @@ from pkxyz_ctrl.safety.modes import Mode
 
 ROOT = Path(__file__).parents[2]
 PERIOD_US = 1000
-NODE_TIMEOUT_US, HEARTBEAT_US = 50_000, 20_000
+DRIVE_TIMEOUT_US = 20_000
 EMCY, SDO_REPLY, SDO_REQUEST = 0x08A, 0x58A, 0x60A
 SCENARIO = """
 name = "to_and_fro"
@@ -74,7 +74,8 @@ def bench(tmp_path_factory):
     bus += "node_heartbeat_timeout_ms = 900\nboot_timeout_us = 20_000_000\n"
     bus += "start_timeout_us = 5_000_000\nsdo_timeout_us = 5_000_000\n"  # a machine that stands still is no silence
     (folder / "quick.toml").write_text(bus, encoding="utf-8")
-    (folder / "slow.toml").write_text(bus + "controller_heartbeat_timeout_ms = 900\n", encoding="utf-8")
+    patient = "controller_heartbeat_timeout_ms = 900\ndrive_timeout_ms = 900\n"
+    (folder / "slow.toml").write_text(bus + patient, encoding="utf-8")
     for name in ("quick", "slow"):
         (folder / f"on_{name}.toml").write_text(SCENARIO.format(bus=f"{name}.toml"), encoding="utf-8")
     return folder
@@ -218,16 +219,17 @@ def test_trajectories_agree_with_lockstep_within_the_noise(bench, changes):
     assert (np.abs(difference_nm.mean(axis=0)) < 3 * noise_nm).all()
 
 
-def test_killed_controller_leaves_0_v_within_the_heartbeat_time(bench, changes):
+def test_killed_controller_leaves_0_v_in_the_time_of_its_drive_frames_and_then_no_node_in_operational(bench, changes):
     changes("pre-operational", False)
     words = ("on_quick.toml", "--bus", "quick.toml", "--out", "killed", "--seconds", "60")
     with UnixBus(f"{bench}/bus") as observer, driving(bench, observer, *words) as run:
         os.kill(run.pid, signal.SIGKILL)
         killed_s = time.time()
         run.communicate(timeout=30)
-        emergency = next_with(observer, EMCY)
-        assert emergency.data[:2] == b"\x30\x81"  # 0x8130, life guard or heartbeat error (CiA 301, table 26)
-        assert emergency.timestamp - killed_s < 1.0
+        for code in (b"\x50\x82", b"\x30\x81"):  # RPDO time-out, then heartbeat error (CiA 301, table 26)
+            emergency = next_with(observer, EMCY)
+            assert emergency.data[:2] == code
+            assert emergency.timestamp - killed_s < 1.0
         for comb in (1, 2, 3):
             request = bytes((0x40, 0x11, 0x64, comb, 0, 0, 0, 0))
             observer.send(can.Message(arbitration_id=SDO_REQUEST, data=request, is_extended_id=False))
@@ -235,10 +237,12 @@ def test_killed_controller_leaves_0_v_within_the_heartbeat_time(bench, changes):
             assert reply.data[1:4] == bytes((0x11, 0x64, comb))
             assert int.from_bytes(reply.data[4:6], "little") == 0
     lines = changes("pre-operational", False)
-    assert lines[-2]["driven"]
+    assert [(line["state"], line["driven"]) for line in lines[-3:]] == [
+        ("operational", True), ("operational", False), ("pre-operational", False),
+    ]  # fmt: skip
     last_us = int(np.fromfile(bench / "truth.bin", TRUTH)["t_us"][-1])
-    waited_us = 1e6 * lines[-1]["t_s"] - last_us
-    assert NODE_TIMEOUT_US - HEARTBEAT_US - 5 * PERIOD_US < waited_us <= NODE_TIMEOUT_US + PERIOD_US
+    waited_us = 1e6 * lines[-2]["t_s"] - last_us
+    assert DRIVE_TIMEOUT_US - 2 * PERIOD_US < waited_us <= DRIVE_TIMEOUT_US + PERIOD_US
     for _ in range(100):  # the writer outlives the controller and closes the recording
         if (bench / "killed" / "recording.parquet").is_file():
             break
