@@ -34,27 +34,43 @@ def test_sextic_and_newton_agree(stage: Stage, strokes_m: np.ndarray) -> None:
     np.testing.assert_allclose(by_root, stage.forward_kinematics(strokes_m), rtol=0, atol=1e-17)
 
 
+def open_by(stage: Stage, strokes_m: np.ndarray, delta: complex) -> float:
+    """How far Eq. 5 is from closed for a delta, over L1^2: the shadow p of two differences of the three equations
+    |p + rho_i e_i| = L1, put into all of them; infinite where it is undefined.
+    """
+    geometry, e = stage.config.geometry, stage.geometry["e"][0]
+    rho = geometry.crank_length_m + geometry.projection_rest_m - strokes_m - delta
+    point = rho[:, None] * e
+    matrix = 2 * (point[:2] - point[2])
+    if abs(np.linalg.det(matrix)) < 1e-6 * geometry.crank_length_m**2:
+        return math.inf
+    shadow = np.linalg.solve(matrix, rho[2] ** 2 - rho[:2] ** 2)
+    return float(np.abs(((point + shadow) ** 2).sum(axis=1) / geometry.crank_length_m**2 - 1).max())
+
+
 @MODEST
 @given(any_stage(), STROKES)
 def test_every_root_closes_the_loop_of_equation_5(stage: Stage, strokes_m: np.ndarray) -> None:
-    """Each of the six deltas, complex ones too, has a shadow p with (p + rho_i e_i)^2 = L1^2 for the three chains."""
+    """Each of the six deltas, complex ones too, has a shadow p with (p + rho_i e_i)^2 = L1^2 for the three chains.
+
+    As well as rounding lets it: a root of a polynomial with coefficients rounded by some eps lies off by that over
+    the slope, little for the root of the device, a lot for the four that merge at rest.
+    """
     geometry = stage.config.geometry
-    e = stage.geometry["e"][0]
-    crank = geometry.crank_length_m
+    slope = np.polynomial.Polynomial(closure_polynomial(geometry, strokes_m)).deriv()
     deltas = link_projections_m(geometry, strokes_m)
     assert deltas.shape == (6,)
-    spread = float(np.ptp(strokes_m))
+    closed_to = []
     for delta in deltas:
-        rho = crank + geometry.projection_rest_m - strokes_m - delta
-        point = rho[:, None] * e
-        if abs(delta - geometry.projection_rest_m) > 0.5 * crank and spread < 1e-6:
-            continue  # near rest the four roots about tau = 0 merge, and their shadow is undefined
-        matrix = 2 * (point[:2] - point[2])
-        if abs(np.linalg.det(matrix)) < 1e-6 * crank**2:
-            continue
-        shadow = np.linalg.solve(matrix, rho[2] ** 2 - rho[:2] ** 2)
-        closure = ((point + shadow) ** 2).sum(axis=1) / crank**2 - 1
-        assert np.abs(closure).max() < 1e-6 if abs(delta - geometry.projection_rest_m) > 0.5 * crank else 1e-12
+        tau = 1 + (geometry.projection_rest_m - strokes_m.mean() - delta) / geometry.crank_length_m
+        if open_by(stage, strokes_m, delta) == math.inf or slope(tau) == 0:
+            continue  # the roots about tau = 0 merge near rest, and their shadow is undefined
+        off = 8 * np.finfo(float).eps / abs(slope(tau)) * geometry.crank_length_m
+        rounding = max(open_by(stage, strokes_m, delta + shift) for shift in (off, -off)) + 4 * np.finfo(float).eps
+        if rounding < 1e-3:
+            assert open_by(stage, strokes_m, delta) < rounding
+            closed_to.append(rounding)
+    assert min(closed_to) < 1e-13  # that of the device
 
 
 @MODEST
