@@ -77,9 +77,15 @@ def snapped(p: np.void, s: np.void) -> int:
         if s["held"][i] == 0:
             volt = s["voltage_v"][i] - s["charge_v"][i]
             if (p["overlap_rest_m"] + s["strokes_m"][i]) * volt * volt > p["lateral_limit_v2m"][i]:
-                s["held"][i] = 1
-                s["held_m"][i] = s["strokes_m"][i]
-                s["voltage_v"][i] = 0.0
-                s["charge_v"][i] = 0.0
+                snap(s, i)
                 return i
     return -1
+
+
+@njit(cache=True)
+def snap(s: np.void, i: int) -> None:
+    """The fingers of chain i come together at its stroke s["strokes_m"]: shorted and held."""
+    s["held"][i] = 1
+    s["held_m"][i] = s["strokes_m"][i]
+    s["voltage_v"][i] = 0.0
+    s["charge_v"][i] = 0.0

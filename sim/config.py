@@ -5,11 +5,22 @@ alone."""
 
 import tomllib
 from pathlib import Path
-from typing import Annotated, Self
+from typing import Annotated, Literal, Self
 
-from pydantic import AfterValidator, BaseModel, ConfigDict, Field
+from pydantic import AfterValidator, Field, model_validator
 
 from sim.device import Device, Finite, Positive
+from sim.model import Model, NotNegative, PerChain, Relative, RelativePerChain
+from sim.structure.config import FingerMisalignment, FlexibleModes, TableTilt
+from sim.surroundings.config import (
+    Ageing,
+    AmplifierNoise,
+    BaseNoise,
+    FloorVibration,
+    Mains,
+    SenseFlicker,
+    Temperature,
+)
 
 __all__ = ["Device", "PlantConfig"]
 
@@ -21,17 +32,9 @@ def _one_file(name: str) -> str:
 
 
 Name = Annotated[str, Field(min_length=1, max_length=100), AfterValidator(_one_file)]
-NotNegative = Annotated[float, Field(ge=0, allow_inf_nan=False)]
-Relative = Annotated[float, Field(gt=-0.9, lt=9.0)]
-PerChain = tuple[Finite, Finite, Finite]
-RelativePerChain = tuple[Relative, Relative, Relative]
 
 
-class _Model(BaseModel):
-    model_config = ConfigDict(frozen=True, extra="forbid")
-
-
-class StiffnessMismatch(_Model):
+class StiffnessMismatch(Model):
     """Relative error of each chain's flexures against the drawing."""
 
     on: bool = False
@@ -40,19 +43,19 @@ class StiffnessMismatch(_Model):
     link_hinge: RelativePerChain = (0.0, 0.0, 0.0)
 
 
-class MassError(_Model):
+class MassError(Model):
     on: bool = False
     relative: Relative = 0.0
 
 
-class Damping(_Model):
+class Damping(Model):
     """Modal damping. Without a ``quality_factor`` the stage file's holds; off means no damping at all."""
 
     on: bool = True
     quality_factor: Positive | None = None
 
 
-class Gravity(_Model):
+class Gravity(Model):
     """Weight of the moving mass, with the stage turned by small angles about x and y. With ``level_is_rest`` the rest
     pose was measured on the level stage, so only the change by the tilt acts."""
 
@@ -63,7 +66,7 @@ class Gravity(_Model):
     acceleration_m_per_s2: Positive = 9.80665
 
 
-class Parasitic(_Model):
+class Parasitic(Model):
     """One more mode, moved by the comb forces and seen by the sense combs through the same shape (that is:
     passively), and by the table through its own. ``compliance_share``: its static compliance as a share of the
     stage's in-plane 1/K_xx."""
@@ -76,7 +79,7 @@ class Parasitic(_Model):
     table_shape: PerChain = (0.0, 0.5, 0.1)
 
 
-class Drift(_Model):
+class Drift(Model):
     """Slow force on the table: an exponential that settles at ``force_n``, and a random walk on each axis."""
 
     on: bool = False
@@ -86,7 +89,7 @@ class Drift(_Model):
     seed_offset: int = 0
 
 
-class Brownian(_Model):
+class Brownian(Model):
     """Thermal force that belongs to the damping: one-sided density sqrt(4 k T C)."""
 
     on: bool = False
@@ -94,7 +97,7 @@ class Brownian(_Model):
     seed_offset: int = 0
 
 
-class Stops(_Model):
+class Stops(Model):
     """Mechanical stops, ``clearance_m`` beyond both ends of the stroke range. Force k d (1 + damping d'), never
     pulling."""
 
@@ -104,28 +107,28 @@ class Stops(_Model):
     damping_s_per_m: NotNegative = 5.0
 
 
-class CombMismatch(_Model):
+class CombMismatch(Model):
     """Relative error of each drive comb's force gain."""
 
     on: bool = False
     relative: RelativePerChain = (0.0, 0.0, 0.0)
 
 
-class Fringe(_Model):
+class Fringe(Model):
     """Change of the drive combs' force gain with overlap, relative, over 25 um of stroke."""
 
     on: bool = False
     relative_per_25um: Annotated[float, Field(gt=-0.5, lt=0.5)] = 0.0
 
 
-class Levitation(_Model):
+class Levitation(Model):
     """Out-of-plane force of a comb as a share of its in-plane force; the ground plane below lifts the fingers."""
 
     on: bool = False
     ratio: Finite = 0.0
 
 
-class PullIn(_Model):
+class PullIn(Model):
     """Lateral instability of the drive combs: once 2 n eps0 h (y0 + q) V^2 / g^3 passes ``lateral_stiffness_ratio``
     times the springs' lateral stiffness, the fingers snap together, short the comb and hold the slider where it is."""
 
@@ -133,7 +136,7 @@ class PullIn(_Model):
     lateral_stiffness_ratio: Positive = 1.0
 
 
-class Charging(_Model):
+class Charging(Model):
     """Dielectric charging: an opposing voltage that creeps towards ``fraction`` of the comb voltage."""
 
     on: bool = False
@@ -141,17 +144,17 @@ class Charging(_Model):
     time_constant_s: Positive = 5.0
 
 
-class AmplifierBandwidth(_Model):
+class AmplifierBandwidth(Model):
     on: bool = True
     corner_hz: Positive = 30e3
 
 
-class Slew(_Model):
+class Slew(Model):
     on: bool = True
     limit_v_per_s: Positive = 20e6
 
 
-class CurrentLimit(_Model):
+class CurrentLimit(Model):
     """Output current into the comb and its wiring: |dV/dt| <= I / (C(q) + stray)."""
 
     on: bool = False
@@ -159,17 +162,17 @@ class CurrentLimit(_Model):
     stray_f: NotNegative = 20e-12
 
 
-class AmplifierGain(_Model):
+class AmplifierGain(Model):
     on: bool = False
     relative: RelativePerChain = (0.0, 0.0, 0.0)
 
 
-class AmplifierOffset(_Model):
+class AmplifierOffset(Model):
     on: bool = False
     offset_v: PerChain = (0.0, 0.0, 0.0)
 
 
-class Dac(_Model):
+class Dac(Model):
     """A converter coarser than the counts on the wire. Off: as fine as the counts, which are themselves a
     quantisation."""
 
@@ -177,27 +180,34 @@ class Dac(_Model):
     step_counts: Annotated[int, Field(ge=1, le=4096)] = 1
 
 
-class SenseNoise(_Model):
-    """White noise, one-sided density. A sample's deviation is density * sqrt(f_sample / 2)."""
+class SenseNoise(Model):
+    """White noise, one-sided density, of each channel.
+
+    ``per_sample``: a deviate for each sample of deviation density * sqrt(f_sample / 2), whatever the bandwidth.
+    ``through_chain``: the noise passes the low-pass of ``sense_bandwidth`` as the strokes do, and is sampled as it is:
+    deviation density * sqrt(pi / 2 * corner), with what folds, and correlated from sample to sample."""
 
     on: bool = True
     density_f_per_rt_hz: NotNegative = 5e-18
+    sampled: Literal["per_sample", "through_chain"] = "per_sample"
     seed_offset: int = 0
 
 
-class SenseBandwidth(_Model):
+class SenseBandwidth(Model):
+    """First-order low-pass of each channel. It lags 1 / (2 pi corner_hz)."""
+
     on: bool = False
     corner_hz: Positive = 100e3
 
 
-class SenseDelay(_Model):
+class SenseDelay(Model):
     """A sample shows the strokes this long before it was asked for."""
 
     on: bool = False
     delay_s: Annotated[float, Field(ge=0, le=1e-3)] = 0.0
 
 
-class SenseGain(_Model):
+class SenseGain(Model):
     """Relative error of each sense comb's gradient and, as curvature, its change over 25 um."""
 
     on: bool = False
@@ -205,12 +215,12 @@ class SenseGain(_Model):
     curvature_per_25um: Annotated[float, Field(gt=-0.5, lt=0.5)] = 0.0
 
 
-class SenseOffset(_Model):
+class SenseOffset(Model):
     on: bool = False
     offset_f: PerChain = (0.0, 0.0, 0.0)
 
 
-class SenseDrift(_Model):
+class SenseDrift(Model):
     """Random walk of each sense channel's offset."""
 
     on: bool = False
@@ -218,21 +228,31 @@ class SenseDrift(_Model):
     seed_offset: int = 0
 
 
-class SenseAdc(_Model):
+class SenseAdc(Model):
     """A converter coarser than the counts on the wire."""
 
     on: bool = False
     step_counts: Annotated[int, Field(ge=1, le=4096)] = 1
 
 
-class Feedthrough(_Model):
-    """What a sense channel shows of its own drive comb's voltage."""
+class Feedthrough(Model):
+    """What a sense channel shows of its own drive comb's voltage, past the chain's filter."""
 
     on: bool = False
     f_per_v: Finite = 0.0
 
 
-class PlantConfig(_Model):
+class Crosstalk(Model):
+    """What reaches a sense channel's input from the drive: its own comb's voltage, those of the other two, and the
+    current through what couples them, of its own comb's dV/dt. All of it through the chain's filter."""
+
+    on: bool = False
+    own_f_per_v: Finite = 0.0
+    others_f_per_v: Finite = 0.0
+    rate_f_per_v_per_s: Finite = 0.0
+
+
+class PlantConfig(Model):
     """All effects of one plant. The defaults are the nominal plant."""
 
     name: Name = "nominal"
@@ -263,6 +283,30 @@ class PlantConfig(_Model):
     sense_drift: SenseDrift = SenseDrift()
     sense_adc: SenseAdc = SenseAdc()
     feedthrough: Feedthrough = Feedthrough()
+    crosstalk: Crosstalk = Crosstalk()
+    sense_flicker: SenseFlicker = SenseFlicker()
+    amplifier_noise: AmplifierNoise = AmplifierNoise()
+    flexible_modes: FlexibleModes = FlexibleModes()
+    finger_misalignment: FingerMisalignment = FingerMisalignment()
+    table_tilt: TableTilt = TableTilt()
+    base_noise: BaseNoise = BaseNoise()
+    floor_vibration: FloorVibration = FloorVibration()
+    mains: Mains = Mains()
+    temperature: Temperature = Temperature()
+    ageing: Ageing = Ageing()
+
+    @model_validator(mode="after")
+    def _fits_together(self) -> Self:
+        if self.sense_noise.on and self.sense_noise.sampled == "through_chain" and not self.sense_bandwidth.on:
+            raise ValueError('sense_noise.sampled = "through_chain" needs sense_bandwidth on: it is what it passes')
+        if self.crosstalk.on and self.crosstalk.rate_f_per_v_per_s != 0.0 and not self.sense_bandwidth.on:
+            raise ValueError("crosstalk.rate_f_per_v_per_s needs sense_bandwidth on: a step's rate has no end without")
+        if self.parasitic.on and (self.flexible_modes.on or self.amplifier_noise.on):
+            raise ValueError(
+                "parasitic is a one-way mode for plants without amplifier_noise and flexible_modes; give it as one of "
+                "flexible_modes.modes"
+            )
+        return self
 
     @classmethod
     def load(cls, path: Path | str) -> Self:

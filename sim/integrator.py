@@ -33,7 +33,7 @@ LAST = STAGES - 1
 
 
 @njit(cache=True, error_model="numpy")
-def _tabulate(p: np.void, s: np.void, h: float) -> None:
+def tabulate(p: np.void, s: np.void, h: float) -> None:
     """E, exp(-D t / 2) and exp(D t / 2) at the stages of a step of h s, the last of which lies at its end. Kept until
     h changes."""
     if s["tabulated_h_s"] == h:
@@ -69,7 +69,7 @@ def _exponentials(d: np.ndarray, t: float, shrink: np.ndarray, swell: np.ndarray
 
 
 @njit(cache=True, error_model="numpy")
-def _times(m: np.ndarray, x: float, y: float, z: float) -> tuple[float, float, float]:
+def times(m: np.ndarray, x: float, y: float, z: float) -> tuple[float, float, float]:
     """m (3, 3) times a vector."""
     return (
         m[0, 0] * x + m[0, 1] * y + m[0, 2] * z,
@@ -94,11 +94,11 @@ def _transient(p: np.void, s: np.void) -> None:
         s["error_volt2"][i] = error[i] * error[i]
     x, y, z = s["motion"][0], s["motion"][1], s["motion"][2]
     ax, ay, az = comb_acceleration(p, s["volt2"], x, y, z)
-    one[0], one[1], one[2] = _times(p["response_1_s2"], ax, ay, az)
-    one_push[0], one_push[1], one_push[2] = _times(p["response_1"], ax, ay, az)
+    one[0], one[1], one[2] = times(p["response_1_s2"], ax, ay, az)
+    one_push[0], one_push[1], one_push[2] = times(p["response_1"], ax, ay, az)
     ax, ay, az = comb_acceleration(p, s["error_volt2"], x, y, z)
-    two[0], two[1], two[2] = _times(p["response_2_s2"], ax, ay, az)
-    two_push[0], two_push[1], two_push[2] = _times(p["response_2"], ax, ay, az)
+    two[0], two[1], two[2] = times(p["response_2_s2"], ax, ay, az)
+    two_push[0], two_push[1], two_push[2] = times(p["response_2"], ax, ay, az)
 
 
 @njit(cache=True, error_model="numpy")
@@ -116,7 +116,7 @@ def _weighted(given: np.ndarray, weights: np.ndarray, n: int) -> tuple[float, fl
 @njit(cache=True, error_model="numpy")
 def _step(p: np.void, s: np.void, h: float) -> None:
     """Integrate motion and voltages over h s, without a look at stops."""
-    _tabulate(p, s, h)
+    tabulate(p, s, h)
     _transient(p, s)
     motion, given, volt2, decay = s["motion"], s["given"], s["volt2"], s["decay"]
     k, h2 = 1.0 / p["amplifier_s"] if p["amplifier_s"] > 0.0 else 0.0, h * h
@@ -130,7 +130,7 @@ def _step(p: np.void, s: np.void, h: float) -> None:
         e2 = e1 * e1
         gx, gy, gz = _weighted(given, A[i], i)
         ux, uy, uz = t * vx + h2 * gx, t * vy + h2 * gy, t * vz + h2 * gz
-        px, py, pz = _times(s["shrink"][i], ux, uy, uz)
+        px, py, pz = times(s["shrink"][i], ux, uy, uz)
         for c in range(3):
             volt = s["base_v"][c] - s["charge_v"][c] + s["slope_v_per_s"][c] * t + s["error_v"][c] * e1
             volt2[c] = volt * volt
@@ -142,15 +142,15 @@ def _step(p: np.void, s: np.void, h: float) -> None:
             vx + mean * gx - x1 * g1 - x2 * g2, vy + mean * gy - y1 * g1 - y2 * g2, vz + mean * gz - z1 * g1 - z2 * g2,
         )  # fmt: skip
         ax, ay, az = ax + one[0] * e1 + two[0] * e2, ay + one[1] * e1 + two[1] * e2, az + one[2] * e1 + two[2] * e2
-        ax, ay, az = _times(s["swell"][i], ax, ay, az)
-        gx, gy, gz = _times(p["damping2_per_s2"], ux, uy, uz)
+        ax, ay, az = times(s["swell"][i], ax, ay, az)
+        gx, gy, gz = times(p["damping2_per_s2"], ux, uy, uz)
         given[i, 0], given[i, 1], given[i, 2] = ax + gx, ay + gy, az + gz
     gx, gy, gz = _weighted(given, B, STAGES)
     ux, uy, uz = h * vx + h2 * gx, h * vy + h2 * gy, h * vz + h2 * gz
     gx, gy, gz = _weighted(given, B_RATE, STAGES)
-    dx, dy, dz = _times(p["damping_per_s"], ux, uy, uz)
-    px, py, pz = _times(s["shrink"][LAST], ux, uy, uz)
-    vx, vy, vz = _times(s["shrink"][LAST], vx + h * gx - 0.5 * dx, vy + h * gy - 0.5 * dy, vz + h * gz - 0.5 * dz)
+    dx, dy, dz = times(p["damping_per_s"], ux, uy, uz)
+    px, py, pz = times(s["shrink"][LAST], ux, uy, uz)
+    vx, vy, vz = times(s["shrink"][LAST], vx + h * gx - 0.5 * dx, vy + h * gy - 0.5 * dy, vz + h * gz - 0.5 * dz)
     e1 = decay[LAST]
     e2 = e1 * e1
     g1, g2 = k * e1, 2.0 * k * e2

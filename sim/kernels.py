@@ -7,12 +7,17 @@ import math
 import numpy as np
 from numba import njit
 
-from sim.amplifier import charge, drive, plan, snapped
-from sim.integrator import LONGEST_S, step
+from sim.amplifier import charge, drive, plan, snap, snapped
+from sim.integrator import step
 from sim.layout import BROKEN, BROWNIAN_STREAM, DRIFT_STREAM, EVENTS, PULLED_IN, STOP
 from sim.noise import normal
 from sim.parasitic import parasitic_step
-from sim.sense import follow, sample, seen, walk
+from sim.sense import follow, follow_voltages, pass_noise, sample, walk
+from sim.structure.general_step import general_step
+from sim.structure.pose import combs_seen
+from sim.structure.side import balance
+from sim.surroundings.call_forces import surround
+from sim.surroundings.slow import grow_old
 
 __all__ = ["advance", "drive", "sample"]
 
@@ -70,23 +75,51 @@ def _move(p: np.void, s: np.void, total_s: float) -> None:
     remaining = total_s
     while remaining > 0.0:
         duration = plan(p, s, remaining)
-        n = math.ceil(duration / LONGEST_S)
+        n = math.ceil(duration / p["longest_s"])
         h = duration / n
-        for _ in range(n):
+        for k in range(n):
+            if p["crosstalk_on"] != 0 and p["sense_filter_s"] > 0.0:
+                follow_voltages(p, s, h)
             if p["parasitic_on"] != 0:
                 parasitic_step(p, s, h)
-            if s["broken"] == 0:
+            if p["general_on"] != 0:
+                _general(p, s, h, remaining - (k + 1) * h)
+            elif s["broken"] == 0:
                 step(p, s, h)
             if s["broken"] != 0 or not _whole(s["motion"]):
                 _break(s)
             chain = snapped(p, s)
             while chain >= 0:
-                note(s, PULLED_IN, chain)
-                s["base_v"][chain], s["error_v"][chain], s["slope_v_per_s"][chain] = 0.0, 0.0, 0.0
+                _note_snap(s, chain)
                 chain = snapped(p, s)
         remaining -= duration
         if remaining < 1e-15:
             remaining = 0.0
+
+
+@njit(cache=True, error_model="numpy")
+def _general(p: np.void, s: np.void, h: float, left_s: float) -> None:
+    """A general step, fingers' balance and memory of the sense chain with it; ``left_s`` of the call follow."""
+    remembers = p["sense_filter_s"] > 0.0 or p["sense_delay_us"] > 0.0
+    if remembers:
+        combs_seen(p, s, s["before_m"], s["before_m_per_s"])
+    if s["broken"] == 0:
+        general_step(p, s, h)
+    if p["misaligned_on"] != 0 and s["broken"] == 0:
+        chain = balance(p, s)
+        while chain >= 0:
+            snap(s, chain)
+            _note_snap(s, chain)
+            chain = balance(p, s)
+    if remembers:
+        follow(p, s, h, s["t_us"] - 1e6 * left_s)
+
+
+@njit(cache=True)
+def _note_snap(s: np.void, chain: int) -> None:
+    """Fingers of a chain have snapped together."""
+    note(s, PULLED_IN, chain)
+    s["base_v"][chain], s["error_v"][chain], s["slope_v_per_s"][chain] = 0.0, 0.0, 0.0
 
 
 @njit(cache=True)
@@ -98,6 +131,7 @@ def _break(s: np.void) -> None:
         for j in range(3):
             s["motion"][j] = s["start"][j]
             s["motion"][3 + j] = 0.0
+        s["modes"][:] = 0.0
     for i in range(3):
         s["voltage_v"][i] = 0.0
         s["base_v"][i], s["slope_v_per_s"][i], s["error_v"][i] = 0.0, 0.0, 0.0
@@ -111,10 +145,16 @@ def advance(params: np.ndarray, state: np.ndarray, dt_us: int) -> None:
     p = params[0]
     s = state[0]
     dt_s = dt_us * 1e-6
-    remembers = p["sense_filter_s"] > 0.0 or p["sense_delay_us"] > 0.0
+    remembers = p["general_on"] == 0 and (p["sense_filter_s"] > 0.0 or p["sense_delay_us"] > 0.0)
     if remembers:
-        seen(p, s, s["before_m"], s["before_m_per_s"])
+        combs_seen(p, s, s["before_m"], s["before_m_per_s"])
+    if p["slow_on"] != 0:
+        grow_old(p, s["t_us"])
     _constant_forces(p, s, dt_s)
+    if p["general_on"] != 0:
+        surround(p, s, dt_us)
+        for j in range(3):
+            s["steady_n"][j], s["force_n"][j] = s["force_n"][j], 0.0
     s["t_us"] += dt_us
     for i in range(3):
         s["touched"][i] = 0
@@ -124,5 +164,7 @@ def advance(params: np.ndarray, state: np.ndarray, dt_us: int) -> None:
         charge(p, s, dt_s)
     if p["sense_walk_f_per_rt_s"] > 0.0:
         walk(p, s, dt_s)
+    if p["sense_chain_noise_f"] > 0.0:
+        pass_noise(p, s, dt_s)
     if remembers:
-        follow(p, s, dt_s)
+        follow(p, s, dt_s, float(s["t_us"]))

@@ -11,6 +11,11 @@ from sim.layout import PARAMS, STATE
 from sim.mechanics import acceleration, stiffness
 from sim.noise import stream
 from sim.parasitic import rest
+from sim.structure.build import build_flexible_modes, build_misalignment, build_tilt
+from sim.structure.pose import combs_seen
+from sim.structure.side import balance
+from sim.surroundings.build import build_surroundings, start_surroundings
+from sim.surroundings.slow import grow_old
 
 EPSILON_0_F_PER_M = 8.8541878128e-12  # CODATA 2018
 BOLTZMANN_J_PER_K = 1.380649e-23  # SI 2019, exact
@@ -35,6 +40,14 @@ def build_parameters(
     _transient_response(p)
     _modes_and_forces(p, config)
     _sense_chain(p, config, device, period_us, sense_f_per_count, sense_zero_f)
+    build_flexible_modes(p, config.flexible_modes, rest_stiffness(p, np.zeros(3)))
+    build_tilt(p, config.table_tilt)
+    build_surroundings(p, config)
+    p["general_on"] = any(
+        p[name] for name in ("mode_count", "misaligned_on", "shaken_on", "tone_count", "amplifier_noise_on")
+    ) or bool(p["sense_flicker_on"])
+    if p["slow_on"]:
+        grow_old(p, 0)
     return params
 
 
@@ -127,6 +140,7 @@ def _drive_combs(p: np.void, config: PlantConfig, device: Device) -> None:
     p["lateral_limit_v2m"] = (
         config.pull_in.lateral_stiffness_ratio * lateral / per_volt2_m if config.pull_in.on else np.inf
     )
+    build_misalignment(p, config.finger_misalignment, device, config.pull_in.lateral_stiffness_ratio * lateral)
     p["charging_on"] = config.charging.on
     p["charging_fraction"], p["charging_s"] = config.charging.fraction, config.charging.time_constant_s
 
@@ -184,8 +198,18 @@ def _sense_chain(
     p["sense_curvature_per_m"] = gain.curvature_per_25um / STROKE_SCALE_M * gain.on
     p["sense_rest_f"] = gradient * comb.overlap_rest_m
     p["sense_offset_f"] = np.array(config.sense_offset.offset_f) * config.sense_offset.on
+    noise = config.sense_noise
     sample_hz = 1e6 / period_us
-    p["sense_noise_f"] = config.sense_noise.density_f_per_rt_hz * math.sqrt(sample_hz / 2) * config.sense_noise.on
+    if noise.sampled == "per_sample":
+        p["sense_noise_f"] = noise.density_f_per_rt_hz * math.sqrt(sample_hz / 2) * noise.on
+    else:  # variance D^2 / (4 tau)
+        p["sense_chain_noise_f"] = (
+            noise.density_f_per_rt_hz * math.sqrt(0.5 * math.pi * config.sense_bandwidth.corner_hz) * noise.on
+        )
+    talk = config.crosstalk
+    p["crosstalk_on"] = talk.on
+    p["crosstalk_own_f_per_v"], p["crosstalk_others_f_per_v"] = talk.own_f_per_v, talk.others_f_per_v
+    p["crosstalk_rate_f_per_v_per_s"] = talk.rate_f_per_v_per_s
     p["sense_filter_s"] = 1 / (2 * math.pi * config.sense_bandwidth.corner_hz) if config.sense_bandwidth.on else 0.0
     p["sense_delay_us"] = config.sense_delay.delay_s * 1e6 * config.sense_delay.on
     p["sense_walk_f_per_rt_s"] = config.sense_drift.walk_f_per_rt_s * config.sense_drift.on
@@ -204,10 +228,14 @@ def state_at_rest(params: np.ndarray, config: PlantConfig, seed: int) -> np.ndar
     s["motion"][:3] = equilibrium(p, s, volt2)
     if p["parasitic_on"]:
         s["parasitic"][0] = rest(p, volt2)
-    strokes(p, s["motion"], s["filtered_m"])
-    s["filtered_m"] += p["parasitic_comb"] * s["parasitic"][0]
+    bend(p, s, volt2)
+    if p["misaligned_on"]:
+        balance(p, s)
+    combs_seen(p, s, s["filtered_m"], s["rates_m_per_s"])
     s["knot_m"][0] = s["filtered_m"]
     s["knot_count"] = 1
+    s["filtered_v"] = s["voltage_v"]
+    s["comb_rise"] = np.where(s["comb_rise"] > 0.0, s["comb_rise"], 1.0)
     offsets = {
         layout.BROWNIAN_STREAM: config.brownian.seed_offset,
         layout.DRIFT_STREAM: config.drift.seed_offset,
@@ -216,7 +244,19 @@ def state_at_rest(params: np.ndarray, config: PlantConfig, seed: int) -> np.ndar
     }
     for source, offset in offsets.items():
         s["random"][source] = stream(seed, source, offset)
+    start_surroundings(p, s, config, seed)
     return state
+
+
+def bend(p: np.void, s: np.void, volt2: np.ndarray) -> None:
+    """Static flexible modes under squared voltages (3,) and the constant force, from a mechanism at rest in
+    s["motion"], which becomes the table's."""
+    strokes(p, s["motion"], s["strokes_m"])
+    force_n = p["force_gain_n_per_v2"] * (1 + p["fringe_per_m"] * s["strokes_m"]) * volt2
+    for k in range(p["mode_count"]):  # the mechanism's own forces carry the constant one
+        push = p["mode_comb"][k] @ force_n + p["mode_table"][k] @ s["force_n"]
+        s["modes"][0, k] = push * p["mode_per_kg"][k] / p["mode_w2_per_s2"][k]
+        s["motion"][:3] += p["mode_table"][k] * s["modes"][0, k]
 
 
 def equilibrium(p: np.void, s: np.void, volt2: np.ndarray) -> np.ndarray:

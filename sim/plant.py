@@ -7,8 +7,8 @@ import numpy as np
 
 from sim import kernels, layout
 from sim.config import Device, PlantConfig
-from sim.geometry import strokes
 from sim.parameters import build_parameters, state_at_rest
+from sim.structure.pose import combs_seen, stand
 
 KINDS = {layout.STOP: "stop", layout.PULLED_IN: "pulled_in", layout.BROKEN: "broken"}
 
@@ -92,23 +92,24 @@ class Plant:
 
     @property
     def position_m(self) -> np.ndarray:
-        """True position of the table (3,), relative to the rest pose, with the parasitic mode's part."""
-        p, s = self.params[0], self.state[0]
-        return np.asarray(s["motion"][:3] + p["parasitic_table"] * s["parasitic"][0])
+        """True position of the table's point of interest (3,), relative to the rest pose, with the modes' part."""
+        out = np.empty(3)
+        stand(self.params[0], self.state[0], out)
+        return out
 
     @property
     def velocity_m_per_s(self) -> np.ndarray:
-        """True velocity of the table (3,), with the parasitic mode's part."""
+        """True velocity of the table's point of interest (3,), with the modes' part."""
         p, s = self.params[0], self.state[0]
-        return np.asarray(s["motion"][3:] + p["parasitic_table"] * s["parasitic"][1])
+        table = np.asarray(s["motion"][3:] + p["parasitic_table"] * s["parasitic"][1])
+        return table + p["tilt_shift"] @ table if p["tilt_on"] else table
 
     @property
     def stroke_m(self) -> np.ndarray:
-        """True strokes of the sliders (3,) from rest, as the sense combs move: with the parasitic mode's part."""
-        p, s = self.params[0], self.state[0]
+        """True strokes of the sliders (3,) from rest, as the sense combs move: with the modes' part."""
         out = np.empty(3)
-        strokes(p, s["motion"], out)
-        return np.asarray(out + p["parasitic_comb"] * s["parasitic"][0])
+        combs_seen(self.params[0], self.state[0], out, np.empty(3))
+        return out
 
     @property
     def voltage_v(self) -> np.ndarray:

@@ -1,30 +1,24 @@
 """From strokes to sense counts.
 
-    C_i = C_rest + g_i (q_i + c q_i^2 / 2) + offset_i + walk_i + feedthrough V_i + noise
+    C_i = C_rest + g_i (q_i + c q_i^2 / 2) + offset_i + walk_i + feedthrough V_i + crosstalk_i + noise
     counts = round((C_i - zero) / scale), saturated to int16
 
-q_i is the slider's stroke with the parasitic mode's part, after a first-order filter and a delay where these are on.
-Filter and delay see the strokes as a cubic through value and rate at both ends of each step."""
+q_i is the slider's stroke with the modes' part, after a first-order filter and a delay where these are on. Filter and
+delay see the strokes as a cubic through value and rate at both ends of each step. Crosstalk and the noise of a chain
+``through_chain`` pass the same filter: with tau its time constant and D the one-sided density,
+
+    n' = (white - n) / tau:  deviation D / (2 sqrt(tau)), correlated as exp(-t / tau) from sample to sample."""
 
 import math
 
 import numpy as np
 from numba import njit
 
-from sim.geometry import stroke_rates, strokes
+from sim.geometry import strokes
 from sim.layout import KNOTS, SENSE_DRIFT_STREAM, SENSE_STREAM
 from sim.noise import normal
-
-
-@njit(cache=True, error_model="numpy")
-def seen(p: np.void, s: np.void, out_m: np.ndarray, out_m_per_s: np.ndarray) -> None:
-    """Strokes and rates (3,) as the sense combs move, parasitic mode included."""
-    strokes(p, s["motion"], out_m)
-    stroke_rates(p, s["motion"], out_m_per_s)
-    if p["parasitic_on"] != 0:
-        for i in range(3):
-            out_m[i] += p["parasitic_comb"][i] * s["parasitic"][0]
-            out_m_per_s[i] += p["parasitic_comb"][i] * s["parasitic"][1]
+from sim.structure.pose import combs_seen
+from sim.surroundings.tones import hum
 
 
 @njit(cache=True, error_model="numpy")
@@ -40,14 +34,14 @@ def _filtered(tau: float, h: float, q0: float, v0: float, q1: float, v1: float, 
 
 
 @njit(cache=True, error_model="numpy")
-def follow(p: np.void, s: np.void, h: float) -> None:
-    """Move filter and memory of the sense chain on over the step of h s that just ended at s["t_us"]. s["before_m"] and
+def follow(p: np.void, s: np.void, h: float, t_us: float) -> None:
+    """Move filter and memory of the sense chain on over the step of h s that just ended at t_us. s["before_m"] and
     s["before_m_per_s"] are the strokes and rates at its start."""
     q, v = s["strokes_m"], s["rates_m_per_s"]
-    seen(p, s, q, v)
+    combs_seen(p, s, q, v)
     n = s["knot_count"] % KNOTS
     s["knot_count"] += 1
-    s["knot_t_us"][n] = s["t_us"]
+    s["knot_t_us"][n] = t_us
     tau = p["sense_filter_s"]
     for i in range(3):
         if tau > 0.0:
@@ -84,6 +78,43 @@ def _remembered(p: np.void, s: np.void, out_m: np.ndarray) -> None:
 
 
 @njit(cache=True, error_model="numpy")
+def follow_voltages(p: np.void, s: np.void, h: float) -> None:
+    """Move the filtered voltages on over the coming h s, in which V = base + slope t + error exp(-t / tau_a)."""
+    tau, lag = p["sense_filter_s"], p["amplifier_s"]
+    kept = math.exp(-h / tau)
+    for i in range(3):
+        ramp = s["base_v"][i] - s["slope_v_per_s"][i] * tau
+        start, end = ramp, ramp + s["slope_v_per_s"][i] * h
+        if lag > 0.0 and s["error_v"][i] != 0.0:
+            part = s["error_v"][i] / (1.0 - tau / lag if tau != lag else 1e-9)
+            start, end = start + part, end + part * math.exp(-h / lag)
+        s["filtered_v"][i] = end + (s["filtered_v"][i] - start) * kept
+
+
+@njit(cache=True, error_model="numpy")
+def pass_noise(p: np.void, s: np.void, dt_s: float) -> None:
+    """Move the filtered noise of the channels on over dt_s, in deviations."""
+    kept = math.exp(-dt_s / p["sense_filter_s"])
+    fresh = math.sqrt(1.0 - kept * kept)
+    for i in range(3):
+        n = SENSE_STREAM + i
+        s["sense_chain_noise"][i] = s["sense_chain_noise"][i] * kept + fresh * normal(s["random"][n], s["spare"][n])
+
+
+@njit(cache=True, error_model="numpy")
+def _crosstalk(p: np.void, s: np.void, i: int) -> float:
+    """What channel i shows of the drive, F."""
+    volt, tau = s["filtered_v"] if p["sense_filter_s"] > 0.0 else s["voltage_v"], p["sense_filter_s"]
+    farad = p["crosstalk_own_f_per_v"] * volt[i]
+    for j in range(3):
+        if j != i:
+            farad += p["crosstalk_others_f_per_v"] * volt[j]
+    if tau > 0.0:  # of a filter, what it shows of the rate is what it lags by, over tau
+        farad += p["crosstalk_rate_f_per_v_per_s"] * (s["voltage_v"][i] - volt[i]) / tau
+    return float(farad)
+
+
+@njit(cache=True, error_model="numpy")
 def walk(p: np.void, s: np.void, dt_s: float) -> None:
     """Random walk of the channels' offsets over dt_s."""
     size = p["sense_walk_f_per_rt_s"] * math.sqrt(dt_s)
@@ -103,7 +134,10 @@ def sample(params: np.ndarray, state: np.ndarray, counts: np.ndarray) -> None:
         for i in range(3):
             q[i] = s["filtered_m"][i]
     else:
-        strokes(p, s["motion"], q)
+        if p["mode_count"] > 0:
+            combs_seen(p, s, q, s["rates_m_per_s"])
+        else:
+            strokes(p, s["motion"], q)
         if p["parasitic_on"] != 0:
             for i in range(3):
                 q[i] += p["parasitic_comb"][i] * s["parasitic"][0]
@@ -113,5 +147,13 @@ def sample(params: np.ndarray, state: np.ndarray, counts: np.ndarray) -> None:
         farad += p["sense_offset_f"][i] + s["sense_walk_f"][i] + p["feedthrough_f_per_v"] * s["voltage_v"][i]
         if p["sense_noise_f"] > 0.0:
             farad += p["sense_noise_f"] * normal(s["random"][SENSE_STREAM + i], s["spare"][SENSE_STREAM + i])
+        if p["sense_chain_noise_f"] > 0.0:
+            farad += p["sense_chain_noise_f"] * s["sense_chain_noise"][i]
+        if p["crosstalk_on"] != 0:
+            farad += _crosstalk(p, s, i)
+        if p["sense_flicker_on"] != 0:
+            farad += p["sense_flicker_f"] * s["sense_flicker"][i].sum()
+        if p["tone_count"] > 0:
+            farad += hum(p, s, i)
         fine = max(-40000.0, min(40000.0, (farad - p["count_zero_f"]) / p["count_f"]))  # before floor: it makes an int
         counts[i] = min(32767, max(-32768, math.floor(fine / step + 0.5) * step))

@@ -4,6 +4,7 @@ import numpy as np
 from numba import njit
 
 from sim.geometry import strokes
+from sim.structure.pose import combs_seen, stand
 
 
 @njit(cache=True, error_model="numpy")
@@ -11,8 +12,14 @@ def observe(plant: np.void, state: np.void, out: np.void) -> None:
     """Write ``position_m``, ``stroke_m`` and ``comb_voltage_v`` (3,) of a plant's records to those fields of the
     record ``out``.
 
-    As ``sim.plant.Plant`` defines them: the parasitic mode's part is in the position and in the strokes.
+    As ``sim.plant.Plant`` defines them: the modes' part is in the position and in the strokes.
     """
+    if plant["general_on"] != 0 or plant["tilt_on"] != 0:
+        combs_seen(plant, state, out["stroke_m"], state["rates_m_per_s"])
+        stand(plant, state, out["position_m"])
+        for i in range(3):
+            out["comb_voltage_v"][i] = state["voltage_v"][i]
+        return
     strokes(plant, state["motion"], out["stroke_m"])
     sway = state["parasitic"][0]
     for i in range(3):
