@@ -7,11 +7,11 @@ import math
 import numpy as np
 from numba import njit
 
-from sim.amplifier import charge, drive, plan, snap, snapped
-from sim.integrator import step
-from sim.layout import BROKEN, BROWNIAN_STREAM, DRIFT_STREAM, EVENTS, PULLED_IN, STOP
-from sim.noise import normal
-from sim.parasitic import parasitic_step
+from sim.motion.amplifier import charge, drive, plan, snap, snapped
+from sim.motion.integrator import step
+from sim.motion.layout import BROKEN, BROWNIAN_STREAM, DRIFT_STREAM, EVENTS, PULLED_IN, STOP
+from sim.motion.noise import normal
+from sim.motion.parasitic import parasitic_step
 from sim.sense import follow, follow_voltages, pass_noise, sample, walk
 from sim.structure.general_step import general_step
 from sim.structure.pose import combs_seen

@@ -4,13 +4,13 @@ import math
 
 import numpy as np
 
-from sim import layout
 from sim.config import Device, PlantConfig
-from sim.geometry import strokes
-from sim.layout import PARAMS, STATE
-from sim.mechanics import acceleration, stiffness
-from sim.noise import stream
-from sim.parasitic import rest
+from sim.motion import layout
+from sim.motion.geometry import strokes
+from sim.motion.layout import PARAMS, STATE
+from sim.motion.mechanics import acceleration, stiffness
+from sim.motion.noise import stream
+from sim.motion.parasitic import rest
 from sim.structure.build import build_flexible_modes, build_misalignment, build_tilt
 from sim.structure.pose import combs_seen
 from sim.structure.side import balance

@@ -5,8 +5,9 @@ from typing import NamedTuple
 
 import numpy as np
 
-from sim import kernels, layout
+from sim import kernels
 from sim.config import Device, PlantConfig
+from sim.motion import layout
 from sim.parameters import build_parameters, state_at_rest
 from sim.structure.pose import combs_seen, stand
 

@@ -14,9 +14,9 @@ import math
 import numpy as np
 from numba import njit
 
-from sim.geometry import strokes
-from sim.layout import KNOTS, SENSE_DRIFT_STREAM, SENSE_STREAM
-from sim.noise import normal
+from sim.motion.geometry import strokes
+from sim.motion.layout import KNOTS, SENSE_DRIFT_STREAM, SENSE_STREAM
+from sim.motion.noise import normal
 from sim.structure.pose import combs_seen
 from sim.surroundings.tones import hum
 

@@ -3,7 +3,7 @@
 import numpy as np
 from numba import njit
 
-from sim.geometry import strokes
+from sim.motion.geometry import strokes
 from sim.structure.pose import combs_seen, stand
 
 

@@ -4,10 +4,10 @@ import math
 
 import numpy as np
 
-from sim.device import Device
-from sim.integrator import LONGEST_S
-from sim.layout import SIZE
-from sim.structure.config import FingerMisalignment, FlexibleModes, TableTilt
+from sim.config.device import Device
+from sim.config.structure import FingerMisalignment, FlexibleModes, TableTilt
+from sim.motion.integrator import LONGEST_S
+from sim.motion.layout import SIZE
 
 STEPS_A_PERIOD = 6.0
 """General steps in a period of the fastest mode: the order-8 method's own share of the longest rigid step."""

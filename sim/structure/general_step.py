@@ -7,20 +7,20 @@ x = y - sum kappa_j r_j where the mechanism is:
     m_j r_j'' = u_j . F - kappa_j . P - m_j (w_j^2 r_j + w_j / Q_j r_j')
 
 from the kinetic energy m y'^2 / 2 + sum m_j r_j'^2 / 2 and the potential V(x) + sum m_j w_j^2 r_j^2 / 2: what a mode
-takes the others get. The method is that of ``sim.integrator``, with the amplifier's transient and the damping taken out
-in the same way; steps are shorter, for the fastest mode."""
+takes the others get. The method is that of ``sim.motion.integrator``, with the amplifier's transient and the damping
+taken out in the same way; steps are shorter, for the fastest mode."""
 
 import math
 
 import numpy as np
 from numba import njit
 
-from sim.amplifier import pass_time
-from sim.geometry import E_X, E_Y, N_X, N_Y, leg, lift
-from sim.integrator import CONTACT_S, LAST, tabulate, times
-from sim.layout import CUBIC, MODES
-from sim.mechanics import comb_acceleration, undamped_acceleration
-from sim.nystrom import B_RATE, STAGES, A, B, C
+from sim.motion.amplifier import pass_time
+from sim.motion.geometry import E_X, E_Y, N_X, N_Y, leg, lift
+from sim.motion.integrator import CONTACT_S, LAST, tabulate, times
+from sim.motion.layout import CUBIC, MODES
+from sim.motion.mechanics import comb_acceleration, undamped_acceleration
+from sim.motion.nystrom import B_RATE, STAGES, A, B, C
 
 
 @njit(cache=True, error_model="numpy")
@@ -98,7 +98,7 @@ def _answer(response: np.ndarray, given: np.ndarray, n: int, out: np.ndarray) ->
 
 @njit(cache=True, error_model="numpy")
 def _transient(p: np.void, s: np.void, n: int) -> None:
-    """As in ``sim.integrator``, of all coordinates: s["general_one"], s["general_two"] and what they push."""
+    """As in ``sim.motion.integrator``, of all coordinates: s["general_one"], s["general_two"] and what they push."""
     error, pose, pull = s["error_v"], s["pose"], s["pull"]
     if error[0] == 0.0 and error[1] == 0.0 and error[2] == 0.0:
         for j in range(n):

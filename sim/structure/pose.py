@@ -6,7 +6,7 @@ point of interest = table + tilt_shift table"""
 import numpy as np
 from numba import njit
 
-from sim.geometry import stroke_rates, strokes
+from sim.motion.geometry import stroke_rates, strokes
 
 
 @njit(cache=True, error_model="numpy")

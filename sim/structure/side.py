@@ -12,7 +12,7 @@ method from y = 0 climbs to the smallest root, and where K - F' loses its sign b
 import numpy as np
 from numba import njit
 
-from sim.geometry import strokes
+from sim.motion.geometry import strokes
 
 
 @njit(cache=True, error_model="numpy")

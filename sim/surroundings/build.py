@@ -4,11 +4,11 @@ import math
 
 import numpy as np
 
-from sim import layout
-from sim.config import PlantConfig
-from sim.layout import FLICKERS, TONES
-from sim.noise import next_u64, normal, stream
-from sim.surroundings.config import Flicker, FloorVibration, Mains
+from sim.config.plant_file import PlantConfig
+from sim.config.surroundings import Flicker, FloorVibration, Mains
+from sim.motion import layout
+from sim.motion.layout import FLICKERS, TONES
+from sim.motion.noise import next_u64, normal, stream
 from sim.surroundings.tones import sum_tones
 
 TONES_A_BAND = 3
@@ -19,7 +19,7 @@ NOMINAL = 1.03
 
 
 def build_surroundings(p: np.void, config: PlantConfig) -> None:
-    """Everything in the sections of ``sim.surroundings.config``; call when the mechanism's parameters stand."""
+    """Everything in the sections of ``sim.config.surroundings``; call when the mechanism's parameters stand."""
     p["shaken_on"] = config.base_noise.on
     if config.base_noise.on:
         p["base_m_per_s2_per_rt_hz"] = config.base_noise.density_m_per_s2_per_rt_hz

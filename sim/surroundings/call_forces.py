@@ -10,8 +10,15 @@ import math
 import numpy as np
 from numba import njit
 
-from sim.layout import AMPLIFIER_FLICKER_STREAM, AMPLIFIER_STREAM, BASE_STREAM, CUBIC, FLICKERS, SENSE_FLICKER_STREAM
-from sim.noise import normal
+from sim.motion.layout import (
+    AMPLIFIER_FLICKER_STREAM,
+    AMPLIFIER_STREAM,
+    BASE_STREAM,
+    CUBIC,
+    FLICKERS,
+    SENSE_FLICKER_STREAM,
+)
+from sim.motion.noise import normal
 from sim.surroundings.tones import sum_tones, turn_tones
 
 

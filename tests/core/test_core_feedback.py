@@ -9,7 +9,7 @@ from scipy.integrate import solve_ivp
 from sim_rig import config, plant
 
 from pkxyz_ctrl.core import feedback, tick
-from sim.mechanics import acceleration
+from sim.motion.mechanics import acceleration
 
 PERIOD_S = bus().period_us * 1e-6
 

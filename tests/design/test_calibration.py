@@ -102,7 +102,7 @@ def test_the_plants_own_numbers_are_found(comb, leaf, crank, link, mass, lift, s
 
 def strokes_under(plant, squared_v2):
     """Where the plant rests."""
-    from sim.geometry import strokes
+    from sim.motion.geometry import strokes
     from sim.parameters import equilibrium
 
     p, s = plant.params[0], plant.state[0].copy()

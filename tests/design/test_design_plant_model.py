@@ -10,7 +10,7 @@ from sim_rig import config, plant
 
 from pkxyz_ctrl.design.law import amplifier_time_constant_s
 from pkxyz_ctrl.design.model.plant_model import linearise, sample
-from sim.mechanics import acceleration
+from sim.motion.mechanics import acceleration
 
 TAU_S = amplifier_time_constant_s(stage())
 UNIT = np.repeat([1e-6, 1e-3, 1e-4], 3)  # sizes of the states, to compare blocks of unlike units

@@ -30,7 +30,11 @@ class Room(NamedTuple):
 
 
 HOUSE: Mapping[str, Room] = MappingProxyType({
-    "sim": Room((), (*NUMBERS, *VALUES, "scipy", "pydantic", "tomllib", "pathlib")),
+    "sim.config": Room((), (*VALUES, "math", "pydantic", "tomllib", "pathlib")),
+    "sim.motion": Room(("sim.config",), (*NUMBERS, *VALUES)),
+    "sim.structure": Room(("sim.config", "sim.motion"), NUMBERS),
+    "sim.surroundings": Room(("sim.config", "sim.motion"), NUMBERS),
+    "sim": Room(("sim.config", "sim.motion", "sim.structure", "sim.surroundings"), (*NUMBERS, *VALUES)),
     # what runs on the target
     "pkxyz_ctrl.can": Room((), ("pydantic", *VALUES)),
     "pkxyz_ctrl.safety": Room(("pkxyz_ctrl.can",), ("numpy", "numba", *VALUES)),
@@ -60,7 +64,7 @@ HOUSE: Mapping[str, Room] = MappingProxyType({
     # the harness: what the controller meets
     "hil.bus": Room(("pkxyz_ctrl.can", "pkxyz_ctrl.compiled", "pkxyz_ctrl.io")),
     "hil.node": Room(("pkxyz_ctrl.can",)),
-    "hil.plant": Room(("sim", "pkxyz_ctrl.compiled", "pkxyz_ctrl.loop", "pkxyz_ctrl")),
+    "hil.plant": Room(("sim.motion", "sim.structure", "sim", "pkxyz_ctrl.compiled", "pkxyz_ctrl.loop", "pkxyz_ctrl")),
     "hil.recording": Room(("pkxyz_ctrl.can", "pkxyz_ctrl.loop", "hil.bus")),
     "hil.faults": Room((
         "sim", "pkxyz_ctrl.can", "pkxyz_ctrl.safety", "pkxyz_ctrl.config", "pkxyz_ctrl.loop", "hil.bus", "hil.node",
@@ -68,10 +72,10 @@ HOUSE: Mapping[str, Room] = MappingProxyType({
     )),
     # a loop that is closed, once
     "hil.lanes": Room(
-        ("sim", "pkxyz_ctrl.*", "hil.bus", "hil.node", "hil.plant", "hil.recording", "hil.faults")
+        ("sim.config", "sim", "pkxyz_ctrl.*", "hil.bus", "hil.node", "hil.plant", "hil.recording", "hil.faults")
     ),
-    "hil.conformance": Room(("sim", "pkxyz_ctrl.*", "hil.bus", "hil.node", "hil.plant", "hil.lanes")),
-    "hil.runs": Room(("sim", "pkxyz_ctrl.*", "hil.recording", "hil.faults", "hil.lanes")),
+    "hil.conformance": Room(("sim.config", "sim", "pkxyz_ctrl.*", "hil.bus", "hil.node", "hil.plant", "hil.lanes")),
+    "hil.runs": Room(("sim.config", "pkxyz_ctrl.*", "hil.recording", "hil.faults", "hil.lanes")),
     # many times, for one question
     "hil.studies.spread": Room(("pkxyz_ctrl.*",)),
     "hil.studies.margins": Room(("pkxyz_ctrl.*", "hil.lanes")),
@@ -79,7 +83,7 @@ HOUSE: Mapping[str, Room] = MappingProxyType({
     "hil.studies.tune": Room(("pkxyz_ctrl.*", "hil.lanes", "hil.runs", "hil.studies.spread")),
     "hil.studies.faults": Room(("pkxyz_ctrl.*", "hil.faults", "hil.lanes", "hil.runs")),
     "hil.studies": Room((
-        "sim", "pkxyz_ctrl.*", "hil.recording", "hil.faults", "hil.lanes", "hil.runs", "hil.studies.spread",
+        "sim.config", "pkxyz_ctrl.*", "hil.recording", "hil.faults", "hil.lanes", "hil.runs", "hil.studies.spread",
         "hil.studies.margins", "hil.studies.faults",
     )),
     # what a person meets
@@ -88,7 +92,7 @@ HOUSE: Mapping[str, Room] = MappingProxyType({
         "hil.studies.identify", "hil.studies.tune", "hil.studies.faults", "hil.studies",
     )),
     "hil.screen": Room(("pkxyz_ctrl.*", "hil.runs", "hil.studies.margins")),
-    "hil.bench.rigs": Room(("sim", "pkxyz_ctrl.*", "hil.lanes", "hil.runs")),
+    "hil.bench.rigs": Room(("sim.motion", "sim", "pkxyz_ctrl.*", "hil.lanes", "hil.runs")),
     "hil.bench": Room((
         "pkxyz_ctrl.*", "hil.bus", "hil.plant", "hil.recording", "hil.lanes", "hil.runs", "hil.studies.spread",
         "hil.studies.margins", "hil.studies.tune", "hil.studies", "hil.screen", "hil.bench.rigs",

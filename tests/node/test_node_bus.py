@@ -13,7 +13,7 @@ from pkxyz_ctrl.can.driver import AmplifierDriver, DriverState
 from pkxyz_ctrl.can.driver_config import DriverConfig
 from pkxyz_ctrl.can.frame import Frame
 from sim.config import PlantConfig
-from sim.device import Device
+from sim.config.device import Device
 from sim.plant import Plant as SimPlant
 
 CONFIGS = Path(__file__).parents[2] / "configs"

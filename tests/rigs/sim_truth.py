@@ -7,10 +7,10 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from sim.geometry import strokes
-from sim.mechanics import acceleration
+from sim.motion.geometry import strokes
+from sim.motion.mechanics import acceleration
+from sim.motion.parasitic import rest
 from sim.parameters import equilibrium
-from sim.parasitic import rest
 from sim.plant import Plant
 
 Array = NDArray[np.float64]

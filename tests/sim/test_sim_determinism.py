@@ -16,7 +16,7 @@ from sim.config import PlantConfig
 from sim.kernels import advance, drive, sample
 
 ROOT = CONFIGS.parent
-NAMES = ["nominal", "mild", "harsh"]
+NAMES = ["nominal", "mild", "harsh", "lab"]
 
 
 def load(name):

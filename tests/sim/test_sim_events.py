@@ -85,7 +85,7 @@ def test_pull_in_law():
         assert [e.kind for e in p.events] == expected
 
 
-@pytest.mark.parametrize("name", ["nominal", "mild", "harsh"])
+@pytest.mark.parametrize("name", ["nominal", "mild", "harsh", "lab"])
 def test_shipped_plants_survive_full_voltage(name):
     """No pull-in, nothing broken at 200 V on any set of combs."""
     p = plant(PlantConfig.load(CONFIGS / "plants" / f"{name}.toml"))
@@ -113,7 +113,7 @@ def test_a_blow_breaks_it_once_and_for_all():
 
 @settings(deadline=None, max_examples=60)
 @given(
-    st.sampled_from(["nominal", "mild", "harsh"]),
+    st.sampled_from(["nominal", "mild", "harsh", "lab"]),
     st.lists(
         st.tuples(
             st.tuples(*[st.integers(-32768, 32767)] * 3),

@@ -7,7 +7,7 @@ from sim_rig import config, counts, plant, settle
 from test_sim_effects import MODES
 from test_sim_integrator import PM, scan
 
-from sim.mechanics import acceleration, energy
+from sim.motion.mechanics import acceleration, energy
 from sim.parameters import rest_stiffness
 
 QUIET = {"amplifier_bandwidth": {"corner_hz": 30e3}}

@@ -10,8 +10,8 @@ from scipy.optimize import minimize
 from sim_rig import DEVICE, config, counts, plant, settle
 
 from sim.config import Device
-from sim.geometry import E_X, E_Y, N_X, N_Y, jacobian, strokes
-from sim.mechanics import acceleration, arcsine, comb_acceleration, energy
+from sim.motion.geometry import E_X, E_Y, N_X, N_Y, jacobian, strokes
+from sim.motion.mechanics import acceleration, arcsine, comb_acceleration, energy
 from sim.parameters import rest_stiffness
 
 PLAIN = plant(config())

@@ -7,7 +7,7 @@ from hypothesis import strategies as st
 from scipy import stats
 from sim_rig import GRADIENT_F_PER_M, config, plant, settle
 
-from sim.noise import next_u64, normal, stream
+from sim.motion.noise import next_u64, normal, stream
 
 
 @settings(deadline=None, max_examples=30)

@@ -6,7 +6,7 @@ from math import factorial
 import numpy as np
 from scipy.integrate import solve_ivp
 
-from sim import nystrom
+from sim.motion import nystrom
 
 
 def exact(values: np.ndarray) -> list[Fraction]:

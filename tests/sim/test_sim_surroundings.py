@@ -8,9 +8,9 @@ from scipy import optimize, signal
 from sim_rig import DEVICE, GRADIENT_F_PER_M, config, counts, plant, settle
 
 from sim.config import PlantConfig
+from sim.config.surroundings import FloorVibration
 from sim.parameters import rest_stiffness
 from sim.surroundings.build import build_surroundings
-from sim.surroundings.config import FloorVibration
 
 FS_HZ = 5000.0
 
@@ -292,7 +292,7 @@ def test_crosstalk_passes_the_chain():
 
 def test_lines_have_room():
     """The widest floor and all harmonics fit into the record of parameters."""
-    from sim.layout import PARAMS, TONES
+    from sim.motion.layout import PARAMS, TONES
 
     p = np.zeros(1, PARAMS)
     harmonics = tuple({"order": k} for k in range(1, 9))

@@ -22,7 +22,7 @@ from hil.studies.identify.plant_response import _spectra, measure_plant
 from hil.studies.margins.measured import at_point
 from pkxyz_ctrl.config.files import ConfigError
 from pkxyz_ctrl.design.identification.modal_fit import FitError, fit_modes
-from sim.geometry import strokes
+from sim.motion.geometry import strokes
 
 CHAINS = range(3)
 

@@ -8,7 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.integrate import solve_ivp
 
-from sim.mechanics import acceleration
+from sim.motion.mechanics import acceleration
 
 Array = NDArray[np.float64]
 

@@ -13,7 +13,7 @@ import math
 import numpy as np
 from numba import njit
 
-from sim.geometry import E_X, E_Y, N_X, N_Y, leg, lift
+from sim.motion.geometry import E_X, E_Y, N_X, N_Y, leg, lift
 
 
 @njit(cache=True)

@@ -19,9 +19,9 @@ import math
 import numpy as np
 from numba import njit
 
-from sim.amplifier import pass_time
-from sim.mechanics import comb_acceleration, undamped_acceleration
-from sim.nystrom import B_RATE, STAGES, A, B, C
+from sim.motion.amplifier import pass_time
+from sim.motion.mechanics import comb_acceleration, undamped_acceleration
+from sim.motion.nystrom import B_RATE, STAGES, A, B, C
 
 LONGEST_S = 205e-6
 """Longest step: a sixth of the fastest rigid mode's period, at which the order-8 method is exact to 1e-14 m in a

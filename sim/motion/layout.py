@@ -5,11 +5,12 @@ no kernel allocates."""
 
 import numpy as np
 
-from sim.nystrom import STAGES
+from sim.config.structure import MODES_MAX
+from sim.motion.nystrom import STAGES
 
 KNOTS = 64
 """Remembered ends of steps, for the sense chain's delay."""
-MODES = 3
+MODES = MODES_MAX
 """Flexible modes at most."""
 SIZE = 3 + MODES
 """Coordinates of table and flexible modes."""

@@ -4,9 +4,10 @@ from typing import Annotated
 
 from pydantic import Field
 
-from sim.device import Positive
-from sim.layout import MODES
-from sim.model import Model, PerAxis, PerChain
+from sim.config.device import Positive
+from sim.config.section import Model, PerAxis, PerChain
+
+MODES_MAX = 3
 
 
 class FlexibleMode(Model):
@@ -29,7 +30,7 @@ class FlexibleModes(Model):
     back."""
 
     on: bool = False
-    modes: Annotated[tuple[FlexibleMode, ...], Field(max_length=MODES)] = ()
+    modes: Annotated[tuple[FlexibleMode, ...], Field(max_length=MODES_MAX)] = ()
 
 
 class FingerMisalignment(Model):

@@ -10,7 +10,7 @@ import math
 import numpy as np
 from numba import njit
 
-from sim.geometry import strokes
+from sim.motion.geometry import strokes
 
 
 @njit(cache=True, error_model="numpy")

@@ -4,7 +4,7 @@ from typing import Annotated
 
 from pydantic import BaseModel, ConfigDict, Field
 
-from sim.device import Finite
+from sim.config.device import Finite
 
 NotNegative = Annotated[float, Field(ge=0, allow_inf_nan=False)]
 Relative = Annotated[float, Field(gt=-0.9, lt=9.0)]

@@ -4,8 +4,8 @@ from typing import Annotated, Self
 
 from pydantic import Field, model_validator
 
-from sim.device import Finite, Positive
-from sim.model import Model, NotNegative, RelativePerChain
+from sim.config.device import Finite, Positive
+from sim.config.section import Model, NotNegative, RelativePerChain
 
 Level = NotNegative
 

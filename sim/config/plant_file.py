@@ -9,10 +9,10 @@ from typing import Annotated, Literal, Self
 
 from pydantic import AfterValidator, Field, model_validator
 
-from sim.device import Device, Finite, Positive
-from sim.model import Model, NotNegative, PerChain, Relative, RelativePerChain
-from sim.structure.config import FingerMisalignment, FlexibleModes, TableTilt
-from sim.surroundings.config import (
+from sim.config.device import Device, Finite, Positive
+from sim.config.section import Model, NotNegative, PerChain, Relative, RelativePerChain
+from sim.config.structure import FingerMisalignment, FlexibleModes, TableTilt
+from sim.config.surroundings import (
     Ageing,
     AmplifierNoise,
     BaseNoise,
