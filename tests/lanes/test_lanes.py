@@ -21,7 +21,8 @@ from pkxyz_ctrl.loop.row import ROW
 from pkxyz_ctrl.safety.gate import TransmitGate
 from pkxyz_ctrl.safety.modes import Mode
 
-CASES = [("nominal", "fd_5k"), ("nominal", "classic_2k"), ("mild", "fd_5k"), ("harsh", "fd_5k"), ("mild", "classic_2k"), ("lab", "fd_5k")]
+PLANTS = ("nominal", "mild", "harsh", "lab")
+CASES = [*((plant, "fd_5k") for plant in PLANTS), ("nominal", "classic_2k"), ("mild", "classic_2k")]
 
 
 @pytest.mark.parametrize(("plant", "bus_name"), CASES)
