@@ -192,11 +192,11 @@ def clear_event(settled: bool) -> int:
 def next_homed(homed: bool, mode: int, event: int) -> bool:
     """Whether the sense offsets are known after ``event`` in ``mode``.
 
-    They become known when homing ends well, and are forgotten in BOOT: a node that was away, or a fault, may have
-    changed what they correct. A homing broken off leaves what was known before.
+    They become known when homing ends well. They are forgotten in BOOT, since a node that was away, or a fault, may
+    have changed what they correct, and in HOMING, which begins with none: broken off, it leaves none.
     """
     target = next_mode(mode, event)
-    if target == _BOOT:
+    if target in (_BOOT, _HOMING):
         return False
     return homed or (mode == _HOMING and event == _HOMED)
 

@@ -103,6 +103,25 @@ def test_homing_again_starts_from_nothing():
     assert zero == pytest.approx(np.full(3, 100.0), abs=0.51)
 
 
+def test_nobody_enables_after_a_homing_that_was_broken_off():
+    """HOME, HOMED, HOME, DISABLE, ENABLE closed the loop with offsets of zero."""
+    c = Cycle(law(autostart=False))
+    for k in range(HOMING_TICKS):
+        c.tick(noisy(AT_REST + 100, k), event=Event.HOME if k == 0 else Event.NONE)
+    assert c.memory["tick"]["sense_zero_f"].all()
+    c.tick(noisy(AT_REST + 100, 0), event=Event.HOME)
+    assert not c.memory["tick"]["sense_zero_f"].any()
+    c.tick(noisy(AT_REST + 100, 1), event=Event.DISABLE)
+    for k in range(20):
+        row = c.tick(noisy(AT_REST + 100, k), event=Event.ENABLE)
+        assert c.mode is Mode.IDLE
+        assert row["event"] == Event.ENABLE_UNHOMED
+    for k in range(HOMING_TICKS):
+        c.tick(noisy(AT_REST + 100, k), event=Event.HOME if k == 0 else Event.NONE)
+    c.tick(noisy(AT_REST + 100, 0), event=Event.ENABLE)
+    assert c.mode is Mode.ENABLED
+
+
 def test_nobody_enables_before_homing():
     c = Cycle(law(autostart=False))
     for k in range(5):

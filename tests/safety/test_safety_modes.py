@@ -159,7 +159,7 @@ def test_loop_closes_only_after_homing_since_the_last_boot(choices: list[tuple[b
         homed, mode = next_homed(homed, mode, asked), int(next_mode(mode, asked))
         if was == Mode.HOMING and event is Event.HOMED:
             homed_since_boot = True
-        if mode == Mode.BOOT:
+        if mode in (Mode.BOOT, Mode.HOMING):
             homed_since_boot = False
         assert homed == homed_since_boot
         if modes.LOOP_CLOSED[mode]:
@@ -173,6 +173,20 @@ def test_offsets_are_forgotten_with_the_node_and_with_a_fault(way: list[Event]) 
         assert homed
         homed, mode = next_homed(homed, mode, int(event)), int(next_mode(mode, int(event)))
     assert (mode, homed) == (Mode.BOOT, False)
+
+
+@pytest.mark.parametrize("ending", [Event.DISABLE, Event.NODE_LOST, Event.TRIP])
+def test_a_homing_broken_off_leaves_no_offsets(ending: Event) -> None:
+    """It has put them to zero; what was known before it is gone."""
+
+    def after(homed: bool, mode: Mode, event: Event) -> bool:
+        return bool(next_homed(homed, int(mode), int(event)))
+
+    assert not after(True, Mode.IDLE, Event.HOME)
+    assert not after(False, Mode.HOMING, Event.NONE)
+    assert not after(after(True, Mode.IDLE, Event.HOME), Mode.HOMING, ending)
+    assert after(False, Mode.HOMING, Event.HOMED)
+    assert after(True, Mode.IDLE, Event.ENABLE)
 
 
 def test_the_way_to_tracking_and_back() -> None:
