@@ -51,6 +51,27 @@ _CLASS = {
     0xF0: "additional functions",
     0xFF: "device specific",
 }
+# By code, then by class: most particular first.
+_REMEDY = (
+    (0xFFFF, 0x8130, "it missed our heartbeat, so the computer or the bus stood still: see what held them up"),
+    (0xFFFF, 0x8250, "no voltage reached it in time, so the computer or the bus stood still: see what held them up"),
+    (0xFF00, 0x8100, "check wiring, termination and bit rates of the bus"),
+    (
+        0xFF00,
+        0x8200,
+        "frames were lost, damaged or sent by another: check the bus's wiring and load, and who else sends",
+    ),
+    (
+        0xFFF8,
+        0xFF10,
+        "frames were lost, damaged or sent by another: check the bus's wiring and load, and who else sends",
+    ),
+    (0xF000, 0x2000, "over-current means a short or dust in a comb, so do not just try again"),
+    (0xF000, 0x3000, "check the amplifier's supply and its high voltage"),
+    (0xF000, 0x4000, "let it cool down, and see to its ventilation"),
+    (0xF000, 0x5000, "restart the amplifier; if it says so again, it needs repair"),
+    (0xF000, 0x6000, "restart the amplifier; if it says so again, it needs repair"),
+)
 _FRAME = struct.Struct("<HB5s")
 
 
@@ -72,6 +93,17 @@ class Emergency(NamedTuple):
         """For a person, e.g. ``EMCY 0x2310: current, output side (error register 0x03)``."""
         suffix = f", data {self.manufacturer.hex(' ')}" if any(self.manufacturer) else ""
         return f"EMCY 0x{self.code:04X}: {code_text(self.code)} (error register 0x{self.register:02X}{suffix})"
+
+    def told_at(self, t_us: int) -> str:
+        """``text`` with how long before ``t_us`` it came, and what to do, unless it says that an error is over."""
+        remedy = "" if self.is_reset else f"; {code_remedy(self.code)}"
+        return f"{self.text}, {max(0, t_us - self.t_us) / 1000:.1f} ms before{remedy}"
+
+
+def code_remedy(code: int) -> str:
+    """What to do about an emergency error code."""
+    found = (remedy for mask, kind, remedy in _REMEDY if code & mask == kind)
+    return next(found, "look the code up in the amplifier's manual")
 
 
 def code_text(code: int) -> str:

@@ -128,7 +128,7 @@ EXPLANATIONS: Final[dict[Trip, tuple[str, str]]] = {
     ),
     Trip.NODE_EMERGENCY: (
         "the amplifier reported a fault of its own",
-        "read the emergency code in the log: over-current means a short or dust in a comb, so do not just try again",
+        "its emergency code says what, and what to do about it",
     ),
     Trip.GATE_BLOCKED: (
         "a frame that may not be sent was held back at the last moment",

@@ -3,7 +3,7 @@
 import pytest
 from canopen.sdo.exceptions import SdoAbortedError
 
-from pkxyz_ctrl.can.emergency import code_text, decode_emergency
+from pkxyz_ctrl.can.emergency import code_remedy, code_text, decode_emergency
 from pkxyz_ctrl.can.sdo import ABORT_TEXT, ReplyKind, SdoDialogue, SdoStep, abort_text, parse_reply, request
 
 
@@ -179,6 +179,30 @@ def test_emergency_codes_as_text(code, text):
 
 def test_every_emergency_code_has_a_text():
     assert all(code_text(code) for code in range(0x10000))
+
+
+@pytest.mark.parametrize(
+    ("code", "word"),
+    [
+        (0x2310, "short or dust"), (0x2000, "short or dust"), (0x3210, "supply"), (0x4210, "cool"), (0x5000, "repair"),
+        (0x6100, "repair"), (0x8130, "heartbeat"), (0x8250, "in time"), (0x8120, "termination"), (0x8240, "who else"),
+        (0xFF10, "who else"), (0xFF14, "who else"), (0xFF20, "manual"), (0x1000, "manual"),
+    ],
+)  # fmt: skip
+def test_what_to_do_follows_the_code(code, word):
+    assert word in code_remedy(code)
+    assert ("over-current" in code_remedy(code)) == (code >> 12 == 2)
+
+
+def test_an_emergency_is_told_by_the_time_since_it_came():
+    emergency = decode_emergency(bytes.fromhex("30 81 11 00 00 00 00 00"), 7_000_000)
+    assert emergency.told_at(7_001_550) == (
+        "EMCY 0x8130: heartbeat of the controller missed (error register 0x11), 1.6 ms before; it missed our "
+        "heartbeat, so the computer or the bus stood still: see what held them up"
+    )
+    over = decode_emergency(bytes(8), 10)
+    assert over.told_at(10) == "EMCY 0x0000: error reset or no error (error register 0x00), 0.0 ms before"
+    assert over.told_at(0).endswith("0.0 ms before")  # it came in the tick that tells
 
 
 def test_emergency_frame():
