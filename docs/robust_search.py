@@ -5,13 +5,13 @@ files. Takes some minutes, so it is no part of ``make docs``.
 import numpy as np
 import tomlkit
 
+from hil.studies.tune.minimax import AxisLaw, Bounds, axis_law, minimax
 from pkxyz_ctrl.config.bus import BusConfig
 from pkxyz_ctrl.config.controller import ControllerConfig
 from pkxyz_ctrl.config.files import CONFIG_DIR, load
 from pkxyz_ctrl.design.hold_noise import rounding_force_n
 from pkxyz_ctrl.design.law import design_law
 from pkxyz_ctrl.design.laws.estimator_gain import measurement_noise
-from pkxyz_ctrl.design.laws.minimax import AxisLaw, Bounds, axis_law, minimax
 from pkxyz_ctrl.design.lqg_equivalent import lqg_equivalent
 from pkxyz_ctrl.design.margins.tolerances import Tolerances
 from pkxyz_ctrl.design.model.loop_plant import LoopPlant, Perturbation, loop_plant

@@ -67,7 +67,6 @@ class PdoParameters:
         self._protection = protection
         self._protected = protected
         plain = tuple((values, subindex) for subindex in (1, 2, 3))
-        self.plain_fields = plain
         self.protected_fields = (*plain, (protection, 1), (protection, 2))
         if not protected:
             od.install(self.mapping, 0, 3)

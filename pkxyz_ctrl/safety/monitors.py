@@ -21,13 +21,6 @@ from numba import njit
 from numpy.typing import NDArray
 
 from pkxyz_ctrl.safety.modes import LOOP_CLOSED, NODE_EXPECTED, Mode
-from pkxyz_ctrl.safety.thresholds import (
-    FORCE_CHANGE_MAX_N,
-    FORCE_CHANGE_SHARE,
-    FORCE_TREND_S,
-    RESIDUAL_MAX_M,
-    UNEXPLAINED_FORCE_MAX_N,
-)
 from pkxyz_ctrl.safety.trips import Trip
 
 
@@ -84,6 +77,14 @@ LIMITS: Final = np.dtype(
     ],
     align=True,
 )
+"""A law's own, from the [monitors] of its controller file; what the forces may be is explained in ``thresholds``.
+
+The innovation is a few nm when all is well, up to 540 nm for a tick or two where a fast circle begins on the harsh
+plant, and the shock of a snap is micrometres, hence 500 nm for an axis in five ticks. Identical counts for 50 ticks do
+not happen while noise spans several counts (0.2^50). 250 ticks at a bound are 50 ms, longer than any move across the
+workspace takes. A frame that is lost or late counts as it fails to come and as the next one's counter has jumped, one
+that is repeated or out of order twice: four of them in short order are a fault, since the bus does neither.
+"""
 
 # Counts of ticks, except the *_level: events times the bucket's leak_ticks. All zero is a healthy beginning.
 MONITOR_MEMORY: Final = np.dtype(
@@ -127,47 +128,6 @@ OBSERVATION: Final = np.dtype(
     ],
     align=True,
 )
-
-
-def default_limits() -> NDArray[np.void]:
-    """(1,) of LIMITS, for a 25 um stage at 5 kHz with 2 nm rms of sense noise.
-
-    The innovation is a few nm when all is well, up to 540 nm for a tick or two where a fast circle begins on the harsh
-    plant, and the shock of a snap is micrometres, hence 500 nm for an axis in five ticks. Those of strokes and forces
-    are explained where they stand, in ``thresholds``. Identical counts for 50 ticks do not happen while noise spans
-    several counts (0.2^50). 250 ticks at a bound are 50 ms, longer than any move across the workspace takes. A frame
-    that is lost or late counts as it fails to come and as the next one's counter has jumped, one that is repeated or
-    out of order twice: four of them in short order are a fault, since the bus does neither.
-    """
-    limits = np.zeros(1, LIMITS)
-    limits["stroke_min_m"] = -2e-6
-    limits["stroke_max_m"] = 27e-6
-    limits["innovation_max_m"] = 0.5e-6
-    limits["residual_max_m"] = RESIDUAL_MAX_M
-    limits["unexplained_force_max_n"] = UNEXPLAINED_FORCE_MAX_N
-    limits["force_change_max_n"] = FORCE_CHANGE_MAX_N
-    limits["force_change_share"] = FORCE_CHANGE_SHARE
-    limits["force_trend_share"] = 200e-6 / FORCE_TREND_S
-    limits["voltage_step_max_v"] = 10.0
-    limits["sense_count_min"] = -32768
-    limits["sense_count_max"] = 32767
-    limits["stale_count"] = 5
-    limits["sequence_count"] = 8
-    limits["crc_count"] = 5
-    limits["length_count"] = 5
-    limits["range_count"] = 3
-    limits["frozen_count"] = 50
-    limits["innovation_count"] = 5
-    limits["residual_count"] = 3
-    limits["unexplained_force_count"] = 5
-    limits["saturation_count"] = 250
-    limits["slew_count"] = 1
-    limits["overrun_count"] = 10
-    limits["solver_count"] = 5
-    limits["frame_leak_ticks"] = 200
-    limits["overrun_leak_ticks"] = 500
-    limits["safe_cycles"] = 10
-    return limits
 
 
 _UNUSABLE = int(SenseStatus.MISSING | SenseStatus.CRC | SenseStatus.LENGTH | SenseStatus.DUPLICATE)

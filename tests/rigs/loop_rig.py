@@ -52,6 +52,11 @@ def controller_with(**sections: dict[str, Any]) -> ControllerConfig:
     return ControllerConfig.model_validate(data)
 
 
+def monitor_limits() -> NDArray[np.void]:
+    """(1,) of ``monitors.LIMITS`` as the shipped controller's law has them; a copy, to be changed."""
+    return law()["limits"].copy()
+
+
 @cache
 def law(bus_name: str = "fd_5k", stage_name: str = "reconstructed", autostart: bool = True) -> NDArray[np.void]:
     """(1,) of ``cycle.LAW`` for the shipped files; read-only."""

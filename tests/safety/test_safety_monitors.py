@@ -7,6 +7,7 @@ import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
+from loop_rig import monitor_limits
 from numpy.typing import NDArray
 
 from pkxyz_ctrl.safety.modes import LOOP_CLOSED, NODE_EXPECTED, Mode
@@ -17,7 +18,6 @@ from pkxyz_ctrl.safety.monitors import (
     NodeEvent,
     SenseStatus,
     check,
-    default_limits,
     implausible_combs,
 )
 from pkxyz_ctrl.safety.trips import EXPLANATIONS, Trip, explain
@@ -30,7 +30,7 @@ class Bench:
     """A memory, its limits, and healthy ticks in which a test changes single fields."""
 
     def __init__(self, mode: Mode = Mode.TRACKING, limits: NDArray[np.void] | None = None) -> None:
-        self.limits = default_limits() if limits is None else limits
+        self.limits = monitor_limits() if limits is None else limits
         self.memory = np.zeros(1, MONITOR_MEMORY)
         self.mode = mode
         self.tick_index = 0
@@ -53,7 +53,7 @@ class Bench:
 
 def only(count_name: str, count: int) -> NDArray[np.void]:
     """Limits with one monitor on."""
-    limits = default_limits()
+    limits = monitor_limits()
     for name in COUNTS:
         limits[name] = -1
     limits[count_name] = count
@@ -92,7 +92,7 @@ STATES: list[tuple[str, Changes, Trip]] = [
     *(
         ("slew_count", {"voltage_step_v": beyond(comb, value)}, Trip.SLEW)
         for comb in range(3)
-        for value in (10.01, -10.01, math.nan)
+        for value in (20.01, -20.01, math.nan)
     ),
     *(
         ("unexplained_force_count", {"unexplained_force_n": beyond(comb, value)}, Trip(Trip.COMB_FORCE_1 << comb))
@@ -214,7 +214,7 @@ def test_frozen_and_range_wait_for_usable_frames() -> None:
 
 
 def test_boundaries_themselves_are_permitted() -> None:
-    limits = default_limits()
+    limits = monitor_limits()
     for name in COUNTS:
         limits[name] = 1
     limits["frozen_count"] = 50
@@ -224,7 +224,7 @@ def test_boundaries_themselves_are_permitted() -> None:
         "sense_count": [-32767, 32766, 0],
         "innovation_m": [0.5e-6, -0.5e-6, 0.0],
         "unexplained_force_n": [0.8e-3, -0.8e-3, 0.0],
-        "voltage_step_v": [10.0, -10.0, 0.0],
+        "voltage_step_v": [limits["voltage_step_max_v"][0], -limits["voltage_step_max_v"][0], 0.0],
     }
     assert Bench(limits=limits).tick(edge) == 0
 
@@ -351,7 +351,7 @@ def test_unknown_mode_owes_nothing(mode: int) -> None:
 
 
 def test_a_stroke_is_implausible_from_just_beyond_the_limit() -> None:
-    limits = default_limits()
+    limits = monitor_limits()
     limit = float(limits["residual_max_m"][0])
     assert limit == 0.7e-6
     for comb in range(3):
@@ -362,7 +362,7 @@ def test_a_stroke_is_implausible_from_just_beyond_the_limit() -> None:
 
 
 def test_a_comb_that_is_only_dragged_along_is_not_named() -> None:
-    limits = default_limits()[0]
+    limits = monitor_limits()[0]
     assert implausible_combs(limits, np.array([9e-6, -2.9e-6, 1.1e-6])) == 0b001
     assert implausible_combs(limits, np.array([9e-6, -3.0e-6, 3.1e-6])) == 0b111
     assert implausible_combs(limits, np.array([-1.2e-6, 0.9e-6, 3.5e-6])) == 0b101
@@ -407,7 +407,7 @@ def test_another_combs_single_outlier_does_not_clear_the_culprit() -> None:
 @pytest.mark.parametrize(("worst", "other"), [(i, k) for i in range(3) for k in range(3) if i != k])
 def test_a_comb_that_the_worst_one_drags_along_is_not_named(worst: int, other: int) -> None:
     """Whichever two they are; from a third of it on, the other is one by itself."""
-    limits = default_limits()[0]
+    limits = monitor_limits()[0]
     for share, named in ((0.3, [worst]), (0.34, [worst, other])):
         residual_m = np.zeros(3)
         residual_m[worst], residual_m[other] = -6e-6, share * 6e-6

@@ -4,11 +4,12 @@ import dataclasses
 import struct
 
 import pytest
+from loop_rig import monitor_limits
 
 from pkxyz_ctrl.can.codec import ProcessCodec
 from pkxyz_ctrl.safety.gate import PERMITTED, FrameKind, GateConfig
 from pkxyz_ctrl.safety.modes import Mode
-from pkxyz_ctrl.safety.monitors import NodeEvent, SenseStatus, default_limits
+from pkxyz_ctrl.safety.monitors import NodeEvent, SenseStatus
 from pkxyz_ctrl.safety.sdo_rules import write_refusal
 from pkxyz_ctrl.safety.trips import Trip
 
@@ -215,10 +216,10 @@ def test_identifiers_of_a_codec_have_eleven_bits() -> None:
             ProcessCodec(cob_id, True)
 
 
-def test_default_limits_of_the_monitors() -> None:
+def test_limits_of_the_monitors() -> None:
     """They decide when 200 V go off, so nobody changes one by a slip; why they are what they are is told there."""
-    assert default_limits().shape == (1,)
-    limits = default_limits()[0]
+    assert monitor_limits().shape == (1,)
+    limits = monitor_limits()[0]
     counts = {name: int(limits[name]) for name in limits.dtype.names if name.endswith(("_count", "_ticks"))}
     assert counts == {
         "stale_count": 5, "sequence_count": 8, "crc_count": 5, "length_count": 5, "range_count": 3,
@@ -229,8 +230,9 @@ def test_default_limits_of_the_monitors() -> None:
     assert limits["safe_cycles"] == 10
     assert (limits["residual_max_m"], limits["unexplained_force_max_n"]) == (0.7e-6, 0.8e-3)
     assert (limits["force_change_max_n"], limits["force_change_share"]) == (40e-6, 0.4)
-    assert limits["force_trend_share"] == 200e-6 / 0.03
-    assert (limits["stroke_min_m"], limits["stroke_max_m"], limits["voltage_step_max_v"]) == (-2e-6, 27e-6, 10.0)
+    assert limits["force_trend_share"] == pytest.approx(200e-6 / 0.03, rel=1e-12)
+    assert (limits["stroke_min_m"], limits["stroke_max_m"]) == (-2e-6, 27e-6)
+    assert 19.99 < limits["voltage_step_max_v"] < 20.0  # 100 V/ms at 5 kHz, to whole counts and half of one
     assert (limits["sense_count_min"], limits["sense_count_max"]) == (-32768, 32767)
     assert list(limits["innovation_max_m"]) == [0.5e-6] * 3
 

@@ -9,14 +9,13 @@ from functools import cache
 
 import numpy as np
 import pytest
-from loop_rig import rows_of, stage
+from loop_rig import monitor_limits, rows_of, stage
 
 from hil.faults.fault import parse
 from hil.runs.scenario import load_scenario
 from pkxyz_ctrl.config.controller import MonitorConfig
 from pkxyz_ctrl.config.files import load
 from pkxyz_ctrl.safety.modes import LOOP_CLOSED, Mode
-from pkxyz_ctrl.safety.monitors import default_limits
 from pkxyz_ctrl.safety.trips import Trip
 from pkxyz_ctrl.trajectory import Circle, Hold, Move, Trajectory
 from sim.config import PlantConfig
@@ -142,13 +141,11 @@ def test_lost_ticks_and_frames_in_a_scan_on_the_harsh_plant_are_survived(text):
 
 
 def test_a_controller_file_that_says_nothing_has_the_limits_of_the_monitors():
-    """One place, one number."""
-    limits = default_limits()
-    given = {name: field.default for name, field in MonitorConfig.model_fields.items() if not field.is_required()}
-    for name, value in given.items():
+    """Those of ``thresholds``, in the law that runs."""
+    limits = monitor_limits()
+    defaults = {name: field.default for name, field in MonitorConfig.model_fields.items() if not field.is_required()}
+    for name, value in defaults.items():
         if name != "force_trend_s":
             assert (limits[name] == value).all(), name
-    assert limits["force_trend_share"] == 200e-6 / given["force_trend_s"]
-    designed = setup("lqg").law["limits"][0]
-    assert designed["unexplained_force_max_n"] == limits["unexplained_force_max_n"][0] == 0.8e-3
-    assert designed["force_trend_share"] == pytest.approx(limits["force_trend_share"][0], rel=1e-12)
+    assert limits["unexplained_force_max_n"] == 0.8e-3
+    assert limits["force_trend_share"][0] == pytest.approx(200e-6 / defaults["force_trend_s"], rel=1e-12)

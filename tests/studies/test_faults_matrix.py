@@ -5,7 +5,7 @@ from functools import cache
 
 import numpy as np
 import pytest
-from loop_rig import first_difference, rows_of
+from loop_rig import first_difference, monitor_limits, rows_of
 
 from hil.faults.catalogue import KINDS
 from hil.faults.fault import parse
@@ -18,7 +18,6 @@ from pkxyz_ctrl.config.bus import BusConfig
 from pkxyz_ctrl.config.files import CONFIG_DIR, load, names
 from pkxyz_ctrl.loop.controller import StartUpError
 from pkxyz_ctrl.safety.modes import LOOP_CLOSED, MAY_ENERGISE, Mode
-from pkxyz_ctrl.safety.monitors import default_limits
 from pkxyz_ctrl.safety.trips import Trip
 
 
@@ -266,7 +265,7 @@ def test_the_bounds_of_combs_that_do_not_obey_are_the_calculation():
 
 def _decided(lacks_n, commanded_n):
     """For each comb the tick at which five in a row were out of proportion, None if never."""
-    limits = default_limits()[0]
+    limits = monitor_limits()[0]
 
     def changed(values):
         mean, out = np.zeros(3), []

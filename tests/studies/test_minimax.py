@@ -7,12 +7,12 @@ import pytest
 from loop_rig import MIDDLE, bus, law, stage
 
 from hil.studies.margins.loop import Loop, over_changed_plants
+from hil.studies.tune.minimax import AxisLaw, Bounds, _Problem, axis_law, minimax
 from pkxyz_ctrl.config.controller import ControllerConfig
 from pkxyz_ctrl.config.files import load
 from pkxyz_ctrl.design.hold_noise import hold_noise_m
 from pkxyz_ctrl.design.law import design_law
 from pkxyz_ctrl.design.law_about import law_about
-from pkxyz_ctrl.design.laws.minimax import AxisLaw, Bounds, _Problem, axis_law, minimax
 from pkxyz_ctrl.design.lqg_equivalent import lqg_equivalent
 from pkxyz_ctrl.design.margins.margins import frequency_grid_hz, loop_response
 from pkxyz_ctrl.design.margins.sensitivity import closed_loop
