@@ -1,10 +1,10 @@
 """The recording of a run: one row a tick, streamed to disk, Parquet in the end.
 
-While a run lasts its rows go, as they are in memory, to a journal beside the file (``recording.parquet.journal``, an
-Arrow stream of one binary column): that costs the loop a tenth of a microsecond a tick, and whatever kills the program,
-every batch written before stays readable. ``close`` takes the rows apart into columns, as Parquet, which could not be
-read without the footer that comes last, and removes the journal.
-``Recording.open`` reads either, so a recording whose program was killed opens like any other.
+While a run lasts its rows go, as they are in memory, to a journal beside the file (``recording.parquet.journal``): that
+costs the loop a tenth of a microsecond a tick, and whatever kills the program, every row written before stays readable.
+``close`` takes the rows apart into columns, as Parquet, which could not be read without the footer that comes last, and
+removes the journal. ``Recording.open`` reads either, so a recording whose program was killed opens like any other; it
+says so itself (``whole``), and goes on saying so.
 """
 
 import json
@@ -19,25 +19,17 @@ import pyarrow as pa
 import pyarrow.parquet as pq
 from numpy.typing import NDArray
 
+from hil.recording.journal import JournalReader, JournalWriter, RecordingError, journal_of
 from pkxyz_ctrl.loop.row import ROW, columns
+
+__all__ = ["COLUMNS", "Recording", "RecordingError", "RecordingWriter", "journal_of", "recover"]
 
 _BATCH_ROWS = 2048
 _GROUP_ROWS = 8 * _BATCH_ROWS  # of the Parquet file: 7 MB at a time, and 10 minutes at 5 kHz are 180 groups
-_KEY, _LAYOUT = b"pkxyz", b"layout"
-_ROW_FIELD = pa.field("row", pa.binary(ROW.itemsize), nullable=False)
+_KEY, _END = b"pkxyz", b"pkxyz_end"
 
 COLUMNS = tuple(name for field in ROW.names or () for name in columns(field))
 """Names of all columns, in order."""
-
-
-class RecordingError(RuntimeError):
-    """A recording that can't be written or read. The message says which file, why, and what is left of it."""
-
-
-def journal_of(path: str | Path) -> Path:
-    """Where the rows of a recording are while it is being written."""
-    path = Path(path)
-    return path.with_name(path.name + ".journal")
 
 
 class RecordingWriter:
@@ -46,18 +38,20 @@ class RecordingWriter:
     def __init__(self, path: str | Path, metadata: dict[str, Any]) -> None:
         """``metadata``: plain data that goes along. Replaces an existing recording. Raises ``RecordingError``."""
         self.path = Path(path)
-        self.ticks = 0
-        self._schema = pa.schema([_ROW_FIELD], metadata=_packed(metadata) | {_LAYOUT: _layout()})
         self._buffer = np.zeros(_BATCH_ROWS, ROW)
         self._filled = 0
         self._closed = False
         self._failed = False
         try:
             self.path.unlink(missing_ok=True)
-            self._sink = pa.OSFile(str(journal_of(self.path)), "wb")
-            self._stream = pa.ipc.new_stream(self._sink, self._schema)
-        except (OSError, pa.ArrowException) as error:
+            self._journal = JournalWriter(journal_of(self.path), metadata)
+        except OSError as error:
             raise RecordingError(f"{self.path}: cannot be written: {_reason(error)}") from None
+
+    @property
+    def ticks(self) -> int:
+        """Rows that are safe from whatever ends this program."""
+        return self._journal.ticks
 
     def write(self, block: NDArray[np.void]) -> None:
         """Add the rows of a block (n,) of ``ROW``; they are copied. Raises ``RecordingError``."""
@@ -70,61 +64,57 @@ class RecordingWriter:
             self._filled += count
             done += count
             if self._filled == _BATCH_ROWS:
-                self._flush()
+                self.flush()
 
-    def close(self) -> None:
-        """Write what is buffered, turn the journal into Parquet. Raises ``RecordingError``; then the journal stays."""
+    def flush(self) -> None:
+        """Hand all rows to the operating system. Raises ``RecordingError``."""
+        if self._filled == 0 or self._failed:
+            return
+        try:
+            self._journal.append(self._buffer[: self._filled])
+        except OSError as error:
+            self._failed = True
+            raise RecordingError(
+                f"{self.path}: cannot go on recording: {_reason(error)}; the first {self.ticks} ticks are kept in "
+                f"{journal_of(self.path).name} and open as before"
+            ) from None
+        self._filled = 0
+
+    def close(self, *, whole: bool = True) -> None:
+        """Write what is buffered, turn the journal into Parquet; ``whole``: nothing is missing at its end.
+
+        Raises ``RecordingError``; then the journal stays.
+        """
         if self._closed:
             return
         self._closed = True
         try:
-            if not self._failed:
-                self._flush()
-                self._stream.close()
-        except (OSError, pa.ArrowException) as error:
-            raise self._lost(error) from None
+            self.flush()
         finally:
-            self._sink.close()
+            self._journal.close()
         if not self._failed:
-            recover(self.path)
+            recover(self.path, whole=whole)
 
     def __enter__(self) -> Self:
         return self
 
     def __exit__(self, kind: type[BaseException] | None, error: BaseException | None, tb: TracebackType | None) -> None:
-        self.close()
-
-    def _flush(self) -> None:
-        if self._filled == 0:
-            return
-        try:
-            rows = pa.FixedSizeBinaryArray.from_buffers(
-                _ROW_FIELD.type, self._filled, [None, pa.py_buffer(self._buffer)]
-            )
-            self._stream.write_batch(pa.record_batch([rows], schema=self._schema))
-        except (OSError, pa.ArrowException) as error:
-            self._failed = True
-            raise self._lost(error) from None
-        self.ticks += self._filled
-        self._filled = 0
-
-    def _lost(self, error: Exception) -> RecordingError:
-        return RecordingError(
-            f"{self.path}: cannot go on recording: {_reason(error)}; the first {self.ticks} ticks are kept in "
-            f"{journal_of(self.path).name} and open as before"
-        )
+        self.close(whole=kind is None)
 
 
-def recover(path: str | Path) -> None:
-    """Turn what the journal of ``path`` holds, whole or cut off anywhere, into Parquet. Raises ``RecordingError``."""
+def recover(path: str | Path, *, whole: bool = False) -> None:
+    """Turn what the journal of ``path`` holds, cut off anywhere, into Parquet. Raises ``RecordingError``."""
     path, journal = Path(path), journal_of(path)
     part = path.with_name(path.name + ".part")
     try:
-        with _JournalBatches(journal) as (schema, batches), pq.ParquetWriter(
+        rows = JournalReader(journal)
+        end = {"whole": whole, "ticks": rows.ticks}
+        schema = _schema({_KEY: json.dumps(rows.metadata).encode(), _END: json.dumps(end).encode()})
+        with pq.ParquetWriter(
             part, schema, compression="zstd", compression_level=1, use_dictionary=False, write_page_checksum=True,
         ) as writer:  # fmt: skip
-            for group in _grouped(batches):
-                writer.write_table(pa.Table.from_batches(group, schema), row_group_size=_GROUP_ROWS)
+            for batches in _groups_of(rows, schema):
+                writer.write_table(pa.Table.from_batches(batches, schema), row_group_size=_GROUP_ROWS)
         part.replace(path)
         journal.unlink()
     except (OSError, pa.ArrowException) as error:
@@ -135,11 +125,17 @@ def recover(path: str | Path) -> None:
 
 
 class Recording:
-    """A finished recording, or the journal of one that was cut off. Columns are read when asked for."""
+    """A finished recording, or the journal of one that was cut off. Columns are read when asked for.
 
-    def __init__(self, path: Path, metadata: dict[str, Any], file: pq.ParquetFile | None, table: Any) -> None:
+    ``whole``: its writer closed it, so that nothing is missing at its end.
+    """
+
+    def __init__(
+        self, path: Path, metadata: dict[str, Any], file: pq.ParquetFile | None, table: Any, *, whole: bool
+    ) -> None:
         self.path = path
         self.metadata = metadata
+        self.whole = whole
         self._file = file
         self._table = table
         self.ticks: int = file.metadata.num_rows if file is not None else len(table)
@@ -151,13 +147,15 @@ class Recording:
         try:
             if path.is_file() or not journal_of(path).is_file():
                 file = pq.ParquetFile(path, pre_buffer=False, page_checksum_verification=True)
-                return cls(path, _metadata(file.schema_arrow, path), file, None)
-            with _JournalBatches(journal_of(path)) as (schema, batches):
-                table = pa.Table.from_batches(list(batches), schema)
-            return cls(path, _metadata(schema, path), None, table)
+                metadata, end = _metadata(file.schema_arrow, path)
+                whole = bool(end["whole"]) and end["ticks"] == file.metadata.num_rows
+                return cls(path, metadata, file, None, whole=whole)
+            rows, schema = JournalReader(journal_of(path)), _schema({})
+            table = pa.Table.from_batches([b for group in _groups_of(rows, schema) for b in group], schema)
+            return cls(path, rows.metadata, None, table, whole=False)
         except FileNotFoundError:
             raise RecordingError(f"{path}: no such recording") from None
-        except (OSError, pa.ArrowException) as error:
+        except (OSError, ValueError, pa.ArrowException) as error:
             raise RecordingError(f"{path}: is not a readable recording: {_reason(error)}") from None
 
     def __getitem__(self, column: str) -> NDArray[Any]:
@@ -220,56 +218,11 @@ class Recording:
         return [table.column(name).to_numpy() for name in names]
 
 
-class _JournalBatches:
-    """Opens a journal: its schema and its complete batches, up to where it was cut off."""
-
-    def __init__(self, path: Path) -> None:
-        self._source = pa.OSFile(str(path), "rb")
-
-    def __enter__(self) -> tuple[pa.Schema, Iterator[pa.RecordBatch]]:
-        reader = pa.ipc.open_stream(self._source)
-        layout = (reader.schema.metadata or {}).get(_LAYOUT)
-        if layout != _layout():
-            raise pa.ArrowInvalid("is a journal of another version of this program, which can read it")
-        schema = _schema({_KEY: reader.schema.metadata[_KEY]})
-        return schema, (_batch(_rows(batch), schema) for batch in self._complete(reader))
-
-    def __exit__(self, *_: object) -> None:
-        self._source.close()
-
-    @staticmethod
-    def _complete(reader: Any) -> Iterator[pa.RecordBatch]:
-        while True:
-            try:
-                batch = reader.read_next_batch()
-            except (StopIteration, OSError, pa.ArrowException):
-                return
-            yield batch
-
-
-def _grouped(batches: Iterator[pa.RecordBatch]) -> Iterator[list[pa.RecordBatch]]:
-    group: list[pa.RecordBatch] = []
-    for batch in batches:
-        group.append(batch)
-        if sum(len(b) for b in group) >= _GROUP_ROWS:
-            yield group
-            group = []
-    if group:
-        yield group
-
-
-def _layout() -> bytes:
-    """How a row lies in memory: whoever reads a journal must mean the same."""
-    return repr(ROW.descr).encode()
-
-
-def _packed(metadata: dict[str, Any]) -> dict[bytes, bytes]:
-    return {_KEY: json.dumps(metadata, allow_nan=False).encode()}
-
-
-def _rows(batch: pa.RecordBatch) -> NDArray[np.void]:
-    column = batch.column(0)
-    return np.frombuffer(column.buffers()[1], ROW, count=len(column), offset=column.offset * ROW.itemsize)
+def _groups_of(rows: JournalReader, schema: pa.Schema) -> Iterator[list[pa.RecordBatch]]:
+    """Rows as the batches of one row group after another, so that no recording is too long for memory."""
+    for group in range(0, rows.ticks, _GROUP_ROWS):
+        begins = range(group, min(group + _GROUP_ROWS, rows.ticks), _BATCH_ROWS)
+        yield [_batch(rows.rows(begin, begin + _BATCH_ROWS), schema) for begin in begins]
 
 
 def _schema(metadata: dict[bytes, bytes]) -> pa.Schema:
@@ -281,12 +234,15 @@ def _schema(metadata: dict[bytes, bytes]) -> pa.Schema:
     return pa.schema(fields, metadata=metadata)
 
 
-def _metadata(schema: pa.Schema, path: Path) -> dict[str, Any]:
-    text = (schema.metadata or {}).get(_KEY)
-    if text is None:
-        raise RecordingError(f"{path}: is Parquet, but not a recording of this program")
-    found: dict[str, Any] = json.loads(text)
-    return found
+def _metadata(schema: pa.Schema, path: Path) -> tuple[dict[str, Any], dict[str, Any]]:
+    """What goes along with the rows, and how the recording ended; ``ValueError`` for what can't be read."""
+    said = schema.metadata or {}
+    if _KEY not in said or _END not in said:
+        raise RecordingError(f"{path}: is Parquet, but not a recording of this program, or of another version of it")
+    found, end = json.loads(said[_KEY]), json.loads(said[_END])
+    if not isinstance(found, dict) or not isinstance(end, dict) or end.keys() != {"whole", "ticks"}:
+        raise ValueError("its metadata are damaged")
+    return found, end
 
 
 def _batch(block: NDArray[np.void], schema: pa.Schema) -> pa.RecordBatch:

@@ -9,6 +9,7 @@ import fcntl
 import os
 import signal
 import struct
+import time
 from pathlib import Path
 from typing import Any
 
@@ -20,11 +21,13 @@ from pkxyz_ctrl.can.frame import Frame
 from pkxyz_ctrl.loop.row import ROW
 
 _HEAD = struct.Struct("<BBqI")  # kind of entry, length of the data that follow, time in us, identifier
-_FRAME, _ROW = 0, 1  # a frame's kind is a bit set of its flags, shifted past the kind
+_FRAME, _ROW, _END = 0, 1, 3  # a frame's kind is a bit set of its flags, shifted past the kind
 _ROW_HEAD = bytes((_ROW,))
+_END_ENTRY = struct.Struct("<BQ")  # the last one, with how many bytes were lost: without it, the loop was killed
 _PIPE_BYTES = 1 << 20  # about a second at 2 kHz
 _WAITING_MAX_BYTES = 1 << 24
 _READ_BYTES = 1 << 16
+_SAFE_AFTER_S = 0.05  # rows and frames are with the operating system, whatever becomes of the writer
 
 
 class WallRecorder:
@@ -33,6 +36,9 @@ class WallRecorder:
     def __init__(self, recording: Path, frames: Path, metadata: dict[str, Any], channel: str) -> None:
         """Files to write. Forks: make it before buses are opened and priorities raised."""
         self.lost_bytes = 0
+        self._path = recording
+        self._status: int | None = None
+        self._told = False
         self._waiting: list[bytes] = []
         reading, self._pipe = os.pipe()
         said, saying = os.pipe()
@@ -63,7 +69,8 @@ class WallRecorder:
         except BlockingIOError:
             written = 0
         except BrokenPipeError:
-            raise RecordingError(self._last_words()) from None
+            self._told = True
+            raise RecordingError(self._last_words() or self._ended()) from None
         self._waiting.clear()
         if written < len(entry):
             if len(entry) < _WAITING_MAX_BYTES:
@@ -76,15 +83,14 @@ class WallRecorder:
         if self._pipe < 0:
             return
         os.set_blocking(self._pipe, True)
-        rest = b"".join(self._waiting)
+        rest = b"".join([*self._waiting, _END_ENTRY.pack(_END, self.lost_bytes)])
         with contextlib.suppress(BrokenPipeError):
             while rest:
                 rest = rest[os.write(self._pipe, rest) :]
         os.close(self._pipe)
         self._pipe = -1
-        words = self._last_words()
-        os.waitpid(self._child, 0)
-        if words:
+        words = self._last_words() or self._ended()
+        if words and not self._told:
             raise RecordingError(words)
 
     def _keep_whole(self, entry: bytes, written: int) -> None:
@@ -95,6 +101,18 @@ class WallRecorder:
         self.lost_bytes += len(entry) - at
         if at > written:
             self._waiting.append(entry[written:at])
+
+    def _ended(self) -> str:
+        """What became of the writer, if it came to no good end; waits for it."""
+        if self._status is None:
+            self._status = os.waitstatus_to_exitcode(os.waitpid(self._child, 0)[1])
+        if self._status == 0:
+            return ""
+        how = f"was killed by signal {-self._status}" if self._status < 0 else f"ended with {self._status}"
+        return (
+            f"{self._path}: the process that writes it {how}; what it had written until then, all but the last "
+            f"{_SAFE_AFTER_S:g} s, is kept and opens as ever"
+        )
 
     def _last_words(self) -> str:
         words = b""
@@ -107,9 +125,12 @@ class WallRecorder:
 
 
 def _length_at(entries: bytes, at: int) -> int:
+    """Of the entry that begins there; as much as is needed to know it, if it isn't all there yet."""
     if entries[at] == _ROW:
         return 1 + ROW.itemsize
-    return _HEAD.size + entries[at + 1]
+    if entries[at] == _END:
+        return _END_ENTRY.size
+    return _HEAD.size + (entries[at + 1] if at + 1 < len(entries) else 0)
 
 
 def _be_the_writer(
@@ -121,7 +142,7 @@ def _be_the_writer(
     status = 0
     try:
         with RecordingWriter(rows_to, metadata) as recording, FrameLog(frames_to, channel) as log:
-            _write_down(reading, recording, log)
+            recording.close(whole=_write_down(reading, recording, log))
     except (RecordingError, OSError) as error:
         os.write(saying, str(error).encode())
         status = 1
@@ -132,20 +153,30 @@ def _be_the_writer(
         os._exit(status)
 
 
-def _write_down(reading: int, recording: RecordingWriter, log: FrameLog) -> None:
+def _write_down(reading: int, recording: RecordingWriter, log: FrameLog) -> bool:
+    """Whether all came, up to the end that the loop made."""
     pending = b""
+    whole = False
+    flush_s = time.monotonic() + _SAFE_AFTER_S
     row = np.zeros(1, ROW)
     row_bytes = row.view(np.uint8).data
     while part := os.read(reading, _READ_BYTES):
         pending += part
         at = 0
-        while len(pending) - at >= _HEAD.size and len(pending) - at >= _length_at(pending, at):
+        while at < len(pending) and len(pending) - at >= _length_at(pending, at):
             end = at + _length_at(pending, at)
             if pending[at] == _ROW:
                 row_bytes[:] = pending[at + 1 : end]
                 recording.write(row)
+            elif pending[at] == _END:
+                whole = _END_ENTRY.unpack_from(pending, at)[1] == 0
             else:
                 kind, _, t_us, can_id = _HEAD.unpack_from(pending, at)
                 log.record(Frame._make((can_id, pending[at + _HEAD.size : end], kind >> 1)), t_us)
             at = end
         pending = pending[at:]
+        if (now_s := time.monotonic()) >= flush_s:
+            flush_s = now_s + _SAFE_AFTER_S
+            recording.flush()
+            log.flush()
+    return whole

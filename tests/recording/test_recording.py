@@ -1,5 +1,6 @@
 """Recordings: nothing lost, whatever ends the run; errors in one line; memory flat however long it takes."""
 
+import contextlib
 import errno
 import os
 import shutil
@@ -87,11 +88,50 @@ def test_a_killed_program_loses_only_the_batch_in_hand(tmp_path):
     assert not path.exists()
     kept = Recording.open(path)
     assert kept.metadata == {"seed": 7}
+    assert not kept.whole
     assert 10_000 - 2048 < kept.ticks <= 10_000
     assert_holds(path, random_rows(10_000)[: kept.ticks])
     recover(path)
     assert pq.read_table(path).num_rows == kept.ticks
+    assert not Recording.open(path).whole  # Parquet by now, and still cut off
     assert_holds(path, random_rows(10_000)[: kept.ticks])
+
+
+def test_only_a_recording_that_was_closed_is_whole(tmp_path):
+    for ending, whole in ((None, True), (RuntimeError, False)):
+        with contextlib.suppress(RuntimeError), RecordingWriter(tmp_path / "r.parquet", {}) as writer:
+            writer.write(random_rows(3000))
+            assert not Recording.open(tmp_path / "r.parquet").whole
+            if ending is not None:
+                raise ending
+        assert Recording.open(tmp_path / "r.parquet").whole is whole
+
+
+def test_a_tail_that_is_missing_is_seen_in_whole_parquet_too(tmp_path):
+    """Somebody wrote it anew without its last row group: every page is sound, the count of ticks is not."""
+    with RecordingWriter(tmp_path / "r.parquet", {}) as writer:
+        writer.write(random_rows(20_000))
+    table = pq.read_table(tmp_path / "r.parquet")
+    pq.write_table(table[:16_384], tmp_path / "cut.parquet")
+    assert Recording.open(tmp_path / "r.parquet").whole
+    assert not Recording.open(tmp_path / "cut.parquet").whole
+
+
+@pytest.mark.parametrize("column", ["voltage_2_v", "position_x_m", "tick", "mode"])
+def test_one_bit_of_a_page_is_noticed(tmp_path, column):
+    """The checksums of the pages: without them a flipped bit is a plausible number."""
+    path = tmp_path / "r.parquet"
+    with RecordingWriter(path, {}) as writer:
+        writer.write(random_rows(3000))
+    chunk = pq.ParquetFile(path).metadata.row_group(0).column(COLUMNS.index(column))
+    content = bytearray(path.read_bytes())
+    content[chunk.data_page_offset + chunk.total_compressed_size // 2] ^= 1
+    path.write_bytes(content)
+    recording = Recording.open(path)
+    field = next(field for field in ROW.names if column in columns(field))
+    for read in (lambda: recording[column], lambda: list(recording.blocks([field]))):
+        with pytest.raises(RecordingError, match=r"r\.parquet: is damaged: .*(checksum|CRC)"):
+            read()
 
 
 @pytest.fixture(scope="module")
@@ -100,12 +140,6 @@ def whole_journal(tmp_path_factory):
     writer = RecordingWriter(path, {})
     writer.write(random_rows(3 * 2048))
     return journal_of(path).read_bytes()
-
-
-def schema_bytes(journal):
-    source = pa.BufferReader(journal)
-    pa.ipc.open_stream(source)
-    return source.tell()
 
 
 def test_a_journal_of_other_rows_is_refused_in_words(tmp_path, whole_journal):
@@ -121,18 +155,19 @@ def test_a_journal_of_other_rows_is_refused_in_words(tmp_path, whole_journal):
 
 @settings(max_examples=60, deadline=None, suppress_health_check=[HealthCheck.function_scoped_fixture])
 @given(st.floats(0, 1) | st.floats(0, 1e-3))
-def test_a_journal_cut_anywhere_gives_the_batches_before_the_cut_or_one_clear_error(tmp_path, whole_journal, share):
+def test_a_journal_cut_anywhere_gives_the_rows_before_the_cut_or_one_clear_error(tmp_path, whole_journal, share):
     path = tmp_path / "r.parquet"
     path.unlink(missing_ok=True)
     cut = int(share * len(whole_journal))
     journal_of(path).write_bytes(whole_journal[:cut])
-    if cut < schema_bytes(whole_journal):
+    head = whole_journal.index(b"\n") + 1
+    if cut < head:
         with pytest.raises(RecordingError, match="not a readable recording"):
             Recording.open(path)
         return
     recording = Recording.open(path)
-    assert recording.ticks % 2048 == 0
-    assert recording.ticks >= 3 * 2048 * share - 2048
+    assert recording.ticks == (cut - head) // ROW.itemsize
+    assert not recording.whole
     assert_holds(path, random_rows(3 * 2048)[: recording.ticks])
 
 
@@ -167,10 +202,11 @@ def test_a_disk_that_fills_up_during_the_run_keeps_what_fits(tmp_path):
     )  # fmt: skip
     assert done.stdout.count("\n") == 1
     assert "cannot go on recording: file too large" in done.stdout
-    assert "the first 6144 ticks are kept" in done.stdout  # 3 batches of 870 kB in 3 MB
     recording = Recording.open(path)
-    assert recording.ticks == 3 * 2048
-    assert recording["tick"].tobytes() == np.tile(random_rows(2048)["tick"], 3).tobytes()
+    head = journal_of(path).read_bytes().index(b"\n") + 1
+    assert recording.ticks == (3_000_000 - head) // ROW.itemsize  # every row that fits
+    assert f"the first {recording.ticks} ticks are kept" in done.stdout
+    assert recording["tick"].tobytes() == np.tile(random_rows(2048)["tick"], 4)[: recording.ticks].tobytes()
 
 
 def test_what_cannot_be_written_or_read_says_so(tmp_path):

@@ -2,8 +2,10 @@
 
 import dataclasses
 import os
+import signal
 import subprocess
 import sys
+import time
 import tracemalloc
 from pathlib import Path
 
@@ -15,7 +17,7 @@ from hil.bus.frame_log import FrameLog
 from hil.lanes.ending import Ending
 from hil.lanes.lane import Lane
 from hil.lanes.wall import WallRig
-from hil.recording.recording import Recording, RecordingError
+from hil.recording.recording import Recording, RecordingError, journal_of
 from hil.recording.wall_recorder import WallRecorder
 from hil.runs.run_folder import RunFolder, metadata_of
 from hil.runs.scenario import load_scenario, resolve
@@ -70,6 +72,7 @@ def test_rows_and_frames_arrive_as_if_written_here(folder, tmp_path):
     assert recorder.lost_bytes == 0
     recording = Recording.open(folder.recording)
     assert recording.ticks == len(rows)
+    assert recording.whole
     for name in ("tick", "estimate_m", "voltage_v"):
         assert np.array_equal(recording.vector(name), rows[name])
     assert folder.frames.read_bytes() == (tmp_path / "here.log").read_bytes()
@@ -106,6 +109,46 @@ def test_rows_survive_a_kill_of_the_loop(tmp_path):
     assert done.returncode == -9, done.stderr
     recording = Recording.open(tmp_path / "run" / "recording.parquet")
     assert recording["tick"].tolist() == list(range(300))
+    assert not recording.whole  # nobody said that these are all
+
+
+def sent(recorder, rows):
+    """Hands over rows one by one, as a loop does."""
+    for index in range(len(rows)):
+        recorder.row(rows[index : index + 1].view(np.uint8).data)
+
+
+def test_a_writer_that_is_killed_is_told_and_all_but_its_last_block_opens(folder):
+    """kill -9 of the recorder: no whole recording, but a readable one, and a word about it."""
+    recorder, rows = WallRecorder(folder.recording, folder.frames, metadata(), "bus"), random_rows(100_000)
+    sent(recorder, rows[:500])
+    while not journal_of(folder.recording).is_file() or Recording.open(folder.recording).ticks < 500:
+        time.sleep(0.06)
+        recorder.frame(FRAMES[0], 0)  # what waits is handed on when something comes
+        sent(recorder, rows[500:501])
+        rows[500:-1] = rows[501:]
+    os.kill(recorder._child, signal.SIGKILL)
+    with pytest.raises(RecordingError, match=r"the process that writes it was killed by signal 9; what it had written"):
+        sent(recorder, rows[501:])
+    recorder.close()
+    recording = Recording.open(folder.recording)
+    assert recording.ticks >= 500
+    assert recording["tick"].tolist() == list(range(recording.ticks))
+    assert not recording.whole
+    assert len(list(can.LogReader(folder.frames))) > 0
+
+
+def test_what_the_writer_was_too_slow_for_is_said_in_the_recording(folder):
+    recorder, rows = WallRecorder(folder.recording, folder.frames, metadata(), "bus"), random_rows(45_000)
+    os.kill(recorder._child, signal.SIGSTOP)
+    sent(recorder, rows)  # 20 MB, which is more than may wait
+    assert recorder.lost_bytes > 0
+    os.kill(recorder._child, signal.SIGCONT)
+    recorder.close()
+    recording = Recording.open(folder.recording)
+    assert 0 < recording.ticks < len(rows)
+    assert np.isin(recording["tick"], rows["tick"]).all()
+    assert not recording.whole
 
 
 class Watched(WallRecorder):
