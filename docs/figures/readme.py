@@ -3,12 +3,13 @@
 python docs/figures/readme.py
 """
 
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
 from functools import cache
 from pathlib import Path
 
-from hil.lanes import either as lanes
-from hil.runs.metrics import Metrics
+from hil.lanes import in_process as lanes
+from hil.lanes.lane import Lane
+from hil.runs.metrics import Metrics, RowFigures
 from hil.runs.scenario import load_scenario
 
 ROOT = Path(__file__).parents[2]
@@ -22,15 +23,15 @@ LAWS = ("open_loop", "lqg", "robust")
 
 
 @cache
-def figures(scenario: str, controller: str) -> dict[str, dict[str, float]]:
+def figures(scenario: str, controller: str) -> RowFigures:
     """Figures of a run of the fast lane, in nm by axis; its bits are those of lockstep."""
     loaded = load_scenario(scenario, controller=controller)
     metrics = Metrics(loaded.trajectory, loaded.bus.period_us)
-    lanes.run(loaded.setup(), "fast", on_block=metrics.update)
+    lanes.run(loaded.setup(), Lane.FAST, on_block=metrics.update)
     return metrics.figures()
 
 
-def three(values: dict[str, float]) -> str:
+def three(values: Mapping[str, float]) -> str:
     """x / y / z in nm, or in um where all are beyond 100 nm."""
     if min(values.values()) > 100.0:
         return " / ".join(f"{v / 1e3:.2f}" for v in values.values()) + " um"
@@ -44,8 +45,8 @@ def rows() -> Iterator[str]:
     yield "| plant | without feedback | default law `lqg` | law `robust` | hold noise, `lqg` |"
     yield "| --- | --- | --- | --- | --- |"
     for scenario, words in PLANTS.values():
-        cells = [three(figures(scenario, law)["rms_error_nm"]) for law in LAWS]
-        noise = f"{max(figures(scenario, 'lqg')['hold_noise_nm'].values()):.1f} nm"
+        cells = [three(figures(scenario, law).rms_error_nm) for law in LAWS]
+        noise = f"{max(figures(scenario, 'lqg').hold_noise_nm.values()):.1f} nm"
         yield f"| {words} | {' | '.join(cells)} | {noise} |"
 
 

@@ -24,13 +24,16 @@ class Kind(StrEnum):
     SCENARIO = "scenario"
     STAGE = "stage"
     CONTROLLER = "controller"
+    BUS = "bus"
 
 
-_LIKE = {Kind.SCENARIO: "raster", Kind.STAGE: "reconstructed", Kind.CONTROLLER: "lqg"}
+_FOLDERS = {Kind.SCENARIO: "scenarios", Kind.STAGE: "stages", Kind.CONTROLLER: "controllers", Kind.BUS: "buses"}
+_LIKE = {Kind.SCENARIO: "raster", Kind.STAGE: "reconstructed", Kind.CONTROLLER: "lqg", Kind.BUS: "socketcan_fd"}
 _RUNS = {
     Kind.SCENARIO: "pkxyz sil {file}",
     Kind.STAGE: "pkxyz sil --stage {file}",
     Kind.CONTROLLER: "pkxyz sil --controller {file}",
+    Kind.BUS: "pkxyz check-amplifier --bus {file}",
 }
 _TABLE = re.compile(r"\[\[?([\w.]+)\]\]?")
 _ENTRY = re.compile(r"(\w+) *=")
@@ -46,7 +49,7 @@ def new(
         raise ConfigError(f"{file}: the name must end in .toml, so that it is taken for a file")
     if file.exists():
         raise ConfigError(f"{file}: is there already and is left alone; give another name or remove it")
-    folder, model = f"{kind.value}s", _model(kind)
+    folder, model = _FOLDERS[kind], _model(kind)
     source = find(folder, like or _LIKE[kind])
     load(folder, source, model)
     command = _RUNS[kind].format(file=file)
@@ -82,10 +85,11 @@ def _model(kind: Kind) -> "type[BaseModel]":
         from hil.runs.scenario import ScenarioConfig
 
         return ScenarioConfig
+    from pkxyz_ctrl.config.bus import BusConfig
     from pkxyz_ctrl.config.controller import ControllerConfig
     from pkxyz_ctrl.config.stage import StageConfig
 
-    return StageConfig if kind is Kind.STAGE else ControllerConfig
+    return {Kind.STAGE: StageConfig, Kind.CONTROLLER: ControllerConfig, Kind.BUS: BusConfig}[kind]
 
 
 def _meaning(model: "type[BaseModel]", table: str, kind: str | None, key: str) -> str:

@@ -7,21 +7,21 @@ import tomllib
 import pytest
 from command_line import pkxyz
 
-from hil.commands.new import Kind, _model, commented
+from hil.commands.new import _FOLDERS, Kind, _model, commented
 from hil.runs.metrics import RowFigures
 from hil.screen.tables import error_lines
 from pkxyz_ctrl.config.files import CONFIG_DIR, load, names
 
-SHIPPED = [(kind, name) for kind in Kind for name in names(f"{kind.value}s")]
+SHIPPED = [(kind, name) for kind in Kind for name in names(_FOLDERS[kind])]
 
 
 @pytest.mark.parametrize(("kind", "name"), SHIPPED)
 def test_a_new_file_is_the_shipped_one_under_another_name(kind, name, tmp_path):
-    source = CONFIG_DIR / f"{kind.value}s" / f"{name}.toml"
+    source = CONFIG_DIR / _FOLDERS[kind] / f"{name}.toml"
     text = commented(source, _model(kind), "mine", "pkxyz sil mine.toml")
     (tmp_path / "mine.toml").write_text(text, encoding="utf-8")
     assert tomllib.loads(text) == tomllib.loads(source.read_text(encoding="utf-8")) | {"name": "mine"}
-    load(f"{kind.value}s", tmp_path / "mine.toml", _model(kind))
+    load(_FOLDERS[kind], tmp_path / "mine.toml", _model(kind))
     assert len(re.findall(r"^\w+ *=.*#", text, re.MULTILINE)) >= 5
 
 
@@ -29,7 +29,7 @@ def test_new_files_run_and_are_not_written_over(tmp_path):
     for kind in Kind:
         done = pkxyz("new", kind.value, f"my_{kind.value}.toml", cwd=tmp_path)
         assert done.returncode == 0, done.stderr
-        assert "pkxyz sil" in done.stdout
+        assert "run it with: pkxyz " in done.stdout
     files = "--stage", "my_stage.toml", "--controller", "my_controller.toml"
     ran = pkxyz("sil", "my_scenario.toml", "--lane", "fast", *files, cwd=tmp_path)
     assert ran.returncode == 0, ran.stderr
@@ -50,7 +50,7 @@ def test_a_new_scenario_brings_the_table_that_it_reads(tmp_path):
     [
         (("scenario", "mine"), "must end in .toml"),
         (("scenario", "mine.toml", "--like", "rastr"), "did you mean 'raster'?"),
-        (("bus", "mine.toml"), "'scenario', 'stage', 'controller'"),
+        (("plant", "mine.toml"), "'scenario', 'stage', 'controller', 'bus'"),
     ],
 )
 def test_what_new_refuses(words, answer, tmp_path):

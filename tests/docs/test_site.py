@@ -5,11 +5,14 @@ from html.parser import HTMLParser
 from pathlib import Path
 
 import pytest
+from fault_codes import CLEARS, EMERGENCY_CAUSES, stem
 from generated_pages import commands, field_meanings
 from mkdocs.commands.build import build
 from mkdocs.config import load_config
 
+from pkxyz_ctrl.can.emergency import _EXACT
 from pkxyz_ctrl.loop.row import ROW, columns
+from pkxyz_ctrl.safety.trips import Trip
 
 ROOT = Path(__file__).parents[2]
 NAMESPACES = {"http://www.w3.org/2000/svg", "http://www.w3.org/1999/xlink", "http://www.w3.org/1999/xhtml"}
@@ -87,3 +90,13 @@ def test_every_column_is_on_the_page_with_its_meaning(site: Path) -> None:
     text = (site / "lookup" / "recording.html").read_text(encoding="utf-8")
     for field in meanings:
         assert all(f"<code>{column}</code>" in text for column in columns(field))
+
+
+def test_every_fault_and_emergency_code_is_on_the_troubleshooting_page_with_an_address(site: Path) -> None:
+    text = (site / "do" / "troubleshooting.html").read_text(encoding="utf-8")
+    for trip in Trip:
+        assert f'<a id="{(trip.name or "").lower()}"></a>' in text
+    assert {stem(trip) for trip in Trip} <= set(CLEARS)
+    for code in _EXACT:
+        assert f'<a id="{code:04x}"></a>0x{code:04X}' in text
+    assert set(EMERGENCY_CAUSES) <= set(_EXACT)

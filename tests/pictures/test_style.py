@@ -13,7 +13,9 @@ DRAWING = sorted(
     path
     for folder in ("hil", "docs", "benchmarks")
     for path in (ROOT / folder).rglob("*.py")
-    if path.name != "style.py" and re.search("matplotlib|pictures.style", path.read_text(encoding="utf-8"))
+    if path.name != "style.py"
+    and "drawings" not in path.parts  # docs/drawings/canvas.py has two themes of its own
+    and re.search("matplotlib|pictures.style", path.read_text(encoding="utf-8"))
 )
 SHADES = {"docs/figures/margins.py": 1, "hil/pictures/faults.py": 3, "hil/pictures/report.py": 1}
 """Colours that mean something in one picture alone: a law's, degrees of lateness, the area under a line."""
