@@ -37,7 +37,7 @@ def folder(tmp_path: Path) -> Path:
 @pytest.mark.slow
 @pytest.mark.parametrize("page", [p for p in PAGES if runs(p)], ids=lambda p: p.relative_to(ROOT).as_posix())
 def test_the_blocks_of_a_page_run_in_order(page: Path, folder: Path) -> None:
-    path = f"{folder.parent / 'bin'}{os.pathsep}{os.environ['PATH']}"
+    path = os.pathsep.join((str(folder.parent / "bin"), str(Path(sys.executable).parent), os.environ["PATH"]))
     env = {**os.environ, "PATH": path, "PYTHONPATH": str(ROOT), "COLUMNS": "120", "OPENBLAS_NUM_THREADS": "1"}
     for block in runs(page):
         interpreter = [sys.executable, "-"] if block.language == "python" else ["bash", "-euo", "pipefail"]
