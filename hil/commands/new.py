@@ -89,7 +89,12 @@ def _model(kind: Kind) -> "type[BaseModel]":
     from pkxyz_ctrl.config.controller import ControllerConfig
     from pkxyz_ctrl.config.stage import StageConfig
 
-    return {Kind.STAGE: StageConfig, Kind.CONTROLLER: ControllerConfig, Kind.BUS: BusConfig}[kind]
+    models: dict[Kind, type[BaseModel]] = {
+        Kind.STAGE: StageConfig,
+        Kind.CONTROLLER: ControllerConfig,
+        Kind.BUS: BusConfig,
+    }
+    return models[kind]
 
 
 def _meaning(model: "type[BaseModel]", table: str, kind: str | None, key: str) -> str:
