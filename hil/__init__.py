@@ -1,1 +1,70 @@
-"""The harness: simulated bus, amplifier node, lanes, scenarios, recordings, reports and the command line."""
+"""The harness: simulated bus, amplifier node, plant, lanes, studies, recordings, pictures and the command line.
+
+The names below are the public interface, kept stable by semantic versioning; everything else is internal.
+
+>>> import hil
+>>> run = hil.run("raster")
+>>> run.summary.rows.rms_error_nm
+>>> run["position_x_m"]
+"""
+
+import importlib
+from typing import TYPE_CHECKING, Any
+
+if TYPE_CHECKING:
+    from hil.api.design import DesignedLaw as DesignedLaw
+    from hil.api.design import design as design
+    from hil.api.run import Run as Run
+    from hil.api.run import open_run as open_run
+    from hil.api.run import run as run
+    from hil.api.studies import identify as identify
+    from hil.api.studies import montecarlo as montecarlo
+    from hil.api.studies import tune as tune
+    from hil.lanes.lane import Lane as Lane
+    from hil.runs.scenario import Scenario as Scenario
+    from hil.runs.scenario import build_scenario as build_scenario
+    from hil.runs.scenario import load_scenario as load_scenario
+    from pkxyz_ctrl.config.files import ConfigError as ConfigError
+
+_HOME = {
+    "ConfigError": "pkxyz_ctrl.config.files",
+    "DesignedLaw": "hil.api.design",
+    "Lane": "hil.lanes.lane",
+    "Run": "hil.api.run",
+    "Scenario": "hil.runs.scenario",
+    "build_scenario": "hil.runs.scenario",
+    "design": "hil.api.design",
+    "identify": "hil.api.studies",
+    "load_scenario": "hil.runs.scenario",
+    "montecarlo": "hil.api.studies",
+    "open_run": "hil.api.run",
+    "run": "hil.api.run",
+    "tune": "hil.api.studies",
+}
+
+__all__ = [
+    "ConfigError",
+    "DesignedLaw",
+    "Lane",
+    "Run",
+    "Scenario",
+    "build_scenario",
+    "design",
+    "identify",
+    "load_scenario",
+    "montecarlo",
+    "open_run",
+    "run",
+    "tune",
+]
+
+
+def __getattr__(name: str) -> Any:
+    """Public names on first use: kernels and design tools take a second to load, and few programs need all of them."""
+    if name not in _HOME:
+        raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
+    return getattr(importlib.import_module(_HOME[name]), name)
+
+
+def __dir__() -> list[str]:
+    return sorted(__all__)

@@ -29,7 +29,8 @@ from hil.commands import replay as replay_cli
 from hil.commands import run as run_cli
 from hil.commands import soak as soak_cli
 from hil.commands import tune as tune_cli
-from hil.lanes.lane import InProcessLane, Lane
+from hil.lanes.lane import Lane
+from hil.screen.choices import InProcessLane
 from hil.screen.first_run import say_if_compiling
 from hil.screen.outputs import what_to_do
 from hil.screen.tables import error_lines, print_whole

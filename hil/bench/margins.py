@@ -9,9 +9,9 @@ from hil.bench.figure import Figure
 from hil.lanes.excitation import excitation, tones
 from hil.lanes.lane import Lane
 from hil.lanes.setup import bare_setup
-from hil.screen.choices import operating_strokes
 from hil.studies.margins.loop import Loop, agreement, over_changed_plants
 from hil.studies.margins.measured import at_point, measure
+from hil.studies.operating_point import operating_strokes
 from pkxyz_ctrl.config.bus import BusConfig
 from pkxyz_ctrl.config.controller import ControllerConfig
 from pkxyz_ctrl.config.files import load

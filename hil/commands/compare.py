@@ -8,7 +8,8 @@ import typer
 from rich.console import Console
 from rich.table import Table
 
-from hil.lanes.lane import InProcessLane, Lane
+from hil.lanes.lane import Lane
+from hil.screen.choices import InProcessLane
 from hil.screen.first_run import say_if_compiling
 from hil.screen.outputs import picture_to_write
 from hil.screen.progress import progress_bar

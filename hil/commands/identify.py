@@ -8,8 +8,8 @@ import typer
 from rich.console import Console
 from rich.table import Table
 
-from hil.lanes.lane import InProcessLane, Lane
-from hil.screen.choices import Tones, operating_strokes
+from hil.lanes.lane import Lane
+from hil.screen.choices import InProcessLane, Tones
 from hil.screen.errors import one_line_errors
 from hil.screen.first_run import say_if_compiling
 from hil.screen.outputs import folder_to_write, writing
@@ -72,6 +72,7 @@ def identify(
     from hil.studies.identify.identification import as_data
     from hil.studies.identify.identification import identify as identified
     from hil.studies.identify.outside_scale import outside_scale, read_points
+    from hil.studies.operating_point import operating_strokes
     from pkxyz_ctrl.config.bus import BusConfig
     from pkxyz_ctrl.config.controller import ControllerConfig
     from pkxyz_ctrl.stage import Stage

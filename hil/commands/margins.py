@@ -9,8 +9,8 @@ import typer
 from rich.console import Console
 from rich.table import Table
 
-from hil.lanes.lane import InProcessLane, Lane
-from hil.screen.choices import Tones, operating_strokes
+from hil.lanes.lane import Lane
+from hil.screen.choices import InProcessLane, Tones
 from hil.screen.errors import one_line_errors
 from hil.screen.first_run import say_if_compiling
 from hil.screen.outputs import folder_to_write, writing
@@ -56,6 +56,7 @@ def margins(
     not; 2 for bad input.
     """
     from hil.studies.margins.loop import Loop, agreement, as_data, over_changed_plants
+    from hil.studies.operating_point import operating_strokes
     from pkxyz_ctrl.config.bus import BusConfig
     from pkxyz_ctrl.config.controller import ControllerConfig
     from pkxyz_ctrl.design.law import design_law

@@ -11,10 +11,3 @@ class Lane(StrEnum):
     LOCKSTEP = "lockstep"
     FAST = "fast"
     WALL = "wall"
-
-
-class InProcessLane(StrEnum):
-    """Those that one process closes by itself, as a choice at the terminal."""
-
-    LOCKSTEP = "lockstep"
-    FAST = "fast"

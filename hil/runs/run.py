@@ -13,7 +13,7 @@ from hil.recording.recording import RecordingWriter
 from hil.runs.learning import Learning
 from hil.runs.metrics import Metrics, RowFigures
 from hil.runs.run_folder import RunFolder, metadata_of
-from hil.runs.scenario import Scenario
+from hil.runs.scenario import Scenario, resolve
 from hil.runs.summary import LoopFigures, Summary, summarise
 from pkxyz_ctrl.config.files import ConfigError
 from pkxyz_ctrl.learning import Learner
@@ -23,7 +23,8 @@ from pkxyz_ctrl.learning import Learner
 class Begun:
     """A run whose configuration is written and whose rows can come: what every lane begins and ends with."""
 
-    folder: RunFolder
+    folder: RunFolder | None
+    """None: nothing is written"""
     scenario: Scenario
     lane: Lane
     resolved: dict[str, Any]
@@ -31,12 +32,12 @@ class Begun:
     learning: Learning | None
 
     @classmethod
-    def begin(cls, folder: RunFolder, scenario: Scenario, lane: Lane) -> "Begun":
+    def begin(cls, folder: RunFolder | None, scenario: Scenario, lane: Lane) -> "Begun":
         """Write the configuration. Raises ``ConfigError``."""
-        return cls(
-            folder, scenario, lane, folder.write_config(scenario), Metrics(scenario.trajectory, scenario.bus.period_us),
-            Learning(scenario) if scenario.config.learning is not None else None,
-        )  # fmt: skip
+        resolved = folder.write_config(scenario) if folder is not None else resolve(scenario)
+        learning = Learning(scenario) if scenario.config.learning is not None else None
+        metrics = Metrics(scenario.trajectory, scenario.bus.period_us)
+        return cls(folder, scenario, lane, resolved, metrics, learning)
 
     @property
     def metadata(self) -> dict[str, Any]:
@@ -46,10 +47,18 @@ class Begun:
     def end(self, rows: RowFigures, loop: LoopFigures, learner: Learner | None = None, *, interrupted: bool) -> Summary:
         """Store what was learnt and write the summary. Raises ``ConfigError`` and ``LearningError``."""
         digest = self.resolved["digest"]
-        learnt = self.learning.close(self.folder, learner, digest) if self.learning is not None else None
+        file = self.folder.learnt if self.folder is not None else None
+        learnt = self.learning.close(file, learner, digest) if self.learning is not None else None
         summary = summarise(self.scenario, self.lane, digest, rows, loop, learnt, interrupted=interrupted)
-        self.folder.write_summary(summary.as_text())
+        if self.folder is not None:
+            self.folder.write_summary(summary.as_text())
         return summary
+
+    def take(self, block: NDArray[np.void]) -> None:
+        """Take in rows (n,) of ``ROW``."""
+        self.metrics.update(block)
+        if self.learning is not None:
+            self.learning.errors.update(block)
 
 
 def run_into(
@@ -70,9 +79,7 @@ def run_into(
 
         def on_block(block: NDArray[np.void]) -> None:
             recording.write(block)
-            begun.metrics.update(block)
-            if begun.learning is not None:
-                begun.learning.errors.update(block)
+            begun.take(block)
 
         try:
             setup = scenario.setup()
@@ -83,8 +90,30 @@ def run_into(
     rows = begun.metrics.figures()
     if result is None:
         return begun.end(rows, LoopFigures(), interrupted=True)
-    loop = LoopFigures(result.missed_ticks, result.faults, result.bus_load, result.realtime_factor)
-    return begun.end(rows, loop, result.learner, interrupted=False)
+    return begun.end(rows, _figures_of(result), result.learner, interrupted=False)
+
+
+def run_in_memory(
+    scenario: Scenario, lane: Lane, on_progress: Callable[[int, int], None] = lambda done, total: None
+) -> tuple[Summary, NDArray[np.void]]:
+    """Run ``scenario`` in lockstep or in the fast lane; returns its summary and all rows (n,) of ``ROW``, and writes
+    nothing. Raises ``ConfigError`` for a bus that the lane can't use.
+    """
+    require_bus(scenario, lane)
+    begun = Begun.begin(None, scenario, lane)
+    blocks: list[NDArray[np.void]] = []
+
+    def on_block(block: NDArray[np.void]) -> None:
+        blocks.append(block.copy())
+        begun.take(block)
+
+    result = lanes.run(scenario.setup(), lane, on_block=on_block, on_progress=on_progress)
+    summary = begun.end(begun.metrics.figures(), _figures_of(result), result.learner, interrupted=False)
+    return summary, np.concatenate(blocks)
+
+
+def _figures_of(result: lanes.LaneResult) -> LoopFigures:
+    return LoopFigures(result.missed_ticks, result.faults, result.bus_load, result.realtime_factor)
 
 
 def require_bus(scenario: Scenario, lane: Lane) -> None:

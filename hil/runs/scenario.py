@@ -6,7 +6,7 @@
 
 import difflib
 import hashlib
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
@@ -158,6 +158,27 @@ def load_scenario(
         data["learning"] = {key: value for key, value in own.items() if key != "file"} | learning
     scenario = config.parse(data, ScenarioConfig, str(source))
     scenario = scenario.model_copy(update={"faults": (*scenario.faults, *faults)})
+    return _resolved(scenario, source, from_here=tuple(given), learning_from_here=learning is not None)
+
+
+def build_scenario(data: Mapping[str, Any], folder: str | Path = ".") -> Scenario:
+    """A scenario from plain data, with the keys of a scenario file; what it names is read from ``folder`` or shipped.
+
+    >>> build_scenario({"name": "hold", "duration_s": 0.4, "seed": 1, "stage": "reconstructed", "plant": "nominal",
+    ...                 "controller": "lqg", "bus": "fd_5k", "reference": [{"kind": "hold", "duration_s": 0.1}]})
+
+    Raises as ``load_scenario`` does.
+    """
+    source = Path(folder) / f"{data.get('name', 'scenario')}.toml"
+    return _resolved(config.parse(dict(data), ScenarioConfig, "the scenario"), source)
+
+
+def _resolved(
+    scenario: ScenarioConfig, source: Path, *, from_here: Sequence[str] = (), learning_from_here: bool = False
+) -> Scenario:
+    """Read and check what a scenario names: from the folder of ``source``, or from the working folder for parts that
+    the caller wants otherwise.
+    """
     parts: dict[str, Any] = {}
     models: dict[str, tuple[str, str, type[BaseModel]]] = {
         "stage": ("stages", scenario.stage, StageConfig),
@@ -168,7 +189,7 @@ def load_scenario(
     }
     problems: list[str] = []
     for key, (kind, name, model) in models.items():
-        folder = Path() if kind.startswith(tuple(given)) else source.parent  # kinds are plurals of keys
+        folder = Path() if kind.startswith(tuple(from_here)) else source.parent  # kinds are plurals of keys
         try:
             parts[key] = _part(kind, name, model, folder)
         except ConfigError as error:
@@ -182,7 +203,7 @@ def load_scenario(
     except TrajectoryError as error:
         raise TrajectoryError(f"{source}: {error}") from None
     file = scenario.learning.file if scenario.learning is not None else None
-    stored_file = None if file is None else (Path() if learning is not None else source.parent) / file
+    stored_file = None if file is None else (Path() if learning_from_here else source.parent) / file
     loaded = Scenario(source, scenario, trajectory=trajectory, stored_file=stored_file, **parts)
     loaded.stored()
     return loaded

@@ -1,0 +1,1 @@
+"""What programs are written against: scenarios run, laws designed, studies made, without the command line."""

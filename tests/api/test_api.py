@@ -1,0 +1,107 @@
+"""The public interface of ``hil``: what it promises, without a name that begins with an underscore."""
+
+import subprocess
+import sys
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+import hil
+from pkxyz_ctrl.config.files import ConfigError
+from pkxyz_ctrl.loop.row import ROW
+
+BRIEF = {
+    "name": "brief", "duration_s": 0.4, "seed": 1, "stage": "reconstructed", "plant": "nominal", "controller": "lqg",
+    "bus": "fd_5k", "reference": [{"kind": "hold", "duration_s": 0.1}],
+}  # fmt: skip
+
+
+@pytest.fixture(scope="module")
+def run() -> hil.Run:
+    return hil.run(hil.build_scenario(BRIEF))
+
+
+def test_every_public_name_is_there_and_described() -> None:
+    for name in hil.__all__:
+        assert getattr(hil, name).__doc__, name
+    assert set(hil.__all__) <= set(dir(hil))
+    with pytest.raises(AttributeError, match="no attribute 'nonsense'"):
+        hil.nonsense  # noqa: B018
+
+
+def test_importing_it_loads_nothing_heavy() -> None:
+    code = "import sys, hil; print(sorted({'numba', 'scipy', 'pyarrow', 'matplotlib', 'control'} & set(sys.modules)))"
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
+    assert done.stdout.strip() == "[]"
+
+
+def test_columns_carry_units_and_are_those_of_the_recording(run: hil.Run) -> None:
+    assert len(run.rows) == 2000
+    assert np.array_equal(run["position_x_m"], run["position_m"][:, 0])
+    assert np.array_equal(run["voltage_2_v"], run.rows["voltage_v"][:, 1])
+    arrays = run.arrays()
+    assert list(arrays) == list(run)
+    assert all(array.shape == (2000,) and array.flags.c_contiguous for array in arrays.values())
+    assert sum(array.nbytes for array in arrays.values()) <= run.rows.nbytes
+    with pytest.raises(KeyError, match=r"no column 'position_x_um'; there are: t_us, tick"):
+        run["position_x_um"]
+
+
+def test_pandas_and_polars_hold_the_same_numbers(run: hil.Run) -> None:
+    pandas, polars = run.to_pandas(), run.to_polars()
+    assert list(pandas.columns) == polars.columns == list(run)
+    for name in ("t_us", "position_z_m", "drive_count_3"):
+        assert np.array_equal(pandas[name].to_numpy(), run[name])
+        assert np.array_equal(polars[name].to_numpy(), run[name])
+
+
+def test_a_folder_holds_the_same_run_in_either_lane(run: hil.Run, tmp_path: Path) -> None:
+    scenario = hil.build_scenario(BRIEF)
+    kept = hil.run(scenario, lane="lockstep", out=tmp_path / "run")
+    opened = hil.open_run(tmp_path / "run")
+    for name in ROW.names or ():
+        assert np.array_equal(opened.rows[name], run.rows[name]), name
+    assert opened.summary == kept.summary
+    assert opened.ok is run.ok is True
+    assert (tmp_path / "run" / "report.png").stat().st_size > 10_000
+    assert run.folder is None
+    assert opened.summary["hold_noise_nm"] == run.summary["hold_noise_nm"]
+
+
+def test_what_cannot_be_built_is_said_in_a_line() -> None:
+    with pytest.raises(ConfigError, match=r"duration_s"):
+        hil.build_scenario(BRIEF | {"duration_s": -1.0})
+    with pytest.raises(ConfigError, match=r"controller|controllers"):
+        hil.build_scenario(BRIEF | {"controller": "no_such_law"})
+
+
+def test_margins_are_those_of_the_command() -> None:
+    law = hil.design("robust")
+    found = law.margins()
+    assert found.stable
+    assert 1.5 < found.mimo.peak_s < 2.0
+    assert 190.0 < found.mimo.bandwidth_hz < 220.0
+    response = law.response([50.0, 200.0])
+    assert np.linalg.svd(response.s, compute_uv=False).max(axis=1)[0] < 0.5
+    with pytest.raises(ConfigError, match="strokes go from 0 to 25 um"):
+        law.margins(at_um=(99.0, 0.0, 0.0))
+    assert law.record["period_us"][0] == 200
+
+
+def test_drawn_plants_go_on_and_run_alone_to_the_bit(tmp_path: Path) -> None:
+    scenario = hil.build_scenario(BRIEF)
+    first = hil.montecarlo(scenario, plants=2, workers=1, out=tmp_path)
+    again = hil.montecarlo(scenario, plants=3, workers=1, out=tmp_path)
+    assert again.results[:2] == first.results
+    assert again.summary["plants"] == 3
+    alone = hil.run(again.scenario_of(3))
+    assert max(alone.summary["hold_noise_nm"].values()) == again.results[2].hold_noise_nm
+
+
+def test_identify_finds_the_resonances() -> None:
+    found = hil.identify(periods=3)
+    hz = np.sort(found.modes.frequency_hz)
+    assert np.abs(hz / np.sort(found.drawn_hz) - 1.0).max() < 0.002
+    with pytest.raises(ConfigError, match="only feeds forward"):
+        hil.identify(controller="open_loop")
