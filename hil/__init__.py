@@ -14,12 +14,12 @@ from typing import TYPE_CHECKING, Any
 if TYPE_CHECKING:
     from hil.api.design import DesignedLaw as DesignedLaw
     from hil.api.design import design as design
+    from hil.api.identify import identify as identify
+    from hil.api.montecarlo import montecarlo as montecarlo
     from hil.api.run import Run as Run
     from hil.api.run import open_run as open_run
     from hil.api.run import run as run
-    from hil.api.studies import identify as identify
-    from hil.api.studies import montecarlo as montecarlo
-    from hil.api.studies import tune as tune
+    from hil.api.tune import tune as tune
     from hil.lanes.lane import Lane as Lane
     from hil.runs.scenario import Scenario as Scenario
     from hil.runs.scenario import build_scenario as build_scenario
@@ -34,12 +34,12 @@ _HOME = {
     "Scenario": "hil.runs.scenario",
     "build_scenario": "hil.runs.scenario",
     "design": "hil.api.design",
-    "identify": "hil.api.studies",
+    "identify": "hil.api.identify",
     "load_scenario": "hil.runs.scenario",
-    "montecarlo": "hil.api.studies",
+    "montecarlo": "hil.api.montecarlo",
     "open_run": "hil.api.run",
     "run": "hil.api.run",
-    "tune": "hil.api.studies",
+    "tune": "hil.api.tune",
 }
 
 __all__ = [

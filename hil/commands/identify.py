@@ -15,7 +15,7 @@ from hil.screen.first_run import say_if_compiling
 from hil.screen.outputs import folder_to_write, writing
 from hil.screen.progress import progress_bar
 from hil.screen.tables import print_whole
-from pkxyz_ctrl.config.files import ConfigError, find, load
+from pkxyz_ctrl.config.files import ConfigError, find
 
 if TYPE_CHECKING:
     from hil.studies.identify.identification import Identification
@@ -23,9 +23,6 @@ if TYPE_CHECKING:
 _screen = Console(highlight=False)
 
 STAGE = "stage.toml"
-
-AMPLITUDE_NM = {"multisine": 5.0, "stepped": 25.0}
-"""Of each tone, by default: one alone may be larger than a hundred at once."""
 
 
 def identify(
@@ -68,35 +65,21 @@ def identify(
     """
     from dataclasses import replace
 
-    from hil.lanes.setup import bare_setup
+    from hil.api.identify import identify as identified
     from hil.studies.identify.identification import as_data
-    from hil.studies.identify.identification import identify as identified
     from hil.studies.identify.outside_scale import outside_scale, read_points
-    from hil.studies.operating_point import operating_strokes
-    from pkxyz_ctrl.config.bus import BusConfig
-    from pkxyz_ctrl.config.controller import ControllerConfig
     from pkxyz_ctrl.stage import Stage
 
-    on_bus, config = load("buses", bus, BusConfig), load("controllers", controller, ControllerConfig)
-    if lane is InProcessLane.LOCKSTEP and on_bus.can is None:
-        raise ConfigError(f"bus {on_bus.name!r} has no [can] and carries no frames; use --lane fast")
-    if config.law == "open_loop":
-        raise ConfigError(
-            f"controller {config.name!r} only feeds forward: what is added to the measurement never reaches its combs; "
-            "choose another --controller"
-        )
     if out is not None:
         folder_to_write(out)
         if (out / STAGE).exists() and (out / STAGE).samefile(find("stages", stage)):
             raise ConfigError(f"--out: {out}: its {STAGE} is the --stage that is identified; give another folder")
-    strokes = operating_strokes(Stage.load(stage), at_um)
     say_if_compiling(quiet=as_json)
     outside = None if reference is None else outside_scale(Stage.load(stage), *read_points(reference))
-    amplitude = AMPLITUDE_NM[tones.value] if amplitude_nm is None else amplitude_nm
     with one_line_errors(), progress_bar("exciting the loop", quiet=as_json) as tell:
         found = identified(
-            bare_setup(stage, plant, config, on_bus, seed), strokes, Lane(lane.value), kind=tones.value,
-            amplitude_m=amplitude * 1e-9, periods=periods, on_progress=tell,
+            stage=stage, plant=plant, controller=controller, bus=bus, lane=Lane(lane.value), tones=tones.value,
+            amplitude_nm=amplitude_nm, periods=periods, at_um=at_um, seed=seed, on_progress=tell,
         )  # fmt: skip
     found = replace(found, outside=outside)
     with one_line_errors():

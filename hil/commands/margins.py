@@ -55,25 +55,22 @@ def margins(
     Exit code 0 if every loop is stable and, on the nominal plant, what was measured agrees with what was computed; 1 if
     not; 2 for bad input.
     """
-    from hil.studies.margins.loop import Loop, agreement, as_data, over_changed_plants
+    from hil.api.design import design
+    from hil.studies.margins.loop import agreement, as_data, over_changed_plants
     from hil.studies.operating_point import operating_strokes
-    from pkxyz_ctrl.config.bus import BusConfig
-    from pkxyz_ctrl.config.controller import ControllerConfig
-    from pkxyz_ctrl.design.law import design_law
     from pkxyz_ctrl.design.margins.tolerances import Tolerances
     from pkxyz_ctrl.stage import Stage
 
-    device, on_bus = Stage.load(stage), load("buses", bus, BusConfig)
-    config = load("controllers", controller, ControllerConfig)
     wide = load("tolerances", tolerances, Tolerances)
-    strokes = operating_strokes(device, at_um)
+    strokes = operating_strokes(Stage.load(stage), at_um)
     if out is not None:
         folder_to_write(out)
     if measured:
         say_if_compiling(quiet=as_json)
     with one_line_errors():
-        loop = Loop(device, on_bus, design_law(device, config, on_bus, autostart=True))
-        computed = loop.margins(strokes)
+        law = design(controller, stage=stage, bus=bus)
+        device, config, on_bus, loop = law.stage, law.controller, law.bus, law.loop
+        computed = law.margins(at_um)
         data: dict[str, Any] = {
             "controller": config.name, "stage": device.config.name, "bus": on_bus.name,
             "strokes_um": [float(q) * 1e6 for q in strokes], "computed": as_data(computed),

@@ -84,7 +84,8 @@ class Summary:
         if learnt is not None:
             figures = learnt.pop("figures")
             periods = figures.pop("periods")
-            plain |= figures | {"learning": learnt | {"periods": periods}}
+            plain |= figures | {"learning": learnt | {"periods": periods, "steps": list(learnt["steps"])}}
+        loop["faults"] = list(self.loop.faults)
         return plain | rows | loop | {"checks": [verdict.as_json() for verdict in self.checks]}
 
     def as_text(self) -> str:

@@ -51,7 +51,7 @@ def test_columns_carry_units_and_are_those_of_the_recording(run: hil.Run) -> Non
 def test_pandas_and_polars_hold_the_same_numbers(run: hil.Run) -> None:
     pandas, polars = run.to_pandas(), run.to_polars()
     assert list(pandas.columns) == polars.columns == list(run)
-    for name in ("t_us", "position_z_m", "drive_count_3"):
+    for name in ("t_us", "position_z_m", "drive_3_count"):
         assert np.array_equal(pandas[name].to_numpy(), run[name])
         assert np.array_equal(polars[name].to_numpy(), run[name])
 

@@ -95,16 +95,20 @@ HOUSE: Mapping[str, Room] = MappingProxyType({
     "hil.bench.rigs": Room(("sim.motion", "sim", "pkxyz_ctrl.*", "hil.lanes", "hil.runs")),
     "hil.bench": Room((
         "pkxyz_ctrl.*", "hil.bus", "hil.plant", "hil.recording", "hil.lanes", "hil.runs", "hil.studies.spread",
-        "hil.studies.margins", "hil.studies.tune", "hil.studies", "hil.screen", "hil.bench.rigs",
+        "hil.studies.margins", "hil.studies.tune", "hil.studies", "hil.bench.rigs",
+    )),
+    "hil.api": Room((
+        "pkxyz_ctrl.*", "hil.recording", "hil.lanes", "hil.runs", "hil.studies.spread", "hil.studies.margins",
+        "hil.studies.identify", "hil.studies.tune", "hil.studies", "hil.pictures",
     )),
     "hil.commands": Room((
         "pkxyz_ctrl.*", "hil.recording", "hil.lanes", "hil.conformance", "hil.runs", "hil.studies.spread",
         "hil.studies.margins", "hil.studies.identify", "hil.studies.tune", "hil.studies.faults", "hil.studies",
-        "hil.pictures", "hil.screen", "hil.bench.rigs", "hil.bench",
+        "hil.pictures", "hil.screen", "hil.bench.rigs", "hil.bench", "hil.api",
     )),
     "hil": Room((
         "pkxyz_ctrl.*", "hil.recording", "hil.faults", "hil.lanes", "hil.runs", "hil.pictures", "hil.screen",
-        "hil.commands",
+        "hil.api", "hil.commands",
     )),
 })  # fmt: skip
 

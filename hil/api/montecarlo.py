@@ -1,0 +1,58 @@
+"""Draw plants from tolerances and run a law on each."""
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+from hil.runs.scenario import Scenario, load_scenario
+from hil.studies.montecarlo import Result, Results, Study, run_study, summary
+from hil.studies.spread.workers import cores
+from pkxyz_ctrl.config.files import load
+from pkxyz_ctrl.design.margins.tolerances import Tolerances
+
+Progress = Callable[[int, int], None]
+
+
+@dataclass(frozen=True)
+class DrawnPlants:
+    """What a law does on plants drawn from tolerances."""
+
+    study: Study
+    results: tuple[Result, ...]
+    """in the order of their seeds"""
+
+    @property
+    def summary(self) -> dict[str, Any]:
+        """Plain data: distributions (median, 95 %, largest), how many did not hold, the worst plant's seed."""
+        return summary(self.results)
+
+    def scenario_of(self, seed: int) -> Scenario:
+        """The scenario on the plant of a seed, to be run alone; its figures come out the same, bit for bit."""
+        return self.study.drawn(seed)
+
+
+def montecarlo(
+    scenario: Scenario | str | Path,
+    *,
+    plants: int = 100,
+    first_seed: int = 1,
+    tolerances: str = "wide",
+    out: str | Path,
+    workers: int | None = None,
+    on_progress: Progress = lambda done, total: None,
+) -> DrawnPlants:
+    """Run a scenario on ``plants`` plants drawn from a tolerances file, each seeded by its own number.
+
+    Results are kept in ``out``/results.jsonl at once: called again it goes on, also after an interruption. ``workers``:
+    processes, by default as many as cores; a program that uses more than one starts under ``if __name__ ==
+    "__main__":``. Raises ``ConfigError``.
+    """
+    loaded = scenario if isinstance(scenario, Scenario) else load_scenario(scenario)
+    study = Study(loaded, load("tolerances", tolerances, Tolerances))
+    folder = Path(out)
+    folder.mkdir(parents=True, exist_ok=True)
+    results = Results(folder / "results.jsonl", study)
+    seeds = range(first_seed, first_seed + plants)
+    run_study(study, seeds, results, workers or cores(), None, on_progress)
+    return DrawnPlants(study, tuple(results.found[seed] for seed in seeds))
