@@ -25,6 +25,7 @@ TABLES = {
               ("bus_and_node", "driver_and_gate", "cycle", "plant", "recording_and_log"))),
     "parts": ("controller", "driver", "gate", "codec", "wire"),
     "floor": ("limits", "bus"),
+    "beside": ("beside",),
     "quality": ("nominal", "mild", "harsh", "learning", "control", "margins"),
 }  # fmt: skip
 COLOURS = (BLUE, SKY, GREEN, ORANGE, FAINT)

@@ -6,7 +6,7 @@ from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import Any
 
-from hil.bench import control, lanes, learning, limits, margins, parts, plant, quality, startup, study, tick
+from hil.bench import beside, control, lanes, learning, limits, margins, parts, plant, quality, startup, study, tick
 from hil.bench.figure import Figure
 from hil.runs.versions import versions
 from pkxyz_ctrl.config.files import ConfigError
@@ -23,6 +23,7 @@ MEASUREMENTS: dict[str, Measurement] = {
     "nominal": quality.nominal,
     "mild": quality.mild,
     "harsh": quality.harsh,
+    "beside": beside.beside,
     "learning": learning.learning,
     "control": control.control,
     "margins": margins.margins,

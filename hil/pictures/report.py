@@ -124,7 +124,8 @@ def _draw_error(plot: Axes, signals: Signals, axis: int, limit_nm: float, summar
         for label, measured in (
             ("scan rms", rows.rms_error_nm),
             ("max", rows.max_error_nm),
-            ("hold noise", rows.hold_noise_nm),
+            ("hold rms", rows.hold_rms_nm),
+            ("noise", rows.hold_noise_nm),
         )
         if measured
     ]
@@ -267,7 +268,7 @@ def _draw_title(figure: Figure, summary: Summary) -> None:
         f"bus {summary.bus}",
         rate,
     ]
-    for measured, words in ((summary.rows.rms_error_nm, "rms error"), (summary.rows.hold_noise_nm, "hold noise")):
+    for measured, words in ((summary.rows.rms_error_nm, "rms error"), (summary.rows.hold_rms_nm, "hold")):
         if measured:
             parts.append(f"{words} " + " / ".join(f"{v:.2f}" for v in measured.values()) + " nm")
     if summary.loop.bus_load is not None:

@@ -1,7 +1,8 @@
 """Figures of a run, taken block by block, and the verdict on a scenario's checks.
 
 Errors are true position less reference at the same sample, in nm; "scanning" is the scan with its turn-arounds, without
-lead-in and lead-out; hold noise is the standard deviation of the true position in holds, after their settling time.
+lead-in and lead-out. A hold is looked at after its settling time: about the set-point, and about its own mean, which
+forgives an offset and a slow drift of whole holds.
 """
 
 import math
@@ -19,7 +20,9 @@ from pkxyz_ctrl.trajectory import Trajectory
 METRICS: dict[str, str] = {
     "rms_error_nm": "RMS error while scanning, each axis",
     "max_error_nm": "largest error while scanning, each axis",
-    "hold_noise_nm": "standard deviation of the true position in holds, each axis",
+    "error_deviation_nm": "RMS error while scanning about its own mean, which an offset in sensing shifts, each axis",
+    "hold_rms_nm": "RMS of the true position about the set-point in holds, each axis",
+    "hold_noise_nm": "standard deviation of the true position in holds about each hold's own mean, each axis",
     "estimate_error_nm": "RMS of estimated less true position while scanning, each axis",
     "line_error_nm": "RMS error on the lines of the last whole period of a scan that repeats, each axis",
     "learning_factor": "periodic error as it is sensed: first period over that after five more",
@@ -52,6 +55,8 @@ class RowFigures:
     saturated_ticks: int
     rms_error_nm: Mapping[str, float] | None
     max_error_nm: Mapping[str, float] | None
+    error_deviation_nm: Mapping[str, float] | None
+    hold_rms_nm: Mapping[str, float] | None
     hold_noise_nm: Mapping[str, float] | None
     estimate_error_nm: Mapping[str, float] | None
 
@@ -90,6 +95,9 @@ class _Sums:
 
     def rms(self) -> NDArray[np.float64]:
         return np.sqrt(self.squares / self.count)
+
+    def deviation(self) -> NDArray[np.float64]:
+        return np.sqrt(self.squared_deviations() / self.count)
 
     def squared_deviations(self) -> NDArray[np.float64]:
         return np.maximum(self.squares - self.total**2 / self.count, 0.0)
@@ -138,9 +146,18 @@ class Metrics:
             saturated_ticks=self.saturated_ticks,
             rms_error_nm=_by_axis(self._error.rms()) if scanned else None,
             max_error_nm=_by_axis(self._error.largest) if scanned else None,
+            error_deviation_nm=_by_axis(self._error.deviation()) if scanned else None,
+            hold_rms_nm=self._hold_rms(),
             hold_noise_nm=self._hold_noise(),
             estimate_error_nm=_by_axis(self._estimate.rms()) if scanned else None,
         )
+
+    def _hold_rms(self) -> dict[str, float] | None:
+        """About the set-points, pooled over the holds."""
+        holds = [noise for noise in self._noise if noise.count > 0]
+        if not holds:
+            return None
+        return _by_axis(np.sqrt(np.sum([h.squares for h in holds], axis=0) / sum(h.count for h in holds)))
 
     def _hold_noise(self) -> dict[str, float] | None:
         """About each hold's own mean, pooled over the holds."""

@@ -17,11 +17,13 @@ def print_whole(screen: Console, table: Table) -> None:
 
 
 def error_lines(rows: "RowFigures", errors_are_of: str) -> Iterator[str]:
-    """A line for each figure of three axes that every run has: error while scanning, and noise in holds."""
+    """A line for each figure of three axes that every run has: error while scanning, and in holds about the set-point
+    and about the mean."""
     by = ", by the estimate" if errors_are_of == "estimate" else ""
     for measured, words in (
         (rows.rms_error_nm, "rms error while scanning"),
-        (rows.hold_noise_nm, "rms noise in holds"),
+        (rows.hold_rms_nm, "rms error in holds"),
+        (rows.hold_noise_nm, "deviation in holds"),
     ):
         if measured:
             yield f"{words}{by}, x / y / z: {' / '.join(f'{value:.2f}' for value in measured.values())} nm"

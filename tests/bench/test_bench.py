@@ -16,7 +16,7 @@ import numpy as np
 import pytest
 from sim_rig import config, counts, plant
 
-from hil.bench import figure, quality, startup, suite, tick
+from hil.bench import beside, figure, quality, startup, suite, tick
 from hil.bench.figure import Figure
 from hil.bench.rigs.closed_loop import scan
 from hil.bench.rigs.reference_motion import reference_motion
@@ -180,3 +180,20 @@ def test_the_page_shows_the_committed_results() -> None:
     for f in results["figures"]:
         assert set(f) == KEYS
         assert f"| {f['name']} |" in page
+
+
+def test_what_the_law_reaches_stands_beside_the_open_loop(monkeypatch: pytest.MonkeyPatch) -> None:
+    """The value is the law's worst axis, the target the open loop's same axis; on nominal 0.3 nm more."""
+    monkeypatch.setattr(beside, "PLACES", {"nominal": beside.PLACES["nominal"], "lab": beside.PLACES["lab"]})
+    found = {f.name: f for f in beside.beside()}
+    assert set(found) == {
+        f"beside.{w}_{p}" for w in ("raster", "circle", "hold") for p in ("nominal", "lab", "lab_identified")
+    }
+    for f in found.values():
+        assert f.target is not None
+        assert f"{f.value:.2f}" in f.detail.partition("; ")[0]
+        open_loop = f.target - (0.3 if f.name.endswith("nominal") else 0.0)
+        assert f"{open_loop:.2f}" in f.detail.partition("; ")[2]
+    assert found["beside.raster_lab"].target > 100.0  # what nobody knew of the device
+    assert 0.3 < found["beside.raster_nominal"].value < 5.0
+    assert found["beside.raster_lab_identified"].value < found["beside.raster_lab"].value

@@ -38,10 +38,13 @@ def test_figures_equal_those_of_whole_arrays_in_any_blocks(seed, cuts):
     error = (rows["position_m"] - rows["reference_m"])[scan] * 1e9
     assert list(figures["rms_error_nm"].values()) == pytest.approx(np.sqrt((error**2).mean(axis=0)), rel=1e-12)
     assert list(figures["max_error_nm"].values()) == pytest.approx(np.abs(error).max(axis=0), rel=1e-12)
+    assert list(figures["error_deviation_nm"].values()) == pytest.approx(error.std(axis=0), rel=1e-9)
     doubt = (rows["estimate_m"] - rows["position_m"])[scan] * 1e9
     assert list(figures["estimate_error_nm"].values()) == pytest.approx(np.sqrt((doubt**2).mean(axis=0)), rel=1e-12)
     holds = [rows["position_m"][at] * 1e9 for at in rows_in(rows, "still_us")]
     assert len(holds) == 2
+    off = np.concatenate([(rows["position_m"] - rows["reference_m"])[at] * 1e9 for at in rows_in(rows, "still_us")])
+    assert list(figures["hold_rms_nm"].values()) == pytest.approx(np.sqrt((off**2).mean(axis=0)), rel=1e-9)
     weights = [len(hold) - 1 for hold in holds]
     variance = np.average([hold.var(axis=0, ddof=1) for hold in holds], axis=0, weights=weights)
     assert list(figures["hold_noise_nm"].values()) == pytest.approx(np.sqrt(variance), rel=1e-6)
@@ -65,14 +68,20 @@ def test_errors_outside_the_scan_and_before_tracking_do_not_count():
 
 def test_a_constant_offset_in_a_hold_is_no_noise_and_a_faulty_stage_is_not_scored():
     rows = tracking_rows()
-    before = figures_of(rows)["hold_noise_nm"]
+    before, about = figures_of(rows)["hold_noise_nm"], figures_of(rows)["hold_rms_nm"]
     first, second = rows_in(rows, "still_us")
     rows["position_m"][first] += 5e-9
     rows["position_m"][second] -= 7e-9
     assert list(figures_of(rows)["hold_noise_nm"].values()) == pytest.approx(list(before.values()), rel=1e-6)
+    share = [len(at) / (len(first) + len(second)) for at in (first, second)]
+    offset_nm = np.sqrt(share[0] * 5.0**2 + share[1] * 7.0**2)
+    seen = list(figures_of(rows)["hold_rms_nm"].values())
+    assert seen == pytest.approx(
+        [np.hypot(offset_nm, each) for each in about.values()], rel=0.03
+    )  # but about the set-point
     rows["mode"] = Mode.FAULT
     assert {key: value for key, value in figures_of(rows).items() if key.endswith("_nm")} == dict.fromkeys(
-        ["rms_error_nm", "max_error_nm", "hold_noise_nm", "estimate_error_nm"]
+        ["rms_error_nm", "max_error_nm", "error_deviation_nm", "hold_rms_nm", "hold_noise_nm", "estimate_error_nm"]
     )
     with pytest.raises(TypeError, match="block of rows"):
         figures_of(np.zeros(3))
