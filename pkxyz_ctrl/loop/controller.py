@@ -209,7 +209,9 @@ class Controller:
             self._restarting = False
             self.faults.append(f"start-up after a clear: {driver.failure}")
             self._event = int(Event.NODE_LOST)
-        elif driver.state is DriverState.CONFIGURING:
+        elif driver.state is DriverState.CONFIGURING or (
+            driver.state is DriverState.OPERATIONAL and self.mode == Mode.BOOT  # found and configured within one tick
+        ):
             self._event = int(Event.NODE_FOUND)
         elif driver.state is DriverState.OPERATIONAL:
             self._event = int(Event.NODE_READY)
@@ -228,7 +230,7 @@ class Controller:
             row = self.memory["row"][0]
             reason = explain(int(row["trips"]))
             emergencies = "".join(f"\n{e.told_at(self._begun_us)}." for e in self.driver.emergencies)
-            detail = "".join(f" [{words}]" for words in (self.driver.failure, self.driver.foreign) if words)
+            detail = f" [{self.driver.failure}]" if self.driver.failure else ""
             self.faults.append(f"at {row['t_us'] * 1e-6:.4f} s: {reason}{detail}{emergencies}{self._others.complaint}")
 
 

@@ -42,7 +42,6 @@ class NodeEvent(IntFlag):
     NOT_OPERATIONAL = 2
     REBOOTED = 4
     EMERGENCY = 8
-    FOREIGN_FRAME = 16
 
 
 # A count of 0 trips at once (a limit that was never filled in is a fault), a negative one switches that monitor off.
@@ -151,9 +150,7 @@ _SLEW = int(Trip.SLEW)
 _OVERRUN = int(Trip.OVERRUN)
 _SOLVER = int(Trip.SOLVER)
 _NOT_FINITE = int(Trip.NOT_FINITE)
-_FOREIGN_FRAME = int(Trip.FOREIGN_FRAME)
-_FOREIGN_EVENT = int(NodeEvent.FOREIGN_FRAME)
-# NodeEvent's first four bits are Trip's four bits from HEARTBEAT_LOST on, in the same order.
+# NodeEvent's four bits are Trip's four bits from HEARTBEAT_LOST on, in the same order.
 _NODE_EVENTS = int(NodeEvent.HEARTBEAT_LOST | NodeEvent.NOT_OPERATIONAL | NodeEvent.REBOOTED | NodeEvent.EMERGENCY)
 _NODE_SHIFT = int(Trip.HEARTBEAT_LOST).bit_length() - 1
 
@@ -347,8 +344,6 @@ def check(limits: np.void, memory: np.void, obs: np.void) -> int:
         clear_memory(memory)
         return trips
     trips |= (int(obs["node_events"]) & _NODE_EVENTS) << _NODE_SHIFT
-    if obs["node_events"] & _FOREIGN_EVENT != 0:
-        trips |= _FOREIGN_FRAME
     leak = limits["overrun_leak_ticks"]
     memory["overrun_level"] = _bucket(memory["overrun_level"], obs["overrun"], leak)
     trips |= _filled(memory["overrun_level"], limits["overrun_count"], leak, _OVERRUN)

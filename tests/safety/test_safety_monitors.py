@@ -296,7 +296,6 @@ def test_node_events_trip_at_once(event: NodeEvent) -> None:
         NodeEvent.NOT_OPERATIONAL: Trip.NODE_NOT_OPERATIONAL,
         NodeEvent.REBOOTED: Trip.NODE_REBOOTED,
         NodeEvent.EMERGENCY: Trip.NODE_EMERGENCY,
-        NodeEvent.FOREIGN_FRAME: Trip.FOREIGN_FRAME,
     }
     for mode in Mode:
         assert Bench(mode).tick({"node_events": event}) == (expected[event] if NODE_EXPECTED[mode] else 0)
@@ -317,7 +316,7 @@ ALL_BAD: Changes = {
     "saturated": 1,
     "solver_ok": 0,
     "overrun": 5,
-    "node_events": 31,
+    "node_events": 15,
 }
 
 
@@ -328,7 +327,7 @@ def test_what_is_watched_in_which_mode(mode: Mode) -> None:
     for _ in range(300):
         trips |= bench.tick(ALL_BAD)
     frames = Trip.SENSE_SEQUENCE | 0b111 * Trip.SENSE_RANGE_1 | 0b111 * Trip.SENSE_FROZEN_1 | Trip.OVERRUN
-    frames |= 0b1111 * Trip.HEARTBEAT_LOST | Trip.FOREIGN_FRAME
+    frames |= 0b1111 * Trip.HEARTBEAT_LOST
     loop = 0b111 * Trip.INNOVATION_X | Trip.SATURATION | Trip.SLEW | Trip.SOLVER | 0b111 * Trip.COMB_FORCE_1
     assert trips == (frames if NODE_EXPECTED[mode] else 0) | (loop if LOOP_CLOSED[mode] else 0)
 

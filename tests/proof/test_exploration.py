@@ -1,0 +1,214 @@
+"""The composition explored, as far as a test has time: all with one fault, and every planted defect.
+
+``make prove`` explores the larger configurations of ``world.CONFIGURATIONS``; docs/understand/how-it-is-tested.md says
+what that shows.
+"""
+
+import random
+import re
+from collections.abc import Callable
+from typing import Any
+
+import pytest
+from explore import Explored, explore, settle
+from story import as_text, from_text, tell
+from world import CONFIGURATIONS, Configuration, World, learnt
+
+from hil.node.amplifier import AmplifierNode
+from hil.node.drive import DriveReceiver
+from hil.node.heartbeat import HeartbeatConsumer
+from pkxyz_ctrl.can.driver import AmplifierDriver, DriverState
+from pkxyz_ctrl.can.frame import Frame
+from pkxyz_ctrl.loop.controller import Controller
+from pkxyz_ctrl.safety.gate import TransmitGate
+from pkxyz_ctrl.safety.modes import Event, Mode
+
+ONE = CONFIGURATIONS["one"]
+FRAMES = Configuration("one frame", 1, kinds=ONE.kinds - {"cut"})
+
+
+@pytest.mark.parametrize("configuration", [CONFIGURATIONS["well"], FRAMES], ids=lambda c: c.name)
+def test_every_state_is_sound(configuration: Configuration) -> None:
+    """To a fixed point: no invariant fails, a way back from everywhere, no start-up for ever."""
+    found = explore(configuration)
+    assert not found.violation, tell(configuration, found.story)
+    assert found.is_complete
+    assert found.states > (100 if configuration.faults == 0 else 5000)
+    assert 1 <= found.longest <= configuration.settle_ticks
+
+
+def test_all_modes_and_levels_are_met() -> None:
+    """What was explored is worth it: every mode, every level of the combs, every state of the driver but OFF."""
+    world = World(ONE, learnt(ONE))
+    modes, levels, states = set(), set(), set()
+    generator = random.Random(1)
+    settle(world)
+    running = world.take_state()
+    for _ in range(4000):
+        modes.add(Mode(world.controller.mode))
+        levels.add(world.plant.counts)
+        states.add(world.controller.driver.state)
+        world.faults_left = 1 if generator.random() < 0.05 else 0
+        world.take(generator.choice(world.options()))
+        options, _ = settle(world)
+        if not options:
+            world.put_state(running)
+    assert modes >= set(Mode) - {Mode.TRACKING}
+    assert len(levels) >= 3
+    assert states >= set(DriverState) - {DriverState.OFF, DriverState.IDENTIFYING}
+
+
+def test_states_with_one_key_have_one_future() -> None:
+    """The abstraction, tried: where two ways meet in a key, everything that follows has the same keys, too.
+
+    Each way is walked on its own, so counters, times and histories differ; what the key leaves out must not matter.
+    """
+    generator = random.Random(2)
+    met: dict[bytes, tuple[Any, set[tuple[str, bytes]]]] = {}
+    compared = 0
+    for walk in range(40):
+        world = World(FRAMES, learnt(FRAMES))
+        world.faults_left = 2
+        options, _ = settle(world)
+        for _ in range(60 + 5 * walk):
+            if not options:
+                break
+            state = world.take_state()
+            key, future = world.key(state), set()
+            for option in options:
+                world.put_state(state)
+                world.take(option)
+                settle(world)
+                future.add((repr(option), world.key(world.take_state())))
+            if key in met and met[key][0] != (state[0][6], state[1][3]):
+                assert met[key][1] == future
+                compared += 1
+            met[key] = (state[0][6], state[1][3]), future
+            world.put_state(state)
+            world.take(generator.choices(options, [30, *[1 + 8 * (o[0] == "tick") for o in options[1:]]])[0])
+            options, _ = settle(world)
+    assert compared > 100
+
+
+def test_a_state_is_taken_and_put_back_whole() -> None:
+    world = World(FRAMES, learnt(FRAMES))
+    settle(world)
+    state = world.take_state()
+    key = world.key(state)
+    for _ in range(40):
+        world.take(world.options()[-1])
+        settle(world)
+    assert world.key(world.take_state()) != key
+    world.put_state(state)
+    assert world.key(world.take_state()) == key
+    assert world._snapshot.take()[3] == state[1][3]
+
+
+# -- planted defects -----------------------------------------------------------------------------------------
+
+Plant = Callable[[pytest.MonkeyPatch], None]
+
+
+def _no_step_limit(patch: pytest.MonkeyPatch) -> None:
+    """The node as it was: whatever passes is applied. The gate's rule alone can't hold the slew limit."""
+    shipped = AmplifierNode._apply
+
+    def apply(node: AmplifierNode, counts: tuple[int, int, int], t_us: int) -> None:
+        node._step_max = 32767
+        shipped(node, counts, t_us)
+
+    patch.setattr(AmplifierNode, "_apply", apply)
+
+
+def _old_start_up(patch: pytest.MonkeyPatch) -> None:
+    """A controller that has to see CONFIGURING at the beginning of a tick, or waits for ever."""
+    shipped = Controller._go_on_starting
+
+    def go_on(controller: Controller, t_us: int) -> None:
+        shipped(controller, t_us)
+        if controller.mode == Mode.BOOT and controller.driver.state is DriverState.OPERATIONAL:
+            controller._event = int(Event.NODE_READY)
+
+    patch.setattr(Controller, "_go_on_starting", go_on)
+
+
+def _no_crc(patch: pytest.MonkeyPatch) -> None:
+    """A node that looks at no CRC: one flipped bit makes a step of a count too many."""
+    shipped = DriveReceiver._receive_protected
+
+    def receive(drive: DriveReceiver, data: bytes, t_us: int) -> None:
+        if len(data) == 8:
+            a, b, c = (int.from_bytes(data[i : i + 2], "little") for i in (0, 2, 4))
+            right = drive._w0[a] ^ drive._w1[b] ^ drive._w2[c] ^ drive._w3[data[6]]
+            data = data[:7] + bytes((right,))
+        shipped(drive, data, t_us)
+
+    patch.setattr(DriveReceiver, "_receive_protected", receive)
+    _no_step_limit(patch)
+
+
+def _deaf_to_silence(patch: pytest.MonkeyPatch) -> None:
+    """A node without any time-out: what it holds, it holds for as long as nothing comes."""
+    patch.setattr(AmplifierNode, "_count_silence", lambda node, t_us: None)
+    patch.setattr(AmplifierNode, "_drive_overdue", lambda node, now_us: None)
+    patch.setattr(HeartbeatConsumer, "_time_out", lambda consumer, now_us: None)
+
+
+def _unhomed(patch: pytest.MonkeyPatch) -> None:
+    """A gate that knows no modes, behind a controller that sends a voltage in all of them."""
+    patch.setattr(TransmitGate, "check", lambda gate, frame, mode, t_us: None)
+    shipped = AmplifierDriver.drive
+
+    def drive(driver: AmplifierDriver, counts: tuple[int, int, int], t_us: int) -> Frame:
+        return shipped(driver, (10, 10, 0), t_us)
+
+    patch.setattr(AmplifierDriver, "drive", drive)
+
+
+def _no_way_back(patch: pytest.MonkeyPatch) -> None:
+    """A controller that hears nobody who clears."""
+    patch.setattr(Controller, "clear", lambda controller: None)
+
+
+def _no_gate(patch: pytest.MonkeyPatch) -> None:
+    """No gate at all: the law's 21 counts reach a node whose own limit is far away."""
+    patch.setattr(TransmitGate, "check", lambda gate, frame, mode, t_us: None)
+    _no_step_limit(patch)
+
+
+def _keeps_its_voltage(patch: pytest.MonkeyPatch) -> None:
+    """A node that is stopped and leaves its combs where they are."""
+    patch.setattr(AmplifierNode, "_outputs_to_error_value", lambda node: None)
+
+
+PLANTED: dict[str, tuple[Plant, str]] = {
+    "node without a step limit": (_no_step_limit, "a step from"),
+    "start-up that has to be seen": (_old_start_up, "a start-up can go on for ever"),
+    "node without a CRC": (_no_crc, "a step from"),
+    "node without time-outs": (_deaf_to_silence, "ticks after the decision"),
+    "voltage in every mode": (_unhomed, "a voltage is sent"),
+    "nobody can clear": (_no_way_back, "no way leads back"),
+    "no gate": (_no_gate, "a step from|beyond 0"),
+    "node that keeps its voltage": (_keeps_its_voltage, "ticks after the decision|gate takes combs"),
+}
+
+
+@pytest.mark.parametrize("name", PLANTED)
+def test_each_planted_defect_is_found(name: str, monkeypatch: pytest.MonkeyPatch) -> None:
+    plant, expected = PLANTED[name]
+    configurations = CONFIGURATIONS["well"], ONE
+    for configuration in configurations:
+        learnt(configuration)  # what may change, before something is broken
+    plant(monkeypatch)
+    found: Explored | None = None
+    for configuration in configurations:
+        found = explore(configuration)
+        if found.violation:
+            break
+    assert found is not None
+    assert re.search(expected, found.violation), found.violation or "nothing was found"
+    told = tell(configuration, found.story)
+    assert f"VIOLATION: {found.violation}" in told or "way" in found.violation or "for ever" in found.violation
+    again, way = from_text(as_text(configuration, found.story))
+    assert again == configuration.name
+    assert tell(CONFIGURATIONS[again], way) == told

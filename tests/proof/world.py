@@ -1,0 +1,557 @@
+"""The composition that is explored: shipped controller and shipped node, a wire that may do anything, any law, anybody.
+
+Controller (driver, modes, monitors, cycle, gate) and amplifier node are the classes that run everywhere else. Their
+frames meet here without a bus: `World` does in one tick what ``loop.runtime`` does, and stops wherever something is
+not decided by the code. There `options` tells what may happen, and `take` lets one of them happen.
+
+What is small here and large elsewhere: the period is 20 ms, so that the shipped time-outs in ms are two or three
+SYNCs; node and driver wait for some ticks only; the sense input gives up counting after 4 SYNCs (255), and the node's
+errors last 30 ms (100). Each of these is compared with a count or an age and has no other effect, so a longer one
+adds ticks in which the same things happen, and none else; that each order in which they can run out occurs is a
+matter of the sizes in `CONFIGURATIONS`.
+"""
+
+from collections import deque
+from dataclasses import dataclass
+from functools import cache
+from typing import Any, Final, NamedTuple
+
+from any_law import any_law, reference_for, sense_counts_at_rest
+from node_rig import EDS
+from snapshot import Attributes, Bases, Snapshot
+
+from hil.bus.clock import Lockstep
+from hil.node.amplifier import AmplifierNode, NmtState
+from hil.node.emergency import FrameErrors
+from pkxyz_ctrl.can import driver as driver_module
+from pkxyz_ctrl.can import sense_input, startup
+from pkxyz_ctrl.can.codec import ProcessCodec
+from pkxyz_ctrl.can.driver import DriverState
+from pkxyz_ctrl.can.driver_config import DriverConfig
+from pkxyz_ctrl.can.frame import Frame
+from pkxyz_ctrl.can.sdo import SdoStep
+from pkxyz_ctrl.config.bus import BusConfig
+from pkxyz_ctrl.config.files import load
+from pkxyz_ctrl.loop.controller import Controller, StartUpError
+from pkxyz_ctrl.safety.gate import GateConfig
+from pkxyz_ctrl.safety.modes import MAY_ENERGISE, Event, Mode
+from pkxyz_ctrl.safety.trips import Trip
+
+Counts = tuple[int, int, int]
+Option = tuple[Any, ...]
+
+PERIOD_US = 20_000
+TURNAROUND_US = 0
+POLL_US = 5_000
+HEARTBEAT_TIMEOUT_MS = 55  # two lost ones, as with the shipped 20 and 50 ms, and the half tick that the first may take
+STEP = 10  # counts that may be added in a tick
+LEVELS: tuple[Counts, ...] = ((0, 0, 0), (10, 10, 0), (20, 20, 10))  # each a permitted step from its neighbour
+TOO_FAR: tuple[Counts, ...] = ((0, 20, 20), (21, 20, 10))  # a comb that drops beyond the slew limit; beyond the maximum
+MAXIMUM = 20
+SETTLED = 2  # ticks, before the loop is closed
+NODE_ID, CONTROLLER_ID = 10, 127
+LATE_TICKS = 2  # how long a frame may be held back
+
+NMT, SYNC, EMCY, SENSE, DRIVE, REPLY, REQUEST = 0x000, 0x080, 0x08A, 0x28A, 0x30A, 0x58A, 0x60A
+NODE_BEAT, OUR_BEAT = 0x70A, 0x77F
+NAMES = {
+    NMT: "NMT", SYNC: "SYNC", EMCY: "emergency", SENSE: "sense", DRIVE: "drive", REPLY: "SDO answer",
+    REQUEST: "SDO request", NODE_BEAT: "heartbeat of the node", OUR_BEAT: "heartbeat of the controller",
+}  # fmt: skip
+FROM_US = frozenset({NMT, SYNC, DRIVE, REQUEST, OUR_BEAT})
+CUTS = {
+    "SYNC": frozenset({SYNC}),
+    "drive": frozenset({DRIVE}),
+    "controller": FROM_US,
+    "node": frozenset({EMCY, SENSE, REPLY, NODE_BEAT}),
+}
+"""What may stop to get through until somebody mends it: one fault, however long it lasts."""
+
+
+class ViolationError(Exception):
+    """An invariant does not hold."""
+
+
+@dataclass(frozen=True)
+class Configuration:
+    """What is explored: sizes, and how much may go wrong."""
+
+    name: str
+    faults: int
+    drive_timeout_syncs: int = 3
+    drive_timeout_ms: int = 50
+    whole_dialogue: bool = False  # all SDO steps of the start-up, not one of each sort
+    kinds: frozenset[str] = frozenset({"late", "repeat", "damage", "skip", "cut"})
+    settle_ticks: int = 4  # within so many ticks of a decision all combs are at 0 V
+    agree_ticks: int = 4  # so long may combs hold something else than the gate believes, before it stops to believe
+
+
+ANY: Final = frozenset({"late", "repeat", "damage", "skip"})
+CONFIGURATIONS: Final = {
+    c.name: c
+    for c in (
+        Configuration("well", 0, kinds=frozenset()),
+        Configuration("one", 1),
+        Configuration("two", 2, kinds=ANY),
+        Configuration("three", 3, kinds=ANY),
+        Configuration("three losses", 3, kinds=frozenset({"lose"})),
+        Configuration("a cut and a loss", 2, kinds=frozenset({"lose", "cut"})),
+        Configuration(
+            "slow drive time-out", 1, drive_timeout_syncs=5, drive_timeout_ms=90, settle_ticks=6, agree_ticks=6
+        ),
+        Configuration("whole dialogue", 1, kinds=ANY, whole_dialogue=True),
+    )
+}
+"""Every kind of fault; what it costs decides how many at a time. ``late`` covers loss: what is held back may never be
+let go."""
+
+
+class Held(NamedTuple):
+    frame: Frame
+    ticks_left: int
+
+
+class Plant:
+    """What the amplifier drives: holds counts, shows the stage at rest, and says what must never happen to combs."""
+
+    def __init__(self, world: "World") -> None:
+        self._world = world
+        self.counts: Counts = (0, 0, 0)
+        self._sample = sense_counts_at_rest()
+
+    def advance_to(self, t_us: int) -> None:
+        pass
+
+    def drive(self, counts: Counts) -> None:
+        before, self.counts = self.counts, (int(counts[0]), int(counts[1]), int(counts[2]))
+        if not all(0 <= count <= MAXIMUM for count in counts):
+            raise ViolationError(f"comb counts {counts} beyond 0..{MAXIMUM}")
+        if any(counts) and any(abs(new - old) > STEP for new, old in zip(counts, before, strict=True)):
+            raise ViolationError(f"a step from {before} to {counts}, beyond {STEP} in a tick")
+        if any(counts) and self._world.node.state is not NmtState.OPERATIONAL:
+            raise ViolationError(f"{counts} driven while the node is {self._world.node.state.name}")
+
+    def sample(self) -> Counts:
+        return self._sample
+
+
+class World:
+    """One state of the composition at a time; see the module."""
+
+    def __init__(self, configuration: Configuration, attributes: Attributes | None = None) -> None:
+        sense_input._SYNCS_UNCOUNTABLE = 4
+        FrameErrors.HOLD_US = 30_000
+        driver_module.configuration_steps = startup.configuration_steps if configuration.whole_dialogue else _few_steps
+        self.configuration = configuration
+        bus = _bus(configuration)
+        assert bus.can is not None
+        driver = bus.can.driver
+        self.law = any_law(PERIOD_US, homing_ticks=2)
+        self._references = {counts: reference_for(self.law, counts) for counts in (*LEVELS, *TOO_FAR)}
+        gate = GateConfig(
+            count_max=MAXIMUM, count_slew_max=STEP, period_us=PERIOD_US, node_id=NODE_ID,
+            controller_node_id=CONTROLLER_ID, fd=driver.fd,
+        )  # fmt: skip
+        self.clock = Lockstep()
+        self.wire: deque[Frame] = deque()
+        self.received: deque[Frame] = deque()  # by the controller's port, not read yet
+        self.held: tuple[Held, ...] = ()
+        self.plant = Plant(self)
+        self.controller = Controller(self.law, bus, gate, self._from_controller)
+        self.node = AmplifierNode(
+            NODE_ID, self.clock, self.wire.append, self.plant, EDS,
+            turnaround_us=TURNAROUND_US, fd=driver.fd, protection=driver.protection,
+        )  # fmt: skip
+        self._codecs = {DRIVE: ProcessCodec(DRIVE, True), SENSE: ProcessCodec(SENSE, True)}
+        self.faults_left = configuration.faults
+        self.phase = "start"
+        self.tick_us = 0
+        self.skipped = 0
+        self.since_decision = 0  # ticks since it was decided that the combs go to 0 V, while they are not there
+        self.quiet = 0  # ticks in a row with 0 V commanded and this tick's sense values there
+        self.apart = 0  # ticks since the combs hold something else than what the gate takes them to hold
+        self.believed: Counts = (0, 0, 0)  # by the gate, before its last frame
+        self.cut: frozenset[int] = frozenset()  # what no longer gets through
+        self.longest = self.longest_apart = 0
+        self.node.power_on()
+        self.controller.start(0)
+        if attributes is not None:
+            parts = attributes.of(self.parts())
+            self._snapshot = Snapshot(parts, self.controller, self.node)
+
+    def parts(self) -> list[object]:
+        """What everything else can be reached from."""
+        return [self.controller, self.node, self.clock]
+
+    # -- state ---------------------------------------------------------------------------------------------------
+
+    def take_state(self) -> tuple[Any, ...]:
+        mine = (
+            tuple(self.wire), tuple(self.received), self.held, self.plant.counts, self.faults_left, self.phase,
+            self.tick_us, self.skipped, self.since_decision, self.quiet,
+            self.apart, self.believed, self.cut,
+        )  # fmt: skip
+        return mine, self._snapshot.take()
+
+    def put_state(self, state: tuple[Any, ...]) -> None:
+        mine, rest = state
+        (
+            wire, received, self.held, self.plant.counts, self.faults_left, self.phase,
+            self.tick_us, self.skipped, self.since_decision, self.quiet,
+            self.apart, self.believed, self.cut,
+        ) = mine  # fmt: skip
+        self.wire.clear()
+        self.wire.extend(wire)
+        self.received.clear()
+        self.received.extend(received)
+        self._snapshot.put(rest)
+
+    def bases(self) -> Bases:
+        driver = self.controller.driver
+        return Bases(self.clock.now_us, driver._drive_counter, self.node._sense.counter, driver._sync_index)
+
+    def key(self, state: tuple[Any, ...]) -> bytes:
+        mine, rest = state
+        bases = self.bases()
+        wire, received, held, counts, left, phase, tick_us, skipped, since, quiet, apart, believed, cut = mine
+        more = (
+            tuple(self._frame_key(f, bases) for f in wire),
+            tuple(self._frame_key(f, bases) for f in received),
+            tuple(sorted((self._frame_key(h.frame, bases), h.ticks_left) for h in held)),
+            counts, left, phase, tick_us - bases.now_us, skipped, since, quiet,
+            apart, believed, tuple(sorted(cut)),
+        )  # fmt: skip
+        return self._snapshot.key(rest, bases, more)
+
+    def _frame_key(self, frame: Frame, bases: Bases) -> tuple[Any, ...]:
+        can_id, data, _ = frame
+        if can_id in self._codecs and len(data) == 8:
+            a, b, c, counter, is_right = self._codecs[can_id].decode(data)
+            base = bases.drive if can_id == DRIVE else bases.sense
+            return can_id, repr((a, b, c, (counter - base) & 0xFF, is_right))
+        if can_id == SYNC and len(data) == 1:
+            return can_id, repr((data[0] - bases.sync) % 240)
+        if can_id == EMCY:
+            return can_id, repr(int.from_bytes(data[:2], "little") >= 0x100)
+        return can_id, data.hex()
+
+    def is_landmark(self) -> bool:
+        """Where ways meet again although nothing is to be decided: before a tick, and now and then in the dialogue."""
+        if self.wire:
+            return self.wire[0].can_id == REQUEST and self.controller.driver._dialogue._position % 6 == 0
+        return self.phase == "before"
+
+    # -- what may happen -----------------------------------------------------------------------------------------
+
+    def options(self) -> list[Option]:
+        """Everything that may happen now; the first is what happens when nothing goes wrong. Empty: it has ended."""
+        if self.phase == "ended":
+            return []
+        if self.wire:
+            return self._fates(self.wire[0])
+        if self.phase in ("before", "after"):
+            options: list[Option] = [("go",)]
+            if self.phase == "before" and self.faults_left and "skip" in self.configuration.kinds:
+                options.append(("skip",))
+            if self.phase == "before" and self.faults_left and "cut" in self.configuration.kinds and not self.cut:
+                options += [("cut", name) for name in CUTS]
+            if self.phase == "before" and self.cut:
+                options.append(("mend",))
+            options += [("release", place) for place in range(len(self.held))]
+            return options
+        if self.phase == "compute":
+            return self._wishes()
+        return [("go",)]
+
+    def _fates(self, frame: Frame) -> list[Option]:
+        if frame.can_id in self.cut:
+            return [("vanish",)]
+        options: list[Option] = [("deliver",)]
+        if self.faults_left:
+            kinds = self.configuration.kinds
+            if "late" in kinds:
+                options.append(("late",))
+            if "repeat" in kinds:
+                options.append(("repeat",))
+            if "damage" in kinds:
+                options += [("damage", place) for place in range(len(damaged(frame)))]
+            if "lose" in kinds:
+                options.append(("lose",))
+        return options
+
+    def _wishes(self) -> list[Option]:
+        """What an operator, a monitor and a law may want in this tick."""
+        mode = Mode(self.controller.mode)
+        driver = self.controller.driver
+        match mode:
+            case Mode.IDLE:
+                wishes: list[Option] = [
+                    ("tick", event, LEVELS[0], 0) for event in (Event.NONE, Event.HOME, Event.ENABLE)
+                ]
+            case Mode.HOMING:
+                wishes = [("tick", event, LEVELS[0], 0) for event in (Event.NONE, Event.DISABLE)]
+            case Mode.ENABLED | Mode.TRACKING:
+                wishes = [("tick", Event.NONE, counts, 0) for counts in (*LEVELS, *TOO_FAR)]
+                wishes += [("tick", Event.DISABLE, LEVELS[0], 0), ("tick", Event.NONE, LEVELS[0], int(Trip.OPERATOR))]
+            case Mode.FAULT:
+                wishes = [("tick", event, LEVELS[0], 0) for event in (Event.NONE, Event.CLEAR)]
+            case _:
+                wishes = [("tick", Event.NONE, LEVELS[0], 0)]
+                if driver.state is DriverState.FAILED:
+                    wishes.append(("tick", Event.CLEAR, LEVELS[0], 0))
+        return wishes
+
+    # -- what happens --------------------------------------------------------------------------------------------
+
+    def take(self, option: Option) -> None:
+        """Let one of `options` happen. Raises `ViolationError`."""
+        match option[0]:
+            case "deliver":
+                self._deliver(self.wire.popleft())
+            case "lose":
+                self.faults_left -= 1
+                self.wire.popleft()
+            case "late":
+                self.faults_left -= 1
+                self.held = (*self.held, Held(self.wire.popleft(), LATE_TICKS))
+            case "repeat":
+                self.faults_left -= 1
+                frame = self.wire.popleft()
+                self.held = (*self.held, Held(frame, LATE_TICKS))
+                self._deliver(frame)
+            case "damage":
+                self.faults_left -= 1
+                self._deliver(damaged(self.wire.popleft())[option[1]])
+            case "release":
+                place = option[1]
+                frame = self.held[place].frame
+                self.held = self.held[:place] + self.held[place + 1 :]
+                self._deliver(frame)
+            case "vanish":
+                self.wire.popleft()
+            case "cut":
+                self.faults_left -= 1
+                self.cut = CUTS[option[1]]
+            case "mend":
+                self.cut = frozenset()
+            case "skip":
+                self.faults_left -= 1
+                self.skipped += 1
+                self._pass_tick()
+            case "tick":
+                self._compute(*option[1:])
+            case _:
+                self._go_on()
+
+    def _from_controller(self, frame: Frame) -> None:
+        """What the gate has let through."""
+        if frame.can_id == DRIVE and any(frame.data[:6]):
+            controller = self.controller
+            if not MAY_ENERGISE[controller.mode] or not controller.memory["homed"][0]:
+                raise ViolationError(
+                    f"a voltage is sent in {Mode(controller.mode).name}, homed {controller.memory['homed'][0]}"
+                )
+            if controller.driver.state is not DriverState.OPERATIONAL:
+                raise ViolationError(f"a voltage is sent while the driver is {controller.driver.state.name}")
+        self.wire.append(frame)
+
+    def _deliver(self, frame: Frame) -> None:
+        if frame.can_id in FROM_US:
+            self.node.on_frame(frame, self.clock.now_us)
+        else:
+            self.received.append(frame)
+
+    def _go_on(self) -> None:
+        match self.phase:
+            case "start":
+                self._start()
+            case "before":
+                self.controller.begin(self.tick_us)
+                self.phase = "sync"
+            case "sync":
+                self.clock.run_until(self.tick_us + TURNAROUND_US)
+                self.phase = "sense"
+            case "sense":
+                self.phase = "after"
+            case "after":
+                self.phase = "read"
+            case "read":
+                self._read()
+            case "finish":
+                self.clock.run_until(self.tick_us + PERIOD_US // 2)
+                if not self.wire:
+                    now_us = self.clock.now_us
+                    self.controller.finish(now_us, now_us)
+                    self.phase = "rest"
+            case "rest":
+                self._rest()
+
+    def _start(self) -> None:
+        """As ``loop.runtime.start``."""
+        try:
+            if self.received:
+                done = self.controller.dialogue(self.received.popleft(), self.clock.now_us)
+            else:
+                next_us = self.clock.next_event_us()
+                until_us = self.clock.now_us + POLL_US
+                self.clock.run_until(until_us if next_us is None else min(until_us, next_us))
+                if self.wire:
+                    return
+                done = self.controller.dialogue(None, self.clock.now_us)
+        except StartUpError:
+            self.phase = "ended"
+            if any(self.plant.counts):
+                raise ViolationError("a start-up that failed leaves a voltage") from None
+            return
+        if done:
+            self.tick_us = self.clock.now_us + PERIOD_US
+            self.phase = "rest"
+            self.tick_us -= PERIOD_US
+
+    def _read(self) -> None:
+        while self.received:
+            if self.controller.receive(self.received.popleft(), self.clock.now_us):
+                self.phase = "compute"
+                return
+            if self.wire:
+                return
+        self.phase = "compute"
+
+    def _compute(self, event: Event, counts: Counts, trips: int) -> None:
+        controller = self.controller
+        if event is Event.CLEAR:
+            controller.clear()
+        elif event is not Event.NONE:
+            controller.request(event)
+        reference = self._references[counts]
+        memory: Any = controller.memory[0]
+        memory["setpoint"] = reference["motion"][0]
+        memory["input"]["trips"] |= trips
+        was, fresh = controller.mode, controller.driver.sense.fresh
+        controller.compute(reference, self.skipped)
+        self.skipped = 0
+        if MAY_ENERGISE[controller.mode] and not MAY_ENERGISE[was] and self.quiet < SETTLED:
+            raise ViolationError(f"the loop is closed after {self.quiet} quiet ticks, {SETTLED} are asked for")
+        is_quiet = fresh and not any(controller._drive_counts)
+        self.quiet = min(self.quiet + 1, SETTLED) if is_quiet else 0
+        self.phase = "finish"
+
+    def _rest(self) -> None:
+        next_us = self.clock.next_event_us()
+        end_us = self.tick_us + PERIOD_US
+        if next_us is not None and next_us <= end_us:
+            self.clock.run_until(next_us)
+            return
+        self._pass_tick()
+
+    def _pass_tick(self) -> None:
+        self.tick_us += PERIOD_US
+        self.clock.run_until(self.tick_us)
+        self._compare_beliefs()
+        if MAY_ENERGISE[self.controller.mode] or not any(self.plant.counts):
+            self.since_decision = 0
+        else:
+            self.since_decision += 1
+            self.longest = max(self.longest, self.since_decision)
+            if self.since_decision > self.configuration.settle_ticks:
+                raise ViolationError(
+                    f"{self.since_decision} ticks after the decision the combs hold {self.plant.counts}"
+                )
+        self.held = tuple(Held(h.frame, h.ticks_left - 1) for h in self.held if h.ticks_left > 1)
+        self.phase = "before"
+
+    def _compare_beliefs(self) -> None:
+        """Do energised combs hold what the gate takes them to hold? It may be wrong while it can't know better.
+
+        Combs at 0 V that the gate takes for energised (no drive frame arrives) are the business of the loop's monitors.
+        """
+        gate = self.controller.gate
+        believes = gate._known and not gate.latched and MAY_ENERGISE[self.controller.mode]
+        if not believes or not any(self.plant.counts) or self.plant.counts == self.believed:
+            self.apart = 0
+        else:
+            self.apart += 1
+            self.longest_apart = max(self.longest_apart, self.apart)
+            if self.apart > self.configuration.agree_ticks:
+                raise ViolationError(
+                    f"for {self.apart} ticks the gate takes combs at {self.plant.counts} to be at {self.believed}"
+                )
+        self.believed = gate._counts if believes else (0, 0, 0)
+
+    @property
+    def is_running(self) -> bool:
+        """The loop is closed: where every state has to have a way to."""
+        return self.controller.mode == Mode.ENABLED
+
+    @property
+    def is_starting(self) -> bool:
+        """On the way from NMT reset to IDLE."""
+        return self.controller.mode < Mode.IDLE and self.controller.driver.state not in (
+            DriverState.FAILED,
+            DriverState.OFF,
+        )
+
+
+def damaged(frame: Frame) -> list[Frame]:
+    """What a frame may have become that still is one."""
+    can_id, data, flags = frame
+    made: list[bytes] = []
+    match can_id:
+        case 0x080:
+            made = [bytes(((data[0] + 6) % 240 + 1,)), b""] if data else []
+        case 0x30A | 0x28A:
+            made = [bytes((data[0] ^ 1, *data[1:])), data[:-1]] if data else []
+        case 0x77F:
+            made = [b"\x00"]
+        case 0x70A:
+            made = [bytes((state,)) for state in (0, 4) if data != bytes((state,))]
+        case 0x08A:
+            made = [bytes((0, 0x10 if data[:2] == b"\0\0" else 0)) + data[2:]]
+        case 0x000:
+            made = [bytes((command, *data[1:])) for command in (1, 2, 0x80, 0x81) if command != data[0]]
+        case 0x60A:
+            made = [data[:4] + bytes((data[4] ^ 1,)) + data[5:], data[:1] + b"\xff\x5f" + data[3:]]
+        case 0x58A:
+            made = [data[:4] + bytes((data[4] ^ 1,)) + data[5:], b"\x80" + data[1:4] + b"\0\0\0\x08"]
+    return [Frame._make((can_id, payload, flags)) for payload in made]
+
+
+OF_EACH_SORT = {0x1401: (1,), 0x2010: (0,), 0x2011: (0,), 0x2012: (0,), 0x1016: (1,), 0x1017: (0,), 0x1019: (0,)}
+
+
+def _few_steps(config: DriverConfig, count_step_max: int) -> tuple[SdoStep, ...]:
+    """Of the shipped steps, in their order, those that change what the node does from then on; what the others write is
+    the default of the EDS. The dialogue treats all alike, and remembers nothing of one but that it is done.
+    """
+    steps = startup.configuration_steps(config, count_step_max)
+    return tuple(step for step in steps if step.subindex in OF_EACH_SORT.get(step.index, ()))
+
+
+@cache
+def learnt(configuration: Configuration) -> Attributes:
+    """What may change, learnt from a world that has been through what goes well."""
+    model = World(configuration)
+    wishes = [Event.HOME, *[Event.NONE] * 4, Event.ENABLE, Event.NONE, Event.DISABLE]
+    while wishes:
+        if model.phase == "compute":
+            model.take(("tick", wishes.pop(0), LEVELS[0], 0))
+        else:
+            model.take(model.options()[0])
+    return Attributes(model.parts())
+
+
+def _bus(configuration: Configuration) -> BusConfig:
+    shipped = load("buses", "fd_5k", BusConfig)
+    assert shipped.can is not None
+    driver = DriverConfig(
+        controller_heartbeat_timeout_ms=HEARTBEAT_TIMEOUT_MS,
+        node_heartbeat_timeout_ms=HEARTBEAT_TIMEOUT_MS,
+        drive_timeout_syncs=configuration.drive_timeout_syncs,
+        drive_timeout_ms=configuration.drive_timeout_ms,
+        boot_timeout_us=50_000,
+        start_timeout_us=50_000,
+        sdo_timeout_us=30_000,
+        retries=1,
+    )
+    can = shipped.can.model_copy(update={"driver": driver})
+    return shipped.model_copy(update={"period_us": PERIOD_US, "can": can})
