@@ -36,9 +36,10 @@ def open_folder(channel: str) -> Path:
     if channel in ("", ".", "..") or "\0" in channel:
         raise UnsafeFolderError("a channel is a name or the path of a folder")
     folder = folder_of(channel)
-    for own in (folder,) if "/" in channel else (folder.parent, folder):
+    is_named = "/" not in channel
+    for own in (folder.parent, folder) if is_named else (folder,):
         _make(own)
-        _require_private(own)
+        _require_private(own, is_named)
     _require_safe_way(folder.absolute())
     return folder
 
@@ -48,14 +49,16 @@ def _make(folder: Path) -> None:
         missing.mkdir(mode=0o700, exist_ok=True)
 
 
-def _require_private(folder: Path) -> None:
+def _require_private(folder: Path, is_named: bool) -> None:
     found = os.lstat(folder)
     if not stat.S_ISDIR(found.st_mode):
         kind = "a link" if stat.S_ISLNK(found.st_mode) else "no folder"
         raise UnsafeFolderError(f"{folder} is {kind}; give a path where there is nothing yet")
     if found.st_uid != os.getuid():
         raise UnsafeFolderError(f"{folder} belongs to another user; give a path of your own")
-    if found.st_mode & _OTHERS_ENTER_OR_WRITE:
+    if found.st_mode & _OTHERS_ENTER_OR_WRITE and is_named:
+        folder.chmod(0o700)  # nobody but this module has a reason to make it; an earlier version did so by the umask
+    elif found.st_mode & _OTHERS_ENTER_OR_WRITE:
         raise UnsafeFolderError(f"{folder} is open to other users; chmod 700 it, or give a path where there is nothing")
 
 

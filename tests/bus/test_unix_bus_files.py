@@ -92,6 +92,14 @@ def test_a_folder_that_others_may_use_is_no_channel(tmp_path, mode):
     refused(tmp_path / "open", "chmod 700")
 
 
+def test_a_named_channel_of_an_earlier_version_is_closed_to_others(tmp_path, monkeypatch):
+    monkeypatch.setenv("XDG_RUNTIME_DIR", str(tmp_path))
+    lab = folder_of("lab")
+    lab.mkdir(parents=True, mode=0o755)
+    with UnixBus("lab"):
+        assert [stat.S_IMODE(folder.stat().st_mode) for folder in (lab.parent, lab)] == [0o700, 0o700]
+
+
 def test_a_folder_of_another_user_is_no_channel(tmp_path, monkeypatch):
     (tmp_path / "theirs").mkdir(mode=0o700)
     uid = os.getuid()
