@@ -191,6 +191,11 @@ class UnixBus(can.BusABC):
             remove_socket(self._path)
             close_folder(self.channel)
 
+    @property
+    def others(self) -> int:
+        """How many sockets of other participants there are; one that was killed counts until somebody sends to it."""
+        return len(self._others())
+
     def _others(self) -> list[str]:
         """Sockets of the other participants; the folder is listed again when it has changed."""
         try:

@@ -1,6 +1,7 @@
 """``pkxyz latency``: how late this machine wakes the loop, and how long a cycle takes."""
 
 import json
+import shutil
 from pathlib import Path
 from typing import Annotated, Any
 
@@ -21,7 +22,7 @@ def latency(
 
     if out is not None:
         picture_to_write(out, "--out")
-    measured = measure(period_us, seconds, cyclictest)
+    measured = measure(period_us, seconds, cyclictest or shutil.which("cyclictest"))
     figures = measured.figures()
     if out is not None:
         from hil.pictures.latency import draw_latency

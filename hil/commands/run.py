@@ -18,7 +18,8 @@ Scenario = Annotated[str, typer.Argument(help="A shipped scenario's name or a TO
 Bus = Annotated[
     str | None,
     typer.Option(
-        help="Name or file of the bus to meet on, instead of the scenario's. Where that is simulated: unix_2k."
+        help="Name or file of the bus to meet on, instead of the scenario's. Where that is simulated: unix_2k, and for "
+        "`run` whichever of unix_2k and unix_1k this machine keeps up with."
     ),
 ]
 Json = Annotated[bool, typer.Option("--json", help="Print JSON, and nothing else.")]
@@ -29,7 +30,7 @@ Replay = Annotated[
 Refresh = Annotated[
     str | None, typer.Option(metavar="FILE", help="Begin with what a run has learnt, and go on learning.")
 ]
-_DEFAULT_BUS = "unix_2k"
+_MEETING_BUSES = ("unix_2k", "unix_1k")  # on one channel: a plant on one of them serves a controller on the other, too
 
 
 def run(
@@ -49,22 +50,30 @@ def run(
 
     Ctrl-C, SIGTERM and errors leave the combs at 0 V. Errors of position are those of the estimate.
     """
+    from hil.lanes.ending import Ended
     from hil.lanes.lane import Lane
     from hil.lanes.wall import require_real_bus
     from hil.pictures.run import draw
     from hil.recording.recording import RecordingError
     from hil.runs.at_rate import run_into
     from hil.runs.run_folder import RunFolder, next_free
+    from hil.screen.live_status import LiveStatus
     from pkxyz_ctrl.design.model.design_error import DesignError
     from pkxyz_ctrl.loop.controller import StartUpError
 
     learning = learning_of(learn, replay, refresh)
-    loaded = _load(scenario, duration_s, stage=stage, controller=controller, bus=bus, learning=learning)
-    require_real_bus(loaded.bus)
+    require_seconds(duration_s)
     say_if_compiling(quiet=as_json)
+    try:
+        loaded = _met(scenario, measured=True, stage=stage, controller=controller, bus=bus, learning=learning)
+    except Ended as end:
+        raise typer.Exit(128 + end.signal_number) from None
+    loaded = _lasting(loaded, duration_s)
+    require_real_bus(loaded.bus)
+    live = LiveStatus(round(loaded.config.duration_s / loaded.bus.period_s), loaded.bus.period_s)
     folder = RunFolder(out if out is not None else next_free(Path("runs"), loaded.config.name, Lane.WALL))
     try:
-        ran = run_into(folder, loaded, _tell)
+        ran = run_into(folder, loaded, _tell, _quiet if as_json else live)
         draw(folder, ran.summary, ran.lateness_us)
     except RecordingError as error:
         raise ConfigError(str(error)) from None
@@ -136,27 +145,43 @@ def learning_of(learn: bool, replay: str | None, refresh: str | None) -> dict[st
     return asked[0] if asked else None
 
 
-def _met(scenario: str, **instead: Any) -> Any:
-    """The scenario on the bus that was given, else on its own, unless that is simulated and ends with its process."""
+def _met(scenario: str, *, measured: bool = False, **instead: Any) -> Any:
+    """The scenario on the bus that was given, else on its own, unless that is simulated and ends with its process: then
+    on the first of those for one machine, or if ``measured`` the first that this machine keeps up with.
+    """
     from hil.runs.scenario import load_scenario
+    from hil.studies.fitting_bus import fastest_that_fits
+    from pkxyz_ctrl.config.bus import BusConfig
+    from pkxyz_ctrl.config.files import load
 
     loaded = load_scenario(scenario, **instead)
     can_config = loaded.bus.can
     if instead["bus"] is not None or (can_config is not None and can_config.interface != "pkxyz-sim"):
         return loaded
-    _tell(f"the scenario's bus, {loaded.bus.name}, is simulated; meeting on {_DEFAULT_BUS}, as without --bus")
-    return load_scenario(scenario, **instead | {"bus": _DEFAULT_BUS})
+    meeting, why = load("buses", _MEETING_BUSES[0], BusConfig), "as without --bus"
+    if measured:
+        buses = (load("buses", name, BusConfig) for name in _MEETING_BUSES)
+        meeting, why = fastest_that_fits(buses, loaded.controller.monitors.overrun_count)
+    _tell(f"the scenario's bus, {loaded.bus.name}, is simulated; meeting on {meeting.name}: {why}")
+    return load_scenario(scenario, **instead | {"bus": meeting.name})
 
 
-def _load(scenario: str, duration_s: float | None, **instead: Any) -> Any:
+def require_seconds(duration_s: float | None) -> None:
+    """Raise ``ConfigError`` for what is no duration of a run."""
+    if duration_s is not None and not 0 < duration_s <= 36_000:
+        raise ConfigError(f"--seconds: {duration_s:g} is not in 0..36000")
+
+
+def _lasting(loaded: Any, duration_s: float | None) -> Any:
     import dataclasses
 
-    loaded = _met(scenario, **instead)
     if duration_s is None:
         return loaded
-    if not 0 < duration_s <= 36_000:
-        raise ConfigError(f"--seconds: {duration_s:g} is not in 0..36000")
     return dataclasses.replace(loaded, config=loaded.config.model_copy(update={"duration_s": duration_s}))
+
+
+def _quiet(row: object) -> None:
+    """Say nothing of a row."""
 
 
 def _tell(words: str) -> None:

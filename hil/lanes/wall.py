@@ -6,25 +6,33 @@ from typing import Any
 
 import numpy as np
 
+from hil.bus.unix_bus import UnixBus
 from hil.lanes.ending import Ending
 from hil.lanes.live_reference import LiveReference
 from hil.lanes.setup import Setup
 from hil.lanes.streamed_reference import StreamedReference
 from hil.recording.wall_recorder import WallRecorder
+from pkxyz_ctrl.can import cob_id
 from pkxyz_ctrl.can.frame import Frame
 from pkxyz_ctrl.config.bus import BusConfig, CanConfig
 from pkxyz_ctrl.config.files import ConfigError
 from pkxyz_ctrl.io.can_port import CanPort, open_bus
 from pkxyz_ctrl.io.clocks import TickClock, WallClock
 from pkxyz_ctrl.loop import cycle as cycling
-from pkxyz_ctrl.loop.controller import Controller
+from pkxyz_ctrl.loop.controller import Controller, StartUpError
 from pkxyz_ctrl.loop.reference import standing_still
 from pkxyz_ctrl.loop.row import TRUTH_FIELDS
 from pkxyz_ctrl.loop.runtime import run, start
 from pkxyz_ctrl.safety.gate import GateConfig
+from pkxyz_ctrl.safety.modes import Mode
 
 _GUARDS_PER_PERIOD = 8
+_SILENT_US = 500_000  # after a fault, for so long without its heartbeat, the amplifier is gone
 _LAST_FRAMES_S = 0.02  # 0 V and pre-operational leave even a slow adapter before it is closed
+
+
+class AmplifierGoneError(Exception):
+    """The amplifier has fallen silent, and nobody here could start it again."""
 
 
 def require_real_bus(bus: BusConfig) -> CanConfig:
@@ -50,10 +58,12 @@ def wall_gate(gate: GateConfig) -> GateConfig:
 
 
 class _LoggedPort:
-    """A port whose frames go to the recorder, too."""
+    """A port whose frames go to the recorder, too. ``heartbeat_us``: when ``node_id`` said last that it is there."""
 
-    def __init__(self, port: CanPort, clock: WallClock, recorder: WallRecorder) -> None:
+    def __init__(self, port: CanPort, clock: WallClock, recorder: WallRecorder, node_id: int) -> None:
         self._port, self._clock, self._log = port, clock, recorder.frame
+        self._heartbeat_id = cob_id.HEARTBEAT_BASE + node_id
+        self.heartbeat_us = 0
         self.unsent = port.unsent
 
     def send(self, frame: Frame) -> None:
@@ -64,6 +74,8 @@ class _LoggedPort:
         frame = self._port.receive(deadline_us)
         if frame is not None:
             self._log(frame, self._port.last_us)
+            if frame.can_id == self._heartbeat_id:
+                self.heartbeat_us = self._port.last_us
         return frame
 
 
@@ -82,7 +94,7 @@ class WallRig:
         self._bus = open_bus(can_config, setup.bus.name)
         self.clock = WallClock()
         self.can_port = CanPort(self._bus, self.clock, can_config.sense_deadline_us // 2)
-        self.port = _LoggedPort(self.can_port, self.clock, recorder)
+        self.port = _LoggedPort(self.can_port, self.clock, recorder, can_config.driver.node_id)
         self.controller = Controller(
             law, setup.bus, wall_gate(setup.gate), self.port.send, self.can_port.discard_unsent
         )
@@ -99,22 +111,44 @@ class WallRig:
         )
         self._started = False
 
+    @property
+    def others(self) -> int | None:
+        """How many others are on the bus; None where that is not known."""
+        return self._bus.others if isinstance(self._bus, UnixBus) else None
+
+    @property
+    def dropped_frames(self) -> int | None:
+        """Frames that a bus among processes lost because a receiver stood still; None on other buses."""
+        return self._bus.dropped if isinstance(self._bus, UnixBus) else None
+
     def run(self) -> None:
-        """Start the amplifier and run all ticks. Raises ``StartUpError`` and ``Ended``."""
+        """Start the amplifier and run all ticks. Raises ``StartUpError``, ``AmplifierGoneError`` and ``Ended``."""
         self._started = True
-        start(self.clock, _Interruptible(self.port, self._ending), self.controller)
+        try:
+            start(self.clock, _Interruptible(self.port, self._ending), self.controller)
+        except StartUpError as error:
+            port = self.can_port
+            if not port.refused:
+                raise
+            raise StartUpError(f"{error}; {port.refusal}" if port.sent else port.refusal) from None
         row, take = self.controller.row, self._recorder.row
         live, memory = self.live, self.controller.memory
         streamed = StreamedReference(self.setup.trajectory, self.setup.bus.period_us, memory)
 
+        controller, fault = self.controller, int(Mode.FAULT)
+
         def record(tick: int) -> None:
             take(row)
             streamed.prepare()
+            if controller.mode == fault:
+                self._require_amplifier()
 
         def record_and_learn(tick: int) -> None:
             take(row)
             if live is not None:
                 live.after(memory)
+            if controller.mode == fault:
+                self._require_amplifier()
 
         if live is None:
             run(self.ticks, self.port, self.controller, streamed, self.setup.ticks, record)
@@ -131,6 +165,10 @@ class WallRig:
                 time.sleep(_LAST_FRAMES_S)
         finally:
             self._bus.shutdown()
+
+    def _require_amplifier(self) -> None:
+        if self.clock.now_us - self.port.heartbeat_us > _SILENT_US:
+            raise AmplifierGoneError
 
     def _take_late_frames(self, until_us: int) -> None:
         """What waits, as far as there is time for it: on a flooded bus there is always more."""

@@ -29,6 +29,7 @@ TRUTH = np.dtype([("t_us", "i8"), *TRUTH_FIELDS, ("sense_count", "i4", (3,))])
 
 _TRUTH_ROW = struct.Struct(f"<q{TRUTH_BYTES}s3i")
 _IDLE_US = 20_000  # between looks at whether to end
+_BACKLOG_US = 20_000  # no frame acts later than this: behind a flood, a node's watchdogs would live in the past
 _IN_FLIGHT_US = 2_000  # a frame may still come that is so much older than now
 
 
@@ -85,7 +86,7 @@ class WallPlant:
             idle_us = wall.now_us + _IDLE_US
             frame = port.receive(idle_us if due_us is None else min(idle_us, due_us))
             if frame is not None:
-                t_us = max(clock.now_us, min(port.last_us, wall.now_us))
+                t_us = max(clock.now_us, wall.now_us - _BACKLOG_US, min(port.last_us, wall.now_us))
                 clock.run_until(t_us)
                 node.on_frame(frame, t_us)
                 self._show()

@@ -10,10 +10,12 @@ import os
 import signal
 import struct
 import time
+from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
 import numpy as np
+from numpy.typing import NDArray
 
 from hil.bus.frame_log import FrameLog
 from hil.recording.recording import RecordingError, RecordingWriter
@@ -30,15 +32,24 @@ _READ_BYTES = 1 << 16
 _SAFE_AFTER_S = 0.05  # rows and frames are with the operating system, whatever becomes of the writer
 
 
-class WallRecorder:
-    """Rows and frames on their way to disk. ``lost_bytes``: what the writer was too slow for."""
+Watch = Callable[[NDArray[np.void]], object]
+"""Is shown each row, (1,) of ``ROW``, as it is written down."""
 
-    def __init__(self, recording: Path, frames: Path, metadata: dict[str, Any], channel: str) -> None:
-        """Files to write. Forks: make it before buses are opened and priorities raised."""
+
+class WallRecorder:
+    """Rows and frames on their way to disk. ``lost_rows``, ``lost_bytes``: what the writer was too slow for."""
+
+    def __init__(
+        self, recording: Path, frames: Path, metadata: dict[str, Any], channel: str, watch: Watch = lambda row: None
+    ) -> None:
+        """Files to write. Forks: make it before buses are opened and priorities raised. ``watch`` is called in the
+        writer's process, where it delays no tick.
+        """
         self.lost_bytes = 0
         self._path = recording
         self._status: int | None = None
         self._told = False
+        self.lost_rows = 0
         self._waiting: list[bytes] = []
         reading, self._pipe = os.pipe()
         said, saying = os.pipe()
@@ -48,7 +59,7 @@ class WallRecorder:
         if self._child == 0:
             os.close(self._pipe)
             os.close(said)
-            _be_the_writer(reading, saying, recording, frames, metadata, channel)
+            _be_the_writer(reading, saying, recording, frames, metadata, channel, watch)
         os.close(reading)
         os.close(saying)
         self._said = said
@@ -99,6 +110,7 @@ class WallRecorder:
         while at < written:
             at += _length_at(entry, at)
         self.lost_bytes += len(entry) - at
+        self.lost_rows += _rows_in(entry, at)
         if at > written:
             self._waiting.append(entry[written:at])
 
@@ -133,8 +145,16 @@ def _length_at(entries: bytes, at: int) -> int:
     return _HEAD.size + (entries[at + 1] if at + 1 < len(entries) else 0)
 
 
+def _rows_in(entries: bytes, at: int) -> int:
+    rows = 0
+    while at < len(entries):
+        rows += entries[at] == _ROW
+        at += _length_at(entries, at)
+    return rows
+
+
 def _be_the_writer(
-    reading: int, saying: int, rows_to: Path, frames_to: Path, metadata: dict[str, Any], channel: str
+    reading: int, saying: int, rows_to: Path, frames_to: Path, metadata: dict[str, Any], channel: str, watch: Watch
 ) -> None:
     """Never returns. Deaf to Ctrl-C: the end of the pipe is the end."""
     for number in (signal.SIGINT, signal.SIGTERM, signal.SIGHUP):
@@ -142,7 +162,7 @@ def _be_the_writer(
     status = 0
     try:
         with RecordingWriter(rows_to, metadata) as recording, FrameLog(frames_to, channel) as log:
-            recording.close(whole=_write_down(reading, recording, log))
+            recording.close(whole=_write_down(reading, recording, log, watch))
     except (RecordingError, OSError) as error:
         os.write(saying, str(error).encode())
         status = 1
@@ -153,7 +173,7 @@ def _be_the_writer(
         os._exit(status)
 
 
-def _write_down(reading: int, recording: RecordingWriter, log: FrameLog) -> bool:
+def _write_down(reading: int, recording: RecordingWriter, log: FrameLog, watch: Watch) -> bool:
     """Whether all came, up to the end that the loop made."""
     pending = b""
     whole = False
@@ -168,6 +188,7 @@ def _write_down(reading: int, recording: RecordingWriter, log: FrameLog) -> bool
             if pending[at] == _ROW:
                 row_bytes[:] = pending[at + 1 : end]
                 recording.write(row)
+                watch(row)
             elif pending[at] == _END:
                 whole = _END_ENTRY.unpack_from(pending, at)[1] == 0
             else:

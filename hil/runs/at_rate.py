@@ -7,9 +7,9 @@ from dataclasses import dataclass
 
 from hil.lanes.ending import Ended, Ending
 from hil.lanes.lane import Lane
-from hil.lanes.wall import WallRig, require_real_bus
+from hil.lanes.wall import AmplifierGoneError, WallRig, require_real_bus
 from hil.recording.recording import Recording
-from hil.recording.wall_recorder import WallRecorder
+from hil.recording.wall_recorder import WallRecorder, Watch
 from hil.runs.metrics import Metrics, RowFigures
 from hil.runs.run import Begun
 from hil.runs.run_folder import RunFolder
@@ -19,6 +19,11 @@ from pkxyz_ctrl.io.clocks import percentile_us
 from pkxyz_ctrl.io.realtime import go_real_time, leave_real_time, settle_memory
 from pkxyz_ctrl.learning import Learner
 
+_COMPANY_S, _LOOK_S = 30.0, 0.05
+_COME_BACK = {
+    False: "start `pkxyz plant` again, then this",
+    True: "check its power and the cable, then start this again",
+}
 _SHARES = {"p50": 0.5, "p99_9": 0.999, "max": 1.0}
 
 
@@ -42,13 +47,18 @@ class _Watched:
     faults: tuple[str, ...] = ()
     lateness_us: list[int] = dataclasses.field(default_factory=list)
     refused_frames: int = 0
+    dropped_frames: int | None = None
+    blocked_frames: int = 0
     learner: Learner | None = None
 
 
-def run_into(folder: RunFolder, scenario: Scenario, say: Callable[[str], object]) -> RanAtRate:
+def run_into(
+    folder: RunFolder, scenario: Scenario, say: Callable[[str], object], watch: Watch = lambda row: None
+) -> RanAtRate:
     """Run ``scenario`` at rate and leave everything in ``folder`` but the picture.
 
-    ``say`` is called with what a person should know. Raises ``ConfigError``, ``StartUpError``, ``RecordingError``.
+    ``say`` is called with what a person should know, ``watch`` with each row, in the writer's process. Raises
+    ``ConfigError``, ``StartUpError``, ``RecordingError``.
     """
     can_config = require_real_bus(scenario.bus)
     begun = Begun.begin(folder, scenario, Lane.WALL)
@@ -56,9 +66,9 @@ def run_into(folder: RunFolder, scenario: Scenario, say: Callable[[str], object]
     watched = _Watched()
     with Ending() as ending:
         channel = can_config.channel
-        recorder = WallRecorder(folder.recording, folder.frames, begun.metadata, channel)
+        recorder = WallRecorder(folder.recording, folder.frames, begun.metadata, channel, watch)
         try:
-            _run(WallRig(setup, recorder, ending), watched, say)
+            _run(WallRig(setup, recorder, ending), watched, say, ending)
         except Ended as end:
             watched.ended_by = end.signal_number
         finally:
@@ -74,19 +84,25 @@ def run_into(folder: RunFolder, scenario: Scenario, say: Callable[[str], object]
         realtime_factor=recording.ticks * period_s / watched.elapsed_s if watched.elapsed_s else None,
         errors_are_of="estimate",
         refused_frames=watched.refused_frames,
+        dropped_frames=watched.dropped_frames,
+        blocked_frames=watched.blocked_frames,
+        lost_rows=recorder.lost_rows,
         lateness_us={name: percentile_us(late, share) for name, share in _SHARES.items()},
     )
     summary = begun.end(rows, loop, watched.learner, interrupted=bool(watched.ended_by))
     return RanAtRate(summary, watched.ended_by, late)
 
 
-def _run(rig: WallRig, watched: _Watched, say: Callable[[str], object]) -> None:
+def _run(rig: WallRig, watched: _Watched, say: Callable[[str], object], ending: Ending) -> None:
     begin_s = time.monotonic()
     try:
+        _wait_for_others(rig, say, ending)
         say(go_real_time())
         settle_memory()
         begin_s = time.monotonic()
         rig.run()
+    except AmplifierGoneError:
+        say(f"the amplifier has fallen silent, so the run ends: {_COME_BACK[rig.others is None]}")
     finally:
         try:
             rig.close()
@@ -96,7 +112,19 @@ def _run(rig: WallRig, watched: _Watched, say: Callable[[str], object]) -> None:
             watched.faults = tuple(rig.controller.faults)
             watched.lateness_us = rig.ticks.lateness_us
             watched.refused_frames = rig.can_port.refused
+            watched.dropped_frames = rig.dropped_frames
+            watched.blocked_frames = rig.controller.gate.blocked_frames
             watched.learner = rig.live.learner if rig.live is not None else None
+
+
+def _wait_for_others(rig: WallRig, say: Callable[[str], object], ending: Ending) -> None:
+    """A plant that was started in the same moment takes some seconds until it is there."""
+    end_s = time.monotonic() + _COMPANY_S
+    if rig.others == 0:
+        say(f"nobody else is on the bus yet: waiting {_COMPANY_S:g} s for `pkxyz plant` in another process")
+    while rig.others == 0 and time.monotonic() < end_s:
+        ending.check()
+        time.sleep(_LOOK_S)
 
 
 def _figures(recording: Recording, metrics: Metrics) -> tuple[RowFigures, int]:

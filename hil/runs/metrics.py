@@ -31,6 +31,10 @@ METRICS: dict[str, str] = {
     "saturated_ticks": "ticks in which a comb force met a bound",
     "missed_ticks": "ticks that were skipped because one before took too long",
     "faults": "number of faults",
+    "refused_frames": "frames that the interface did not take, at rate",
+    "dropped_frames": "frames that a bus among processes lost, at rate",
+    "blocked_frames": "frames that our own gate held back, at rate",
+    "lost_rows": "rows that the recording's writer was too slow for, at rate",
     "bus_load": "share of time in which the bus was busy, 0 to 1",
     "realtime_factor": "stage time by wall-clock time",
 }

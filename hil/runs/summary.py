@@ -12,6 +12,8 @@ from hil.runs.period_errors import PeriodFigures
 from hil.runs.scenario import Scenario
 from hil.runs.versions import versions
 
+_AT_RATE = ("refused_frames", "dropped_frames", "blocked_frames", "lost_rows", "lateness_us")
+
 
 @dataclass(frozen=True)
 class LoopFigures:
@@ -29,6 +31,12 @@ class LoopFigures:
     """or of the "estimate", where nobody knows the truth"""
     refused_frames: int | None = None
     """frames that the adapter did not take; wall lane"""
+    dropped_frames: int | None = None
+    """frames that a bus among processes lost because a receiver stood still; wall lane"""
+    blocked_frames: int | None = None
+    """frames that our own gate held back; wall lane"""
+    lost_rows: int | None = None
+    """rows that the recording's writer was too slow for; wall lane"""
     lateness_us: Mapping[str, int] | None = None
     """of the wake-ups: p50, p99_9, max; wall lane"""
 
@@ -49,7 +57,10 @@ class Learnt:
 
 @dataclass(frozen=True)
 class Summary:
-    """One run. ``ok`` is false for a run that was interrupted or does not keep its checks."""
+    """One run. ``ok`` is false for a run that was interrupted or does not keep its checks.
+
+    Without a check of its own, a fault that nobody asked for and a row that was lost are checks that fail.
+    """
 
     scenario: str
     lane: Lane
@@ -78,7 +89,7 @@ class Summary:
         """Plain data, the figures by name of ``METRICS`` at the top."""
         plain = dataclasses.asdict(self)
         rows, loop, learnt = plain.pop("rows"), plain.pop("loop"), plain.pop("learnt")
-        wall = {key: loop.pop(key) for key in ("refused_frames", "lateness_us")}
+        wall = {key: loop.pop(key) for key in _AT_RATE}
         if self.lane is Lane.WALL:
             loop |= wall
         if learnt is not None:
@@ -101,9 +112,20 @@ def summarise(
     measured = dataclasses.asdict(rows) | dataclasses.asdict(loop)
     if learnt is not None:
         measured |= dataclasses.asdict(learnt.figures)
-    checks = evaluate(scenario.config.checks, measured)
+    checks = evaluate(scenario.config.checks, measured) + _untold(scenario, loop)
     return Summary(
         scenario.config.name, lane, scenario.config.seed, digest, scenario.stage.name, scenario.plant.name,
         scenario.controller.name, scenario.bus.name, scenario.bus.period_us, scenario.config.duration_s, interrupted,
         rows, loop, learnt, checks, not interrupted and all(check.ok is not False for check in checks), versions(),
     )  # fmt: skip
+
+
+def _untold(scenario: Scenario, loop: LoopFigures) -> tuple[Verdict, ...]:
+    """What fails a run though the scenario says nothing of it."""
+    config = scenario.config
+    found: dict[str, int | None] = {"lost_rows": loop.lost_rows}
+    if not config.faults and config.clear_s is None:
+        found["faults"] = len(loop.faults)
+    return tuple(
+        Verdict(name, value, None, 0.0, False) for name, value in found.items() if value and name not in config.checks
+    )

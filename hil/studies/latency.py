@@ -8,7 +8,6 @@ bit as they did in the fast lane.
 import dataclasses
 import os
 import re
-import shutil
 import subprocess
 import time
 from pathlib import Path
@@ -123,9 +122,10 @@ class _Stopwatch:
 
 
 def measure(period_us: int, seconds: float, cyclictest: str | None = None) -> Latency:
-    """Run the default scenario's controller at ``period_us`` for ``seconds``, beside cyclictest where it is found.
+    """Run the default scenario's controller at ``period_us`` for ``seconds``.
 
-    ``cyclictest``: its path; None looks it up. Raises ``ConfigError`` for a period or a time out of range.
+    ``cyclictest``: path of the program to run beside it, None for none. Raises ``ConfigError`` for a period or
+    a time out of range.
     """
     if not _PERIODS_US[0] <= period_us <= _PERIODS_US[1]:
         raise ConfigError(f"--period-us: {period_us} is not in {_PERIODS_US[0]}..{_PERIODS_US[1]}")
@@ -138,7 +138,7 @@ def measure(period_us: int, seconds: float, cyclictest: str | None = None) -> La
     controller.memory["mode"] = Mode.IDLE
     reference = reference_rows(setup.trajectory.sample(0, setup.ticks + PREVIEW_ROWS, period_us))
     cycling.cycle(setup.law, cycling.new_memory(), reference)
-    beside = _start_cyclictest(cyclictest or shutil.which("cyclictest"), period_us, seconds)
+    beside = _start_cyclictest(cyclictest, period_us, seconds)
     with Ending() as ending:
         clock = TickClock(
             WallClock(), period_us, latest_start_us=period_us // 3, guard_us=period_us // 8, leave=ending.check

@@ -1,5 +1,7 @@
 """Any python-can bus as ``runtime.Port``. The only place in this package that knows python-can."""
 
+import errno
+import logging
 import time
 from contextlib import suppress
 from typing import Any, Protocol
@@ -10,7 +12,21 @@ from pkxyz_ctrl.can.frame import Frame
 from pkxyz_ctrl.config.bus import CanConfig
 from pkxyz_ctrl.config.files import ConfigError
 
+logging.getLogger("can").addHandler(logging.NullHandler())  # what matters of it is in the errors that it raises
+
 _STAMP_MAX_AGE_S = 1.0
+_NO_FD = "it carries no FD frames: set it up for them (ip link set ... mtu 72, type can ... fd on), or say fd = false"
+_REMEDIES = {
+    errno.ENETDOWN: "it is down: ip link set ... up",
+    errno.EINVAL: _NO_FD,
+    errno.EMSGSIZE: _NO_FD,
+    errno.ENOBUFS: "nobody takes what is sent: check power, wiring, termination and bit rates",
+    errno.ENODEV: "it has gone: check the adapter's plug",
+    errno.ENXIO: "it has gone: check the adapter's plug",
+}
+
+
+_SAYS_NOTHING_OF_FD = ("virtual",)  # it carries them, and calls itself classic
 
 
 class _Time(Protocol):
@@ -25,12 +41,24 @@ def open_bus(config: CanConfig, name: str) -> can.BusABC:
         keywords |= {"fd": True, "data_bitrate": config.data_bitrate_bit_per_s}
     keywords |= config.options or {}
     try:
-        return can.Bus(channel=config.channel, interface=config.interface, **keywords)
+        opened = can.Bus(channel=config.channel, interface=config.interface, **keywords)
+    except NameError:  # kvaser's way to say it
+        raise ConfigError(
+            f"bus {name!r}: can.interface {config.interface!r}: its driver library is not installed on this machine"
+        ) from None
     except (can.CanError, OSError, ValueError, TypeError, ImportError) as error:
         raise ConfigError(
             f"bus {name!r}: can.interface {config.interface!r}, channel {config.channel!r}: "
             f"{' '.join(str(error).split()) or type(error).__name__}; see [can] and [can.options] of the bus config"
         ) from None
+    is_classic = opened.protocol is can.CanProtocol.CAN_20 and config.interface not in _SAYS_NOTHING_OF_FD
+    if config.driver.fd and is_classic:
+        opened.shutdown()
+        raise ConfigError(
+            f"bus {name!r}: can.interface {config.interface!r}, channel {config.channel!r}, carries no FD frames as it "
+            "was opened; say fd = false, without data_bitrate_bit_per_s, or use another interface"
+        )
+    return opened
 
 
 def to_frame(message: can.Message) -> Frame:
@@ -65,8 +93,9 @@ class CanPort:
     """``runtime.Port`` on a python-can bus.
 
     ``refused`` counts frames that the bus did not take (queue full, bus-off): they are lost, and it is for the monitors
-    to say when that is too much. ``last_us`` is the time of the frame received last, by the stamp of its interface
-    where that is a time of day, as python-can wants it, else when it was read; it never runs backwards.
+    to say when that is too much. ``refusal`` is a sentence on the latest of them. ``last_us`` is the time of the frame
+    received last, by the stamp of its interface where that is a time of day, as python-can wants it, else when it was
+    read; it never runs backwards.
 
     ``receive`` looks again and again for ``spin_us`` before it sleeps: an answer that comes within that time, as a
     sense frame does, is not delayed by a wake-up, some 50 us. It reckons by ``clock``, and leaves python-can's own
@@ -79,16 +108,20 @@ class CanPort:
         self._spin_us = spin_us
         has_own_recv = type(bus).recv is not can.BusABC.recv  # some that come from elsewhere, and wrappers
         self._read = bus.recv if has_own_recv else self._read_once
+        self.sent = 0
         self.refused = 0
+        self.refusal = ""
         self.last_us = 0
 
     def send(self, frame: Frame) -> bool:
         """Hand a frame to the bus; False if it was refused."""
         try:
             self._bus.send(to_message(frame))
-        except (can.CanError, OSError):
+        except (can.CanError, OSError, ValueError) as error:
             self.refused += 1
+            self.refusal = f"the interface refuses frames ({_reason(error)})"
             return False
+        self.sent += 1
         return True
 
     def receive(self, deadline_us: int) -> Frame | None:
@@ -129,3 +162,11 @@ class CanPort:
         """
         with suppress(can.CanError, OSError, NotImplementedError):
             self._bus.flush_tx_buffer()
+
+
+def _reason(error: Exception) -> str:
+    """Why a frame was not taken, in the interface's words, and what to do where that is known."""
+    number = getattr(error, "error_code", None) or getattr(error, "errno", None)
+    words = " ".join(str(error).split()) or type(error).__name__
+    remedy = _REMEDIES.get(number) if isinstance(number, int) else None
+    return words if remedy is None else f"{words}; {remedy}"

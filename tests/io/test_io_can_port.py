@@ -1,5 +1,6 @@
 """Frames through python-can and back, on its own virtual bus and between Unix sockets."""
 
+import errno
 import os
 import re
 import socket
@@ -225,3 +226,56 @@ def test_a_port_works_on_a_bus_of_python_can_itself():
         assert port.receive(clock.now_us + 1000) is None
         assert not port.send(Frame(1, b""))
         assert port.refused == 1
+
+
+class Refusing(can.BusABC):
+    """A bus that takes no frame, with the error that the kernel gives for it."""
+
+    def __init__(self, error):
+        super().__init__("refusing")
+        self.channel_info, self._error = "refusing", error
+
+    def send(self, msg, timeout=None):
+        raise self._error
+
+
+@pytest.mark.parametrize(
+    ("error", "words"),
+    [
+        (can.CanOperationError("Failed to transmit: Invalid argument", errno.EINVAL), "carries no FD frames"),
+        (can.CanOperationError("Failed to transmit: Network is down", errno.ENETDOWN), "ip link set"),
+        (OSError(errno.ENOBUFS, "No buffer space available"), "termination"),
+        (ValueError("CAN FD is not for this adapter"), "CAN FD is not for this adapter"),
+    ],
+)
+def test_a_frame_that_is_refused_is_told_with_what_to_do(error, words):
+    with Refusing(error) as bus:
+        port = CanPort(bus, WallClock())
+        assert not port.send(Frame(0, b"\x81\x0a", True, True))
+        assert (port.sent, port.refused) == (0, 1)
+        assert words in port.refusal
+        assert "\n" not in port.refusal
+
+
+def test_what_cannot_carry_fd_frames_is_refused_as_such(tmp_path):
+    with pytest.raises(ConfigError, match=r"carries no FD frames.*fd = false"):
+        open_bus(config(channel=f"{tmp_path}/bus", options={"fd": False}), "mine")
+    assert list((tmp_path / "bus").iterdir()) == []
+
+
+def test_an_adapter_without_its_driver_is_one_line(tmp_path):
+    """In a process of its own: python-can looks for the libraries as it is imported, and says what it lacks."""
+    script = (
+        "from pkxyz_ctrl.config.bus import BusConfig\n"
+        "from pkxyz_ctrl.config.files import ConfigError, load\n"
+        "from pkxyz_ctrl.io.can_port import open_bus\n"
+        "config = load('buses', 'unix_2k', BusConfig).can\n"
+        "for interface in ('kvaser', 'pcan', 'vector', 'ixxat'):\n"
+        "    try:\n"
+        "        open_bus(config.model_copy(update={'interface': interface, 'channel': '0'}), 'mine')\n"
+        "    except ConfigError as error:\n"
+        "        print(interface, error)\n"
+    )
+    done = subprocess.run([sys.executable, "-c", script], capture_output=True, text=True, check=False)
+    assert done.stderr == ""
+    assert [line.split()[0] for line in done.stdout.splitlines()] == ["kvaser", "pcan", "vector", "ixxat"]

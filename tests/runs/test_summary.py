@@ -1,0 +1,62 @@
+"""What makes a run not ok though its scenario says nothing of it: an unasked-for fault, and rows that were lost."""
+
+import pytest
+
+from hil.lanes.lane import Lane
+from hil.runs.metrics import RowFigures
+from hil.runs.scenario import load_scenario
+from hil.runs.summary import LoopFigures, summarise
+
+ROWS = RowFigures(1000, 0, None, None, None, None)
+TEXT = """
+name = "plain"
+duration_s = 0.1
+seed = 1
+stage = "reconstructed"
+plant = "nominal"
+controller = "lqg"
+bus = "fd_5k"
+reference = [{{ kind = "hold", duration_s = 0.1 }}]
+{more}
+"""
+
+
+def summary(tmp_path, loop, more=""):
+    path = tmp_path / "plain.toml"
+    path.write_text(TEXT.format(more=more), encoding="utf-8")
+    return summarise(load_scenario(path), Lane.WALL, "digest", ROWS, loop, interrupted=False)
+
+
+FAULT = LoopFigures(faults=("at 0.1 s: the amplifier no longer says that it is alive",), lost_rows=0)
+
+
+@pytest.mark.parametrize(
+    ("loop", "more", "failing"),
+    [
+        (LoopFigures(), "", []),
+        (LoopFigures(lost_rows=0, dropped_frames=3, refused_frames=2, blocked_frames=0), "", []),
+        (FAULT, "", ["faults"]),
+        (FAULT, "checks = { ticks = { min = 1 } }", ["faults"]),
+        (FAULT, "checks = { faults = { min = 1, max = 1 } }", []),
+        (LoopFigures(faults=2 * FAULT.faults), "checks = { faults = { min = 1, max = 1 } }", ["faults"]),
+        (FAULT, '[[faults]]\ntarget = "sense.2"\nkind = "stuck"\nat_s = 0.05', []),
+        (LoopFigures(lost_rows=1), "", ["lost_rows"]),
+        (LoopFigures(dropped_frames=3), "checks = { dropped_frames = { max = 2 } }", ["dropped_frames"]),
+        (LoopFigures(blocked_frames=1), "checks = { blocked_frames = { max = 0 } }", ["blocked_frames"]),
+        (LoopFigures(refused_frames=1), "checks = { refused_frames = { max = 0 } }", ["refused_frames"]),
+    ],
+)
+def test_checks_that_fail(tmp_path, loop, more, failing):
+    found = summary(tmp_path, loop, more)
+    assert [check.name for check in found.checks if check.ok is False] == failing
+    assert found.ok == (not failing)
+
+
+def test_what_was_lost_is_in_the_json(tmp_path):
+    told = summary(tmp_path, LoopFigures(lost_rows=5, dropped_frames=4, refused_frames=3, blocked_frames=2)).as_json()
+    assert [told[f"{name}"] for name in ("lost_rows", "dropped_frames", "refused_frames", "blocked_frames")] == [
+        5,
+        4,
+        3,
+        2,
+    ]
