@@ -10,6 +10,7 @@ import os
 import signal
 import struct
 import time
+from collections import deque
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
@@ -29,6 +30,7 @@ _END_ENTRY = struct.Struct("<BQ")  # the last one, with how many bytes were lost
 _PIPE_BYTES = 1 << 20  # about a second at 2 kHz
 _WAITING_MAX_BYTES = 1 << 24
 _READ_BYTES = 1 << 16
+_HANDED_OVER_MOST = 8  # ticks in a tick
 _SAFE_AFTER_S = 0.05  # rows and frames are with the operating system, whatever becomes of the writer
 
 
@@ -37,7 +39,10 @@ Watch = Callable[[NDArray[np.void]], object]
 
 
 class WallRecorder:
-    """Rows and frames on their way to disk. ``lost_rows``, ``lost_bytes``: what the writer was too slow for."""
+    """Rows and frames on their way to disk.
+
+    ``lost_rows``, ``lost_bytes``: what the writer was too slow for, ticks whole, their frames with them.
+    """
 
     def __init__(
         self, recording: Path, frames: Path, metadata: dict[str, Any], channel: str, watch: Watch = lambda row: None
@@ -50,7 +55,9 @@ class WallRecorder:
         self._status: int | None = None
         self._told = False
         self.lost_rows = 0
-        self._waiting: list[bytes] = []
+        self._tick: list[bytes] = []  # what has come since the last row
+        self._waiting: deque[bytes] = deque()  # a tick each
+        self._waiting_bytes = 0
         reading, self._pipe = os.pipe()
         said, saying = os.pipe()
         with contextlib.suppress(OSError, AttributeError):
@@ -68,33 +75,45 @@ class WallRecorder:
     def frame(self, frame: Frame, t_us: int) -> None:
         """Note a frame that was sent or received at ``t_us``."""
         can_id, data, flags = frame
-        self._waiting.append(_HEAD.pack(_FRAME | flags << 1, len(data), t_us, can_id) + data)
+        self._tick.append(_HEAD.pack(_FRAME | flags << 1, len(data), t_us, can_id) + data)
 
     def row(self, row: memoryview) -> None:
         """Note the row of a tick and send all that waits. Raises ``RecordingError`` if the writer has given up."""
-        self._waiting.append(_ROW_HEAD)
-        self._waiting.append(bytes(row))
-        entry = b"".join(self._waiting)
+        self._tick.append(_ROW_HEAD)
+        self._tick.append(bytes(row))
+        entry = b"".join(self._tick)
+        self._tick.clear()
+        if self._waiting_bytes + len(entry) > _WAITING_MAX_BYTES:
+            self.lost_rows += 1
+            self.lost_bytes += len(entry)
+        else:
+            self._waiting.append(entry)
+            self._waiting_bytes += len(entry)
         try:
-            written = os.write(self._pipe, entry)
+            self._hand_over()
         except BlockingIOError:
-            written = 0
+            pass
         except BrokenPipeError:
             self._told = True
             raise RecordingError(self._last_words() or self._ended()) from None
-        self._waiting.clear()
-        if written < len(entry):
-            if len(entry) < _WAITING_MAX_BYTES:
-                self._waiting.append(entry[written:])
-            else:
-                self._keep_whole(entry, written)
+
+    def _hand_over(self) -> None:
+        """What waits, a few ticks' worth at most: a writer that stood still must not cost a tick its time."""
+        waiting = self._waiting
+        for _ in range(min(len(waiting), _HANDED_OVER_MOST)):
+            written = os.write(self._pipe, waiting[0])
+            self._waiting_bytes -= written
+            if written < len(waiting[0]):
+                waiting[0] = waiting[0][written:]
+                return
+            waiting.popleft()
 
     def close(self) -> None:
         """Send the rest, let the writer finish. Raises ``RecordingError`` if it could not write all."""
         if self._pipe < 0:
             return
         os.set_blocking(self._pipe, True)
-        rest = b"".join([*self._waiting, _END_ENTRY.pack(_END, self.lost_bytes)])
+        rest = b"".join([*self._waiting, *self._tick, _END_ENTRY.pack(_END, self.lost_bytes)])
         with contextlib.suppress(BrokenPipeError):
             while rest:
                 rest = rest[os.write(self._pipe, rest) :]
@@ -103,16 +122,6 @@ class WallRecorder:
         words = self._last_words() or self._ended()
         if words and not self._told:
             raise RecordingError(words)
-
-    def _keep_whole(self, entry: bytes, written: int) -> None:
-        """Give up what waits, but for the rest of the entry that is already half in the pipe."""
-        at = 0
-        while at < written:
-            at += _length_at(entry, at)
-        self.lost_bytes += len(entry) - at
-        self.lost_rows += _rows_in(entry, at)
-        if at > written:
-            self._waiting.append(entry[written:at])
 
     def _ended(self) -> str:
         """What became of the writer, if it came to no good end; waits for it."""
@@ -143,14 +152,6 @@ def _length_at(entries: bytes, at: int) -> int:
     if entries[at] == _END:
         return _END_ENTRY.size
     return _HEAD.size + (entries[at + 1] if at + 1 < len(entries) else 0)
-
-
-def _rows_in(entries: bytes, at: int) -> int:
-    rows = 0
-    while at < len(entries):
-        rows += entries[at] == _ROW
-        at += _length_at(entries, at)
-    return rows
 
 
 def _be_the_writer(

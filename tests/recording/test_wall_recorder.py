@@ -18,7 +18,7 @@ from hil.lanes.ending import Ending
 from hil.lanes.lane import Lane
 from hil.lanes.wall import WallRig
 from hil.recording.recording import Recording, RecordingError, journal_of
-from hil.recording.wall_recorder import WallRecorder
+from hil.recording.wall_recorder import _PIPE_BYTES, _WAITING_MAX_BYTES, WallRecorder
 from hil.runs.run_folder import RunFolder, metadata_of
 from hil.runs.scenario import load_scenario, resolve
 from hil.studies import latency
@@ -236,3 +236,20 @@ def test_cyclictest_is_read_as_it_prints():
     counts = read_cyclictest(text)
     assert {us: n for us, n in enumerate(counts) if n} == {3: 41, 12: 2, 1999: 2}
     assert read_cyclictest("policy: fifo\n") is None
+
+
+def test_rows_that_the_writer_is_too_slow_for_are_counted(folder):
+    """The writer stands still until pipe and patience are full. Each row that is not in the file has been counted."""
+    recorder = WallRecorder(folder.recording, folder.frames, metadata(), "bus")
+    row = random_rows(1)
+    data, sent = row.view(np.uint8).data, 2 * (_WAITING_MAX_BYTES + _PIPE_BYTES) // ROW.itemsize
+    os.kill(recorder._child, signal.SIGSTOP)
+    for tick in range(sent):
+        row["tick"] = tick
+        recorder.row(data)
+    os.kill(recorder._child, signal.SIGCONT)
+    recorder.close()
+    kept = Recording.open(folder.recording)["tick"]
+    assert 0 < recorder.lost_rows == sent - len(kept)
+    assert recorder.lost_bytes == recorder.lost_rows * (1 + ROW.itemsize)
+    assert (np.diff(kept) >= 1).all()
