@@ -11,6 +11,7 @@ from rich.table import Table
 from hil.screen.first_run import say_if_compiling
 from hil.screen.outputs import folder_to_write
 from hil.screen.progress import progress_bar
+from pkxyz_ctrl.config.files import ConfigError
 
 _screen = Console(highlight=False)
 
@@ -26,19 +27,32 @@ def tune(
         str | None, typer.Option(metavar="URL", help="Database of the study; default: study.db in the folder.")
     ] = None,
     seed: Annotated[int, typer.Option(min=0, help="Of the search.")] = 1,
+    stage: Annotated[
+        str | None,
+        typer.Option(
+            help="A stage's name or file, in place of the one for which taps are asked: one that identify wrote, say."
+        ),
+    ] = None,
     out: Annotated[Path, typer.Option(help="Folder for the controller file, study and pictures.")] = Path("tuned"),
     as_json: Annotated[bool, typer.Option("--json", help="Print JSON, and nothing else.")] = False,
 ) -> None:
     """Search a law's weights: margins are constraints and computed first, runs on the fast lane follow if they hold.
 
-    Call it again to go on. Exit code 0 if numbers were found that keep every constraint, 1 if not, 2 for bad input,
+    Call it again to go on. The taps of the law youla are a convex problem: they are found at once, without trials.
+    Exit code 0 if numbers were found that keep every constraint, 1 if not, 2 for bad input,
     130 if interrupted (what is done is kept).
     """
     from hil.studies.spread.workers import cores
     from hil.studies.tune.search import load_problem
+    from hil.studies.tune.taps import asks_for_taps
     from hil.studies.tune.tuning import best, importances, judged, nearest, open_study, write_controller
     from hil.studies.tune.tuning import search as run_search
 
+    if asks_for_taps(search):
+        _tune_taps(search, stage, out, as_json=as_json)
+        return
+    if stage is not None:
+        raise ConfigError(f"--stage: the search {search!r} names its stage itself; --stage is for a search of taps")
     problem = load_problem(search)
     folder_to_write(out)
     say_if_compiling(quiet=as_json)
@@ -70,6 +84,27 @@ def tune(
     else:
         _show(data, problem.search.objective)
     raise typer.Exit(130 if interrupted else 0 if found is not None else 1)
+
+
+def _tune_taps(search: str, stage: str | None, out: Path, *, as_json: bool) -> None:
+    from hil.studies.tune.taps import TapsSearch, find_taps, write_taps
+    from pkxyz_ctrl.config.files import load
+
+    asked = load("searches", search, TapsSearch)
+    if stage is not None:
+        asked = asked.model_copy(update={"stage": stage})
+    folder_to_write(out)
+    found = find_taps(asked, on_progress=lambda line: None if as_json else _screen.print(line))
+    path = out / f"{asked.name}_tuned.toml"
+    write_taps(asked, found, path)
+    noise_nm = dict(zip(("plane", "z"), (1e9 * v for v in found.hold_noise_m), strict=True))
+    if as_json:
+        print(json.dumps({"search": asked.name, "hold_noise_nm": noise_nm, "controller": str(path)}))
+    else:
+        _screen.print(
+            f"noise at hold {noise_nm['plane']:.2f} nm in x and y, {noise_nm['z']:.2f} nm in z", soft_wrap=True
+        )
+        _screen.print(f"run it: pkxyz sil --controller {path}", soft_wrap=True)
 
 
 def _show(data: dict, objective: str) -> None:  # type: ignore[type-arg]

@@ -5,7 +5,7 @@ from typing import Annotated, Self
 from pydantic import Field, model_validator
 
 from pkxyz_ctrl.config.files import FrozenModel, Name
-from pkxyz_ctrl.config.laws import LAWS, SECTIONS, Hinf, Irc, Linear, Mpc, PiNotch
+from pkxyz_ctrl.config.laws import LAWS, SECTIONS, Hinf, Irc, Linear, Mpc, PiNotch, Youla
 from pkxyz_ctrl.safety.thresholds import (
     FORCE_CHANGE_MAX_N,
     FORCE_CHANGE_SHARE,
@@ -88,8 +88,8 @@ class ControllerConfig(FrozenModel):
 
     name: Name
     law: LAWS
-    """lqg: Kalman filter and state feedback; open_loop: feed-forward alone; mpc: lqg that plans ahead inside limits;
-    pi_notch, irc, hinf: linear laws, designed; linear: one of the user's own.
+    """lqg: Kalman filter and state feedback; youla: lqg and a filter of its innovations; open_loop: feed-forward alone;
+    mpc: lqg that plans ahead inside limits; pi_notch, irc, hinf: linear laws, designed; linear: one of the user's own.
     """
     operating_strokes_m: tuple[float, float, float]
     """Strokes about which gains are designed; the energy gradient and the kinematics are exact everywhere."""
@@ -101,6 +101,7 @@ class ControllerConfig(FrozenModel):
     regulator: RegulatorConfig
     limits: DriveLimitsConfig
     monitors: MonitorConfig
+    youla: Youla | None = None
     pi_notch: PiNotch | None = None
     irc: Irc | None = None
     hinf: Hinf | None = None

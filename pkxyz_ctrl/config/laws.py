@@ -117,6 +117,44 @@ class Mpc(FrozenModel):
         return self
 
 
-LAWS = Literal["lqg", "open_loop", "pi_notch", "irc", "hinf", "linear", "mpc"]
-SECTIONS = ("pi_notch", "irc", "hinf", "linear", "mpc")
+Taps = Annotated[tuple[float, ...], Field(min_length=1, max_length=48)]
+
+
+class InnovationFilter(FrozenModel):
+    """Taps of the Youla filter for buses of one period and delay, in N/m."""
+
+    period_us: Annotated[int, Field(gt=0)]
+    delay_periods: Annotated[int, Field(ge=1, le=2)] = 1
+    plane: Taps
+    """q_0, q_1, ... of x and of y"""
+    z: Taps
+
+    @model_validator(mode="after")
+    def _as_many(self) -> Self:
+        if len(self.plane) != len(self.z):
+            raise ValueError(f"plane has {len(self.plane)} taps and z {len(self.z)}; give both as many, with zeros")
+        return self
+
+
+class Youla(FrozenModel):
+    """The state feedback of lqg, and a filter of the innovations beside it: w = -sum_j q_j nu(k - j). ``pkxyz tune``
+    finds the taps, which hold for one stage, and for the estimator and the regulator of the same file.
+    """
+
+    filter: tuple[InnovationFilter, ...] = ()
+    """one for each kind of bus; on others the state feedback stands alone"""
+    fade_s: Positive = 0.02
+    """how long the filter takes to fade out where a quiet hold is asked for, and to come back"""
+
+    @model_validator(mode="after")
+    def _one_for_each(self) -> Self:
+        kinds = [(f.period_us, f.delay_periods) for f in self.filter]
+        twice = [kind for kind in kinds if kinds.count(kind) > 1]
+        if twice:
+            raise ValueError(f"there are two filters for a period of {twice[0][0]} us; remove one")
+        return self
+
+
+LAWS = Literal["lqg", "youla", "open_loop", "pi_notch", "irc", "hinf", "linear", "mpc"]
+SECTIONS = ("youla", "pi_notch", "irc", "hinf", "linear", "mpc")
 """Laws with a section of their own, which has their name."""

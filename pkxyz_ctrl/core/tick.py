@@ -13,7 +13,7 @@ import numpy as np
 from numba import njit
 from numpy.typing import NDArray
 
-from pkxyz_ctrl.core import allocation, feedback, kinematics, linear_law, predictive, voltage
+from pkxyz_ctrl.core import allocation, feedback, kinematics, linear_law, predictive, voltage, youla
 from pkxyz_ctrl.core import estimator as filtering
 from pkxyz_ctrl.core.elasticity import ELASTICITY, energy_gradient
 from pkxyz_ctrl.core.linear3 import inverse3, multiply3_transposed
@@ -38,6 +38,7 @@ LAW = np.dtype(
         ("estimator", filtering.ESTIMATOR),
         ("feedback", feedback.FEEDBACK),
         ("linear", linear_law.LINEAR_LAW),
+        ("youla", youla.YOULA),
         ("drive", voltage.DRIVE),
         ("predictive", predictive.PREDICTIVE),
         ("kind", "i4"),  # OPEN_LOOP, STATE_FEEDBACK, LINEAR or PREDICTIVE
@@ -82,6 +83,7 @@ MEMORY = np.dtype(
         ("measurement_m", "f8", (3,)),
         ("seen_m", "f8", (3,)),  # the measurement, or the estimate in its place
         ("linear", linear_law.LINEAR_STATE),
+        ("youla", youla.YOULA_STATE),
         ("plan_n", "f8", (3,)),  # force at the platform that a plan adds to the feed-forward of this tick
         ("plan_known", "i4"),
         ("solver_iterations", "i4"),  # of this tick's plan; 0 without one, negative if it was not used
@@ -91,6 +93,7 @@ MEMORY = np.dtype(
         ("slack_n", "f8", (3,)),
         ("force_n", "f8", (3,)),
         ("feedforward_n", "f8", (3,)),  # of the last tick, if the loop was closed then
+        ("held_n", "f8", (3,)),  # the same with what makes up for its being held
         ("feedforward_known", "i4"),
         ("active_set_steps", "i4"),
         ("scratch", SCRATCH),
@@ -125,6 +128,7 @@ def estimate(law: np.void, memory: np.void, has_measurement: bool) -> None:
     """
     estimator, state, drive, scratch = law["estimator"], memory["estimate"], law["drive"], memory["scratch"]
     filtering.update(estimator, state, memory["measurement_m"], has_measurement)
+    youla.note(law["youla"], memory["youla"], state["innovation_m"])
     position, w, w_change = scratch["position_m"], scratch["w_n"], scratch["w_change_n"]
     acting, acted, start = scratch["acting_n"], scratch["acted_n"], scratch["state"]
     ahead = state["ahead"]
@@ -177,9 +181,17 @@ def act(law: np.void, memory: np.void, here: Array, now: Array, after: Array, la
     feedback.sampled_target(gains, now, demand, before, row)
     memory["feedforward_known"] = 1
     feedback.add_held_share(last, before, following, share, demand)
+    if gains["ripple_of_held"] != 0:
+        held = memory["held_n"]
+        for i in range(3):
+            before[i] = held[i] if known else demand[i]
+            held[i] = demand[i]
+        feedback.sampled_target(gains, now, demand, before, row)
     kind, origin = law["kind"], law["estimator"]["operating_point_m"]
     if kind == STATE_FEEDBACK:
         feedback.add_feedback(gains, origin, memory["estimate"]["ahead"], row, share, demand)
+        if law["youla"]["taps"] > 0:
+            youla.add_feedback(law["youla"], memory["youla"], share, demand)
     elif kind == LINEAR:
         tau = law["estimator"]["sense_delay_s"]
         linear_law.add_feedback(law["linear"], memory["linear"], memory["seen_m"], here, tau, share, demand)
@@ -226,6 +238,7 @@ def release(memory: np.void) -> None:
     memory["active_set_steps"] = 0
     memory["feedforward_known"] = 0
     linear_law.clear(memory["linear"])
+    youla.clear(memory["youla"])
 
 
 @njit(cache=True, error_model="numpy")

@@ -35,8 +35,10 @@ def hold_noise_m(
     seen[:plant_n], seen[plant_n:n] = -plant.b @ law.d, law.b
     rounded = np.zeros((n + 3, 3))
     rounded[:plant_n] = plant.b
+    if law.told_from is not None:  # its filter knows the counts that went out
+        rounded[plant_n + law.told_from : plant_n + law.told_from + 3] = np.eye(3)
     if noise_shaping:
-        a[:plant_n, n:] = -plant.b
+        a[:n, n:] = -rounded[:n]
         rounded[n:] = np.eye(3)
     covariance = _stationary(a, seen @ sense @ seen.T + rounded @ rounding @ rounded.T)
     return np.sqrt(np.diag(covariance)[:3])

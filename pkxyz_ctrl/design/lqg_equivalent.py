@@ -1,5 +1,5 @@
-"""The default law, and the predictive one far from its limits, as a linear law from measured position to force: what
-filter and regulator amount to.
+"""State feedback, with a Youla filter or without, and the predictive law far from its limits, as a linear law from
+measured position to force: what filter and regulator amount to.
 
 The tick's filter knows the forces that it asked for, so they are states too: x = [s(9), w(k-1), w(k-2), ...]. Its net
 input is taken at the estimate's own mid-period position, so where the stage's gradient is not that of the design point
@@ -41,7 +41,9 @@ def lqg_equivalent(
     if numbers["kind"] == PREDICTIVE:
         gains[:, :6] += softening @ _midway(filter_, gains[:, :6])
     gains *= share
-    return _assemble(filter_, softening, gains, delay, float(law["period_us"][0]) * 1e-6)
+    equivalent = _assemble(filter_, softening, gains, delay, float(law["period_us"][0]) * 1e-6)
+    taps = numbers["youla"]["tap_n_per_m"][: int(numbers["youla"]["taps"])]
+    return with_taps(equivalent, filter_, share * taps) if len(taps) else equivalent
 
 
 def _midway(filter_: np.void, gains: Array) -> Array:
@@ -54,11 +56,10 @@ def _assemble(filter_: np.void, softening: Array, gains: Array, delay: int, peri
     phi = np.vstack([filter_["transition"], np.eye(9)[6:]])
     gamma, lag = (np.vstack([filter_[name], np.zeros((3, 3))]) for name in ("input", "input_lag"))
     phi = phi + gamma @ softening @ np.hstack([np.eye(3), filter_["half_period_s"] * np.eye(3), np.zeros((3, 3))])
-    seen = np.hstack([np.eye(3), -filter_["sense_delay_s"] * np.eye(3), np.zeros((3, 3))])
     order = 9 + 3 * (delay + 1)
     # rows over [x, y]: what the filter's state is after each step, as a function of the law's state and measurement
     ahead = np.zeros((9, order + 3))
-    ahead[:, :9] = np.eye(9) - filter_["gain"] @ seen
+    ahead[:, :9] = np.eye(9) - filter_["gain"] @ seen_by(filter_)
     ahead[:, order:] = filter_["gain"]
     predicted = ahead
     for step in range(delay):
@@ -73,4 +74,30 @@ def _assemble(filter_: np.void, softening: Array, gains: Array, delay: int, peri
     after[:9] = predicted
     after[9:12] = force
     after[12:order, 9 : order - 3] = np.eye(order - 12)
-    return DiscreteLaw(period_s, after[:, :order], after[:, order:], -force[:, :order], -force[:, order:])
+    return DiscreteLaw(period_s, after[:, :order], after[:, order:], -force[:, :order], -force[:, order:], told_from=9)
+
+
+def seen_by(filter_: np.void) -> Array:
+    """H (3,9): what a sample shows of the filter's state, x - tau v."""
+    return np.hstack([np.eye(3), -filter_["sense_delay_s"] * np.eye(3), np.zeros((3, 3))])
+
+
+def with_taps(law: DiscreteLaw, filter_: np.void, taps: Array) -> DiscreteLaw:
+    """The equivalent ``law`` with a Youla filter of ``taps`` (n,3) in N/m beside it: the innovations of the last n - 1
+    samples are states, too, and the filter knows the force that follows from them.
+    """
+    order, late = law.order, 3 * (len(taps) - 1)
+    innovation = np.zeros((3, order + late))
+    innovation[:, :9] = -seen_by(filter_)
+    force = np.zeros((3, order + late))  # over states; what is seen now adds taps[0]
+    force[:, order:] = np.hstack([np.diag(tap) for tap in taps[1:]])
+    force += taps[0][:, None] * innovation
+    a, b = np.zeros((order + late, order + late)), np.zeros((order + late, 3))
+    a[:order, :order], b[:order] = law.a, law.b
+    a[9:12] -= force
+    b[9:12] -= np.diag(taps[0])
+    if late:
+        a[order : order + 3], b[order : order + 3] = innovation, np.eye(3)
+        a[order + 3 :, order : order + late - 3] = np.eye(late - 3)
+    c = np.hstack([law.c, np.zeros((3, late))]) + force
+    return DiscreteLaw(law.period_s, a, b, c, law.d + np.diag(taps[0]), told_from=9, order_max=order + late)

@@ -9,8 +9,9 @@ import scipy.integrate
 import scipy.optimize
 from hypothesis import given, settings
 from hypothesis import strategies as st
-from loop_rig import MIDDLE, bus, controller, law, new_tick_memory, rows_of, setup, stage
+from loop_rig import MIDDLE, bus, law, new_tick_memory, rows_of, setup, stage
 
+from pkxyz_ctrl.config.controller import ControllerConfig
 from pkxyz_ctrl.config.files import load
 from pkxyz_ctrl.core import tick
 from pkxyz_ctrl.design.hold_noise import hold_noise_m
@@ -251,13 +252,14 @@ def test_another_bus_is_another_law():
 # -- the default law's linear equivalent ------------------------------------------------------------------------------
 
 
-@pytest.mark.parametrize("delay_periods", [1, 2])
+@pytest.mark.parametrize(("name", "delay_periods"), [("lqg", 1), ("lqg", 2), ("youla", 1)])
 @pytest.mark.parametrize("strokes_m", [MIDDLE, OFF_CENTRE])
-def test_the_linear_equivalent_is_what_the_tick_does(delay_periods, strokes_m):
+def test_the_linear_equivalent_is_what_the_tick_does(name, delay_periods, strokes_m):
     """80 ticks of the compiled tick on random measurements of 1 nm, with counts 50 000 times finer: the force that
     it asks for beyond the one that holds, to 1e-3.
     """
-    designed = design_law(stage(), controller(), bus("fd_5k", delay_periods), autostart=True)
+    shipped = load("controllers", name, ControllerConfig)
+    designed = design_law(stage(), shipped, bus("fd_5k", delay_periods), autostart=True)
     expected = lqg_equivalent(stage(), designed, strokes_m)
     numbers = designed["tick"].copy()[0]
     numbers["drive"]["volt_per_count"] /= 50_000

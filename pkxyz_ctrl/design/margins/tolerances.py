@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 from pydantic import Field, model_validator
 
 from pkxyz_ctrl.config.files import FrozenModel
-from pkxyz_ctrl.design.model.loop_plant import NOMINAL, Perturbation
+from pkxyz_ctrl.design.model.loop_plant import NOMINAL, ParasiticMode, Perturbation
 
 Array = NDArray[np.float64]
 Relative = Annotated[float, Field(ge=0, lt=1)]
@@ -26,6 +26,21 @@ class Case:
     perturbation: Perturbation
 
 
+class ParasiticRange(FrozenModel):
+    """What a parasitic mode of a drawn device may be, each from least to greatest."""
+
+    frequency_hz: tuple[Annotated[float, Field(gt=0)], Annotated[float, Field(gt=0)]]
+    quality_factor: tuple[Annotated[float, Field(gt=0.5)], Annotated[float, Field(gt=0.5)]]
+    compliance_share: tuple[Annotated[float, Field(ge=0, lt=1)], Annotated[float, Field(ge=0, lt=1)]]
+
+    def draw(self, rng: np.random.Generator) -> ParasiticMode:
+        """One mode; frequency and quality factor evenly by ratio."""
+        frequency_hz, quality_factor = (
+            np.exp(rng.uniform(*np.log(r))) for r in (self.frequency_hz, self.quality_factor)
+        )
+        return ParasiticMode(float(frequency_hz), float(quality_factor), float(rng.uniform(*self.compliance_share)))
+
+
 class Tolerances(FrozenModel):
     """A file of configs/tolerances. Relative numbers are the largest deviation to either side."""
 
@@ -37,6 +52,12 @@ class Tolerances(FrozenModel):
     """least and greatest"""
     comb_gain: Relative
     """of each comb by itself"""
+    delay_s: Annotated[float, Field(ge=0, lt=1e-3)] = 0.0
+    """between sample and action, more or less; of drawn devices, like all that follows"""
+    amplifier_bandwidth: Relative = 0.0
+    sense_bandwidth_hz: tuple[Annotated[float, Field(gt=0)], Annotated[float, Field(gt=0)]] | None = None
+    """least and greatest corner of the sense chain"""
+    parasitic: tuple[ParasiticRange, ...] = ()
     stroke_low_m: Stroke
     """points of the workspace: the middle of the strokes, and the eight corners of a cube of strokes from this ..."""
     stroke_high_m: Stroke
@@ -78,6 +99,30 @@ class Tolerances(FrozenModel):
             for change, perturbation in self.perturbations().items()
         ]
 
+    def combined(self, across: int = 9) -> list[Case]:
+        """Everything changed at once, in the middle: ``across`` stages from the softest and heaviest to the stiffest
+        and lightest, hardly damped, with combs and delay at their ends; and three that are damped well, acting late.
+
+        Ends alone do not do: a resonance that is hardly damped is dangerous where its frequency meets a bad phase.
+        """
+        middle, g, late_s = self.points_m()["middle"], self.comb_gain, self.delay_s
+        ends = [(comb, delay_s) for comb in (g, -g) for delay_s in ((late_s, -late_s) if late_s > 0.0 else (0.0,))]
+        found = []
+        for quality_factor, count, at in (
+            (self.quality_factor[1], across, ends), (self.quality_factor[0], 3, [(g, late_s), (-g, late_s)])
+        ):  # fmt: skip
+            for stiff in np.linspace(-1.0, 1.0, count):
+                for comb, delay_s in at:
+                    change = Perturbation(
+                        float(stiff) * self.stiffness,
+                        -float(stiff) * self.mass,
+                        quality_factor,
+                        (comb, comb, comb),
+                        delay_s,
+                    )
+                    found.append(Case(f"combined {len(found) + 1}", middle, change))
+        return found
+
     def draw(self, seed: int) -> Case:
         """A plant drawn by a seed: everything at once, evenly within its range (the quality factor by ratio)."""
         rng = np.random.default_rng(seed)
@@ -87,6 +132,11 @@ class Tolerances(FrozenModel):
         comb = rng.uniform(-self.comb_gain, self.comb_gain, 3)
         strokes = rng.uniform(self.stroke_low_m, self.stroke_high_m, 3)
         drawn = Perturbation(
-            float(stiffness), float(mass), quality_factor, (float(comb[0]), float(comb[1]), float(comb[2]))
-        )
+            float(stiffness), float(mass), quality_factor, (float(comb[0]), float(comb[1]), float(comb[2])),
+            delay_s=float(rng.uniform(-self.delay_s, self.delay_s)),
+            amplifier_bandwidth=float(rng.uniform(-self.amplifier_bandwidth, self.amplifier_bandwidth)),
+            sense_bandwidth_hz=None if self.sense_bandwidth_hz is None
+            else float(np.exp(rng.uniform(*np.log(self.sense_bandwidth_hz)))),
+            parasitic=tuple(mode.draw(rng) for mode in self.parasitic),
+        )  # fmt: skip
         return Case(f"seed {seed}", strokes, drawn)

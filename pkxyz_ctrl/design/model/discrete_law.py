@@ -26,7 +26,7 @@ class LawError(ValueError):
 
 @dataclass(frozen=True)
 class DiscreteLaw:
-    """Matrices of the law: A (n,n), B (n,3) in 1/m, C (3,n) in N, D (3,3) in N/m; n at most ``ORDER_MAX``. Read-only.
+    """Matrices of the law: A (n,n), B (n,3) in 1/m, C (3,n) in N, D (3,3) in N/m; n at most ``order_max``. Read-only.
 
     Raises ``LawError`` for other shapes, numbers that are not finite, and more states than there is room for.
     """
@@ -36,11 +36,15 @@ class DiscreteLaw:
     b: Array
     c: Array
     d: Array
+    told_from: int | None = None
+    """first of the three states that are told what force was really given, where a law has such"""
+    order_max: int = ORDER_MAX
+    """more where the tick does not run these matrices, but what they are equivalent to"""
 
     def __post_init__(self) -> None:
         order = len(np.atleast_1d(self.a))
-        if order > ORDER_MAX:
-            raise LawError(f"the law has {order} states and the tick has room for {ORDER_MAX}; reduce its order")
+        if order > self.order_max:
+            raise LawError(f"the law has {order} states and the tick has room for {self.order_max}; reduce its order")
         if not self.period_s > 0.0:
             raise LawError(f"period_s must be positive, not {self.period_s}")
         for name, shape in (("a", (order, order)), ("b", (order, 3)), ("c", (3, order)), ("d", (3, 3))):

@@ -6,6 +6,9 @@ Linear about one point of the workspace, and exactly sampled. With w the force a
 
 d periods lie between sample and action, tau is the amplifier's time constant, tau_s the sense chain's delay. G is the
 part of the stiffness that the held comb forces take away (they turn with the platform), and E the error of the combs.
+
+A device may differ from that in its numbers, in its delay (d need not be whole then), by a pole of its sense chain, and
+by parasitic modes r'' + d r' + w^2 r = share w^2 K^-1 f, which are seen beside x and do not act back on it.
 """
 
 import math
@@ -23,6 +26,16 @@ Array = NDArray[np.float64]
 
 
 @dataclass(frozen=True)
+class ParasiticMode:
+    """One mode beside the rigid motion, alike in x, y and z."""
+
+    frequency_hz: float
+    quality_factor: float
+    compliance_share: float
+    """its static answer to a force over that of the stage"""
+
+
+@dataclass(frozen=True)
 class Perturbation:
     """How a device differs from its drawing. Relative errors; 0.2 is 20 % more."""
 
@@ -31,9 +44,15 @@ class Perturbation:
     quality_factor: float | None = None
     """None: as in the stage file"""
     comb_gain: tuple[float, float, float] = (0.0, 0.0, 0.0)
+    delay_s: float = 0.0
+    """more between sample and action than the bus says, or less"""
+    amplifier_bandwidth: float = 0.0
+    sense_bandwidth_hz: float | None = None
+    """corner of the sense chain; None: far away"""
+    parasitic: tuple[ParasiticMode, ...] = ()
 
     def __post_init__(self) -> None:
-        if min(self.stiffness, self.mass, *self.comb_gain) <= -1.0:
+        if min(self.stiffness, self.mass, self.amplifier_bandwidth, *self.comb_gain) <= -1.0:
             raise ValueError(f"a relative error of -1 or less leaves no stage: {self}")
         if self.quality_factor is not None and self.quality_factor <= 0.0:
             raise ValueError(f"quality_factor must be positive, not {self.quality_factor}")
@@ -83,11 +102,12 @@ def loop_plant(stage: Stage, bus: BusConfig, strokes_m: ArrayLike, perturbation:
         damping = damping * stage.quality_factor / perturbation.quality_factor
     rows = stage.pulls(model.position_m).T
     comb_error = rows @ np.diag(1.0 + np.array(perturbation.comb_gain)) @ np.linalg.inv(rows)
-    phi, gamma = _sampled(stiffness, damping, mass, comb_error, _amplifier_s(stage), bus.period_s)
-    a, b = _delayed(phi, gamma, bus.delay_periods)
-    c = np.zeros((3, len(a)))
-    c[:, 0:3] = np.eye(3)
-    c[:, 3:6] = -stage.sense_delay_s * np.eye(3)
+    device = _Device(
+        stiffness, damping, mass, comb_error, _amplifier_s(stage) / (1.0 + perturbation.amplifier_bandwidth)
+    )
+    a, b, c = device.continuous(stage.sense_delay_s, perturbation)
+    a, b = _sampled(a, b, bus.period_s, bus.delay_periods * bus.period_s + perturbation.delay_s)
+    c = np.hstack([c, np.zeros((3, len(a) - c.shape[1]))])
     return LoopPlant(bus.period_s, a, b, c, strokes, stiffness)
 
 
@@ -115,28 +135,77 @@ def _amplifier_s(stage: Stage) -> float:
     return 1.0 / (2.0 * math.pi * stage.config.amplifier.bandwidth_hz)
 
 
-def _sampled(
-    stiffness: Array, damping: Array, mass: float, comb_error: Array, amplifier_s: float, period_s: float
-) -> tuple[Array, Array]:
-    """Phi (9,9) and Gamma (9,3) over a period, for the states x, v, f and a force asked for that is held."""
-    augmented = np.zeros((12, 12))
-    augmented[0:3, 3:6] = np.eye(3)
-    augmented[3:6, 0:3] = -stiffness / mass
-    augmented[3:6, 3:6] = -damping / mass
-    augmented[3:6, 6:9] = np.eye(3) / mass
-    augmented[6:9, 6:9] = -np.eye(3) / amplifier_s
-    augmented[6:9, 9:12] = comb_error / amplifier_s
-    exponential = scipy.linalg.expm(augmented * period_s)
-    return exponential[:9, :9], exponential[:9, 9:]
+@dataclass(frozen=True)
+class _Device:
+    """What stands between a force that is asked for and the motion."""
+
+    stiffness: Array
+    damping: Array
+    mass: float
+    comb_error: Array
+    amplifier_s: float
+
+    def continuous(self, sense_delay_s: float, change: Perturbation) -> tuple[Array, Array, Array]:
+        """A, B (n,3) and C (3,n) of the states x, v, f, the parasitic modes' r and r', and the sense filter's, each of
+        three, for a force asked for as the input.
+        """
+        eye, modes = np.eye(3), change.parasitic
+        n = 9 + 6 * len(modes) + (0 if change.sense_bandwidth_hz is None else 3)
+        a, b, c = np.zeros((n, n)), np.zeros((n, 3)), np.zeros((3, n))
+        a[0:3, 3:6] = eye
+        a[3:6, 0:3], a[3:6, 3:6], a[3:6, 6:9] = -self.stiffness / self.mass, -self.damping / self.mass, eye / self.mass
+        a[6:9, 6:9], b[6:9] = -eye / self.amplifier_s, self.comb_error / self.amplifier_s
+        c[:, 0:3], c[:, 3:6] = eye, -sense_delay_s * eye
+        for k, mode in enumerate(modes):
+            r, v = slice(9 + 6 * k, 12 + 6 * k), slice(12 + 6 * k, 15 + 6 * k)
+            w = 2.0 * math.pi * mode.frequency_hz
+            a[r, v], a[v, r], a[v, v] = eye, -w * w * eye, -w / mode.quality_factor * eye
+            a[v, 6:9] = mode.compliance_share * w * w * np.linalg.inv(self.stiffness)
+            c[:, r] = eye
+        if change.sense_bandwidth_hz is not None:
+            w = 2.0 * math.pi * change.sense_bandwidth_hz
+            a[n - 3 :, : n - 3], a[n - 3 :, n - 3 :] = w * c[:, : n - 3], -w * eye
+            c = np.zeros((3, n))
+            c[:, n - 3 :] = eye
+        return a, b, c
 
 
-def _delayed(phi: Array, gamma: Array, periods: int) -> tuple[Array, Array]:
-    """A line of ``periods`` forces in front of the plant; the one at its end acts now."""
-    n = len(phi) + 3 * periods
-    a, b = np.zeros((n, n)), np.zeros((n, 3))
-    a[: len(phi), : len(phi)] = phi
-    a[: len(phi), n - 3 :] = gamma
-    for i in range(1, periods):
-        a[n - 3 * i : n - 3 * i + 3, n - 3 * i - 3 : n - 3 * i] = np.eye(3)
-    b[len(phi) : len(phi) + 3] = np.eye(3)
-    return a, b
+def _sampled(a: Array, b: Array, period_s: float, delay_s: float) -> tuple[Array, Array]:
+    """A and B of the sampled plant, a line of the forces that wait for their time behind its states, newest first.
+
+    The force of sample k acts ``delay_s`` after it for a period. Raises ``ValueError`` for a delay below 0.
+    """
+    if delay_s < 0.0:
+        raise ValueError(f"a force can't act {-delay_s * 1e6:g} us before the sample that it answers")
+    periods = int(delay_s / period_s + 1e-9)
+    rest_s = max(0.0, delay_s - periods * period_s)  # for so long in a period the force before still acts
+    n, waiting = len(a), periods + (1 if rest_s > 1e-9 * period_s else 0)
+    late, early = _held(a, b, rest_s), _held(a, b, period_s - rest_s)
+    phi, last, newer = early[0] @ late[0], early[0] @ late[1], early[1]
+    total = n + 3 * waiting
+    sampled, enters = np.zeros((total, total)), np.zeros((total, 3))
+    sampled[:n, :n] = phi
+    if waiting == 0:
+        enters[:n] = newer
+        return sampled, enters
+    enters[n : n + 3] = np.eye(3)
+    for i in range(1, waiting):
+        sampled[n + 3 * i : n + 3 * i + 3, n + 3 * i - 3 : n + 3 * i] = np.eye(3)
+    if waiting == periods:
+        sampled[:n, total - 3 :] = newer
+    else:
+        sampled[:n, total - 3 :] = last
+        if waiting > 1:
+            sampled[:n, total - 6 : total - 3] = newer
+        else:
+            enters[:n] = newer
+    return sampled, enters
+
+
+def _held(a: Array, b: Array, time_s: float) -> tuple[Array, Array]:
+    """Phi and Gamma over a time for a held input."""
+    n = len(a)
+    augmented = np.zeros((n + 3, n + 3))
+    augmented[:n, :n], augmented[:n, n:] = a, b
+    exponential = scipy.linalg.expm(augmented * time_s)
+    return exponential[:n, :n], exponential[:n, n:]

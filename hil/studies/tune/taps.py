@@ -1,0 +1,169 @@
+"""A search for the taps of the Youla filter: what is asked, as data, the plants that follow from it, and the file that
+comes out.
+
+It is convex, so there is nothing to try: no trials, no database, the same taps every time.
+"""
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Annotated, Any
+
+import numpy as np
+import tomlkit
+from numpy.typing import NDArray
+from pydantic import Field
+
+from pkxyz_ctrl.config import files as config
+from pkxyz_ctrl.config.bus import BusConfig
+from pkxyz_ctrl.config.controller import ControllerConfig
+from pkxyz_ctrl.config.files import ConfigError, FrozenModel
+from pkxyz_ctrl.design.hold_noise import rounding_force_n
+from pkxyz_ctrl.design.law import design_law
+from pkxyz_ctrl.design.laws.estimator_gain import measurement_noise
+from pkxyz_ctrl.design.laws.youla import Bounds, InnovationLoop, Noise, youla_taps
+from pkxyz_ctrl.design.lqg_equivalent import lqg_equivalent
+from pkxyz_ctrl.design.margins.margins import HALF_POWER
+from pkxyz_ctrl.design.margins.tolerances import Case, Tolerances
+from pkxyz_ctrl.design.model.discrete_law import LawError
+from pkxyz_ctrl.design.model.loop_plant import NOMINAL, loop_plant
+from pkxyz_ctrl.design.model.plant_model import linearise
+from pkxyz_ctrl.stage import Stage
+
+Array = NDArray[np.float64]
+Text = Annotated[str, Field(min_length=1)]
+Positive = Annotated[float, Field(gt=0)]
+
+_DIGITS = 7
+"""Significant digits of a tap in the file."""
+_EDGE = 0.99 * HALF_POWER
+"""|S| at the edge: a little below half the power, as the bound falls from there on."""
+
+
+class TapBounds(FrozenModel):
+    """What is asked of each axis."""
+
+    edge_hz: Positive
+    """|S| stays below half the power up to here, as drawn ..."""
+    slope: Annotated[float, Field(ge=0, le=1)]
+    """... and falls below with this power of the frequency"""
+    peak_s_max: Annotated[float, Field(gt=1)]
+    disk_margin_min: Annotated[float, Field(gt=0, lt=2)]
+    effort_max: Positive
+    """largest |K S| over the stage's stiffness, as drawn"""
+    peak_s_changed_max: Annotated[float, Field(gt=1)]
+    """|S| of the plants that have one thing changed"""
+    peak_s_combined_max: Annotated[float, Field(gt=1)]
+    """... and of those that have all changed at once"""
+
+
+class TapsSearch(FrozenModel):
+    """A file of configs/searches that asks for taps."""
+
+    name: Text
+    controller: Text
+    stage: Text
+    bus: Text
+    tolerances: Text
+    taps: Annotated[int, Field(ge=2, le=48)]
+    bounds: TapBounds
+
+
+@dataclass(frozen=True)
+class FoundTaps:
+    """Taps (n,) in N/m of x and y, and of z, and the deviation of a held position in m that they leave, as drawn."""
+
+    plane: tuple[float, ...]
+    z: tuple[float, ...]
+    hold_noise_m: tuple[float, float]
+
+
+def asks_for_taps(name_or_path: str | Path) -> bool:
+    """Whether this search file is one of these. Raises ``ConfigError`` for a file that can't be read."""
+    return "taps" in config.read_toml(config.find("searches", name_or_path))
+
+
+def find_taps(search: TapsSearch, on_progress: Callable[[str], None] = lambda line: None) -> FoundTaps:
+    """Taps for the stage, bus and tolerances of a search. Raises ``ConfigError`` where there are none."""
+    axes = {}
+    for axis, name in ((0, "x and y"), (2, "z")):
+        try:
+            axes[axis] = _axis_taps(search, axis, lambda line, name=name: on_progress(f"{name}: {line}"))  # type: ignore[misc]
+        except LawError as error:
+            raise ConfigError(f"search {search.name!r}: {name}: {error}") from error
+    return FoundTaps(_rounded(axes[0][0]), _rounded(axes[2][0]), (axes[0][1], axes[2][1]))
+
+
+def _axis_taps(search: TapsSearch, axis: int, on_progress: Callable[[str], None]) -> tuple[Array, float]:
+    stage, bus = Stage.load(search.stage), config.load("buses", search.bus, BusConfig)
+    controller = config.load("controllers", search.controller, ControllerConfig)
+    tolerances, asked = config.load("tolerances", search.tolerances, Tolerances), search.bounds
+    alone = design_law(stage, without_filter(controller), bus, autostart=True)
+    filter_ = alone["tick"][0]["estimator"]
+
+    def loop(case: Case, peak_s: float) -> InnovationLoop:
+        plant = loop_plant(stage, bus, case.strokes_m, case.perturbation)
+        return InnovationLoop(
+            plant, lqg_equivalent(stage, alone, case.strokes_m, case.perturbation), filter_, axis, peak_s
+        )
+
+    middle = np.array(controller.operating_strokes_m)
+    # a comb alone couples the axes, and where the stage stands matters little: both are in the margins' own table
+    single = [c for c in tolerances.cases() if np.array_equal(c.strokes_m, middle) and "comb " not in c.name]
+    changed = [loop(case, asked.peak_s_changed_max) for case in single if case.perturbation != NOMINAL]
+    changed += [loop(case, asked.peak_s_combined_max) for case in tolerances.combined()]
+    model = linearise(stage, middle)
+    noise = Noise(
+        float(np.sqrt(np.diag(measurement_noise(stage, model, bus)))[axis]),
+        float(rounding_force_n(stage, bus, model)[axis]),
+    )
+    bounds = Bounds(
+        asked.edge_hz, _EDGE, asked.slope, asked.peak_s_max, asked.disk_margin_min, asked.effort_max
+    )  # fmt: skip
+    return youla_taps(
+        loop(Case("as drawn", middle, NOMINAL), asked.peak_s_max), changed, bounds, noise, search.taps, on_progress
+    )
+
+
+def without_filter(controller: ControllerConfig) -> ControllerConfig:
+    """The controller with its state feedback alone. Raises ``ConfigError`` for one of another law."""
+    if controller.youla is None:
+        raise ConfigError(
+            f'controller {controller.name!r}: law = "{controller.law}" has no taps; give one with "youla"'
+        )
+    return controller.model_copy(update={"youla": controller.youla.model_copy(update={"filter": ()})})
+
+
+def _rounded(taps: Array) -> tuple[float, ...]:
+    return tuple(float(f"{tap:.{_DIGITS}g}") for tap in taps)
+
+
+def write_taps(search: TapsSearch, found: FoundTaps, path: Path) -> None:
+    """The search's controller file with these taps in place of those for the same bus. Raises ``ConfigError`` where it
+    can't be written.
+    """
+    document = tomlkit.parse(config.find("controllers", search.controller).read_text(encoding="utf-8"))
+    bus = config.load("buses", search.bus, BusConfig)
+    section: Any = document["youla"]
+    kept = [f for f in section.get("filter", []) if (f["period_us"], f.get("delay_periods", 1)) != _kind(bus)]
+    filters = tomlkit.aot()
+    for old in kept:
+        filters.append(old)
+    table = tomlkit.table()
+    table.add("period_us", bus.period_us)
+    table.add("delay_periods", bus.delay_periods)
+    table.add("plane", tomlkit.array([*found.plane]).multiline(True))
+    table.add("z", tomlkit.array([*found.z]).multiline(True))
+    x, z = (1e9 * value for value in found.hold_noise_m)
+    table.comment(f"pkxyz tune {search.name}: stage {search.stage}, {x:.2f} nm of noise in x and y, {z:.2f} in z")
+    filters.append(table)
+    section["filter"] = filters
+    document["name"] = path.stem
+    try:
+        path.write_text(tomlkit.dumps(document), encoding="utf-8")
+    except OSError as error:
+        raise ConfigError(f"{path}: {(error.strerror or str(error)).lower()}; give another --out") from None
+
+
+def _kind(bus: BusConfig) -> tuple[int, int]:
+    return bus.period_us, bus.delay_periods

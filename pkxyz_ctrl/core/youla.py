@@ -1,0 +1,74 @@
+"""The Youla filter: a finite impulse response of the Kalman filter's innovations, per axis, compiled.
+
+    w = - sum_j q_j nu(k - j)
+
+nu (m) is what a sample shows beyond what the model predicted for the forces that were really given. Set-points, jumps
+and limits are in that prediction, so none of them reaches w, and no choice of taps can make the nominal loop unstable:
+sensitivity is affine in them (Youla, Bongiorno, Lu 1976), which is what their design rests on.
+"""
+
+import numpy as np
+from numba import njit
+from numpy.typing import NDArray
+
+Array = NDArray[np.float64]
+
+TAPS_MAX = 48
+
+YOULA = np.dtype(
+    [
+        ("tap_n_per_m", "f8", (TAPS_MAX, 3)),  # q_j of axes x, y, z
+        ("taps", "i4"),  # how many of them are in use; 0: there is no such filter
+        ("fade_ticks", "i4"),  # from the full filter to none of it, or back
+    ],
+    align=True,
+)
+
+YOULA_STATE = np.dtype(
+    [
+        ("innovation_m", "f8", (2 * TAPS_MAX, 3)),  # twice the same ring: from ``newest`` on, newest first
+        ("newest", "i4"),
+        ("quiet", "i4"),  # 1: asked to do without the filter
+        ("faded", "i4"),  # ticks of ``fade_ticks`` that it has faded out
+    ],
+    align=True,
+)
+
+
+@njit(cache=True, error_model="numpy")
+def note(youla: np.void, state: np.void, innovation_m: Array) -> None:
+    """Take in the innovation (3,) of this sample, and fade a tick further towards what is asked."""
+    if youla["taps"] == 0:
+        return
+    at = state["newest"] - 1 if state["newest"] > 0 else TAPS_MAX - 1
+    state["newest"] = at
+    for i in range(3):
+        state["innovation_m"][at, i] = innovation_m[i]
+        state["innovation_m"][at + TAPS_MAX, i] = innovation_m[i]
+    if state["quiet"] != 0:
+        state["faded"] = min(state["faded"] + 1, youla["fade_ticks"])
+    else:
+        state["faded"] = max(state["faded"] - 1, 0)
+
+
+@njit(cache=True, error_model="numpy")
+def add_feedback(youla: np.void, state: np.void, share: float, out: Array) -> None:
+    """Add share times w to ``out`` (3,)."""
+    tap, innovation, at = youla["tap_n_per_m"], state["innovation_m"], state["newest"]
+    share *= 1.0 - state["faded"] / youla["fade_ticks"]
+    x, y, z = 0.0, 0.0, 0.0
+    for j in range(youla["taps"]):
+        x += tap[j, 0] * innovation[at + j, 0]
+        y += tap[j, 1] * innovation[at + j, 1]
+        z += tap[j, 2] * innovation[at + j, 2]
+    out[0] -= share * x
+    out[1] -= share * y
+    out[2] -= share * z
+
+
+@njit(cache=True, error_model="numpy")
+def clear(state: np.void) -> None:
+    """Forget: the loop is open."""
+    for j in range(2 * TAPS_MAX):
+        for i in range(3):
+            state["innovation_m"][j, i] = 0.0

@@ -1,0 +1,180 @@
+"""The law youla against all its goals, over changed and drawn devices, and the cone programmes that found its taps."""
+
+import numpy as np
+import pytest
+from loop_rig import MIDDLE, bus, stage
+
+from hil.studies.margins.loop import Loop, over_changed_plants
+from hil.studies.tune.taps import TapsSearch, asks_for_taps, find_taps, without_filter, write_taps
+from pkxyz_ctrl.config.controller import ControllerConfig
+from pkxyz_ctrl.config.files import ConfigError, load
+from pkxyz_ctrl.config.laws import InnovationFilter, Youla
+from pkxyz_ctrl.design.hold_noise import hold_noise_m
+from pkxyz_ctrl.design.law import design_law
+from pkxyz_ctrl.design.law_about import law_about
+from pkxyz_ctrl.design.margins.margins import frequency_grid_hz, loop_response
+from pkxyz_ctrl.design.margins.tolerances import Case, Tolerances
+from pkxyz_ctrl.design.model.discrete_law import response
+from pkxyz_ctrl.design.model.loop_plant import NOMINAL, Perturbation, loop_plant
+
+
+def loop_of(config):
+    return Loop(stage(), bus(), design_law(stage(), config, bus(), autostart=True))
+
+
+def shipped():
+    return loop_of(load("controllers", "youla", ControllerConfig))
+
+
+def s_at(loop, hz):
+    return np.abs(loop.response(MIDDLE, np.atleast_1d(hz)).s)
+
+
+def test_the_law_reaches_all_that_is_asked_at_once():
+    """Two-sided, as an unexplained improvement is an error too."""
+    loop = shipped()
+    found = loop.margins(MIDDLE)
+    for part in (found.mimo, *found.axes):
+        assert 200.0 <= part.bandwidth_hz < 210.0
+        assert 1.5 < part.peak_s <= 1.9
+        assert 0.64 <= part.disk_margin < 0.8
+    assert 0.27 < s_at(loop, 60.0)[0].max() <= 0.32
+    plant, about = loop_plant(stage(), bus(), MIDDLE), law_about(stage(), loop.law, MIDDLE)
+    assert 0.85 < 1e9 * hold_noise_m(stage(), bus(), plant, about).max() <= 1.0
+    f = frequency_grid_hz(plant, about)[:-1]
+    k = response(about.a, about.b, about.c, about.d, np.exp(2j * np.pi * f * plant.period_s))
+    effort = np.abs(k @ loop_response(plant, about, f).s).max(axis=0) / np.diag(plant.stiffness_n_per_m)[:, None]
+    assert 5.0 < effort.max() <= 8.0
+    changed = over_changed_plants(loop, load("tolerances", "wide", Tolerances).cases())
+    assert len(changed.peak_s) == 135
+    assert 2.0 < changed.worst[1] <= 2.5
+
+
+def test_the_law_bears_devices_with_everything_changed_at_once():
+    """Delay, poles and parasitic modes among it: 100 drawn ones, of the 500 that the bench looks at."""
+    loop, tolerances = shipped(), load("tolerances", "wide", Tolerances)
+    drawn = [loop.peak_sensitivity(tolerances.draw(seed)) for seed in range(1, 101)]
+    assert 2.2 < np.percentile(drawn, 95) <= 3.0
+    assert max(drawn) <= 4.0
+    ends = [loop.peak_sensitivity(case) for case in tolerances.combined(3)]
+    assert 2.5 < max(ends) <= 4.0
+
+
+@pytest.mark.parametrize("scale", [0.0, 0.25, 0.5, 0.75])
+def test_a_quiet_hold_is_quieter_and_as_stable_on_its_way(scale):
+    """The filter fades by a factor on all taps: what it passes on the way is stable everywhere, too."""
+    config = load("controllers", "youla", ControllerConfig)
+    fade = {n: tuple(scale * q for q in getattr(config.youla.filter[0], n)) for n in ("plane", "z")}
+    faded = Youla(filter=(config.youla.filter[0].model_copy(update=fade),))
+    loop = loop_of(config.model_copy(update={"youla": faded}))
+    tolerances = load("tolerances", "wide", Tolerances)
+    assert max(loop.peak_sensitivity(case) for case in tolerances.combined(3)) <= 3.5
+    plant, about = loop_plant(stage(), bus(), MIDDLE), law_about(stage(), loop.law, MIDDLE)
+    noise_nm = 1e9 * hold_noise_m(stage(), bus(), plant, about).max()
+    if scale == 0.0:
+        assert 0.5 < noise_nm <= 0.9
+    assert noise_nm < 1.0
+
+
+def test_on_a_bus_without_a_filter_the_state_feedback_stands_alone():
+    config = load("controllers", "youla", ControllerConfig)
+    slow = design_law(stage(), config, bus("classic_2k"), autostart=True)
+    alone = design_law(stage(), without_filter(config), bus("classic_2k"), autostart=True)
+    assert slow["tick"]["youla"]["taps"][0] == 0
+    assert slow.tobytes() == alone.tobytes()
+
+
+# -- the search -------------------------------------------------------------------------------------------------------
+
+SMALL = {"taps": 16, "bounds": {
+    "edge_hz": 120.0, "slope": 0.7, "peak_s_max": 1.9, "disk_margin_min": 0.6, "effort_max": 6.0,
+    "peak_s_changed_max": 2.5, "peak_s_combined_max": 3.5}}  # fmt: skip
+
+
+def small(**bounds):
+    search = load("searches", "youla", TapsSearch)
+    return TapsSearch.model_validate({**dict(search), **SMALL, "bounds": SMALL["bounds"] | bounds})
+
+
+@pytest.fixture(scope="module")
+def found():
+    return find_taps(small())
+
+
+def with_taps(found):
+    config = load("controllers", "youla", ControllerConfig)
+    taps = Youla(filter=(InnovationFilter(period_us=200, plane=found.plane, z=found.z),))
+    return config.model_copy(update={"youla": taps})
+
+
+def test_a_search_keeps_its_bounds_on_a_finer_sweep_than_its_own(found):
+    """Against the margins of the whole law, by other code: all bounds to 2 %, one of them as good as reached."""
+    loop = loop_of(with_taps(found))
+    axes = loop.margins(MIDDLE).axes
+    assert max(axis.peak_s for axis in axes) <= 1.9 * 1.02
+    assert min(axis.disk_margin for axis in axes) >= 0.6 / 1.02
+    assert 118.0 < min(axis.bandwidth_hz for axis in axes) < 135.0
+    tolerances = load("tolerances", "wide", Tolerances)
+    assert max(loop.peak_sensitivity(case) for case in tolerances.combined()) <= 3.5 * 1.02
+    middle = [c for c in tolerances.cases() if np.array_equal(c.strokes_m, MIDDLE) and "comb " not in c.name]
+    assert max(loop.peak_sensitivity(case) for case in middle) <= 2.5 * 1.02
+
+
+def test_the_noise_that_a_search_makes_least_is_that_of_the_law(found):
+    loop = loop_of(with_taps(found))
+    plant, about = loop_plant(stage(), bus(), MIDDLE), law_about(stage(), loop.law, MIDDLE)
+    solved = hold_noise_m(stage(), bus(), plant, about)
+    assert [solved[0], solved[2]] == pytest.approx(found.hold_noise_m, rel=1e-3)
+    wider = find_taps(small(edge_hz=90.0))
+    assert max(wider.hold_noise_m) < max(found.hold_noise_m)
+
+
+def test_what_no_filter_can_do_is_refused_with_what_would_help():
+    with pytest.raises(ConfigError, match=r"search 'youla': x and y: no filter of 16 taps .* lower edge_hz"):
+        find_taps(small(edge_hz=600.0))
+
+
+def test_the_found_taps_run_from_the_file_that_is_written(found, tmp_path):
+    write_taps(small(), found, tmp_path / "mine.toml")
+    written = load("controllers", tmp_path / "mine.toml", ControllerConfig)
+    assert [(f.plane, f.z) for f in written.youla.filter] == [(found.plane, found.z)]
+    assert written.name == "mine"
+    assert asks_for_taps("youla")
+    assert not asks_for_taps("lqg")
+
+
+# -- devices that differ in more than numbers -------------------------------------------------------------------------
+
+
+def test_a_plant_that_acts_later_is_the_same_plant_turned_in_phase():
+    """50 us more, and 50 us less, against a longer line: the response turns by 2 pi f times the delay, to 1 %, up to
+    where the hold of a period tells them apart.
+    """
+    f = np.array([20.0, 100.0, 300.0])
+    z = np.exp(2j * np.pi * f * 2e-4)
+
+    def gain(change):
+        p = loop_plant(stage(), bus(), MIDDLE, change)
+        return response(p.a, p.b, p.c, np.zeros((3, 3)), z)[:, 0, 0]
+
+    for delay_s in (-50e-6, 50e-6, 120e-6):
+        turned = gain(Perturbation(delay_s=delay_s)) / gain(NOMINAL)
+        assert turned == pytest.approx(np.exp(-2j * np.pi * f * delay_s), rel=0.01)
+    whole = loop_plant(stage(), bus(delay_periods=2), MIDDLE)
+    by_delay = gain(Perturbation(delay_s=200e-6))
+    assert response(whole.a, whole.b, whole.c, np.zeros((3, 3)), z)[:, 0, 0] == pytest.approx(by_delay, rel=1e-9)
+
+
+def test_a_force_before_its_sample_is_refused():
+    with pytest.raises(ValueError, match="can't act 100 us before the sample"):
+        loop_plant(stage(), bus(), MIDDLE, Perturbation(delay_s=-300e-6))
+
+
+def test_what_all_tolerances_at_once_are():
+    tolerances = load("tolerances", "wide", Tolerances)
+    cases = tolerances.combined()
+    assert len(cases) == 9 * 4 + 3 * 2
+    assert {c.perturbation.delay_s for c in cases} == {50e-6, -50e-6}
+    softest = cases[0].perturbation
+    assert (softest.stiffness, softest.mass, softest.quality_factor) == (-0.2, 0.1, 200.0)
+    assert all(isinstance(case, Case) and np.array_equal(case.strokes_m, MIDDLE) for case in cases)
