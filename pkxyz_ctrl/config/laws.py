@@ -143,8 +143,10 @@ class Youla(FrozenModel):
 
     filter: tuple[InnovationFilter, ...] = ()
     """one for each kind of bus; on others the state feedback stands alone"""
+    quiet_share: Annotated[float, Field(ge=0, le=1)] = 0.4
+    """how much of the filter is left while a quiet hold is asked for: less noise, less rejection"""
     fade_s: Positive = 0.02
-    """how long the filter takes to fade out where a quiet hold is asked for, and to come back"""
+    """how long the filter takes to fade to that, and to come back"""
 
     @model_validator(mode="after")
     def _one_for_each(self) -> Self:

@@ -19,7 +19,8 @@ YOULA = np.dtype(
     [
         ("tap_n_per_m", "f8", (TAPS_MAX, 3)),  # q_j of axes x, y, z
         ("taps", "i4"),  # how many of them are in use; 0: there is no such filter
-        ("fade_ticks", "i4"),  # from the full filter to none of it, or back
+        ("fade_ticks", "i4"),  # from the full filter to what is left of it in a quiet hold, or back
+        ("quiet_share", "f8"),  # which is this share of the taps
     ],
     align=True,
 )
@@ -28,7 +29,7 @@ YOULA_STATE = np.dtype(
     [
         ("innovation_m", "f8", (2 * TAPS_MAX, 3)),  # twice the same ring: from ``newest`` on, newest first
         ("newest", "i4"),
-        ("quiet", "i4"),  # 1: asked to do without the filter
+        ("quiet", "i4"),  # 1: a quiet hold is asked for
         ("faded", "i4"),  # ticks of ``fade_ticks`` that it has faded out
     ],
     align=True,
@@ -55,7 +56,7 @@ def note(youla: np.void, state: np.void, innovation_m: Array) -> None:
 def add_feedback(youla: np.void, state: np.void, share: float, out: Array) -> None:
     """Add share times w to ``out`` (3,)."""
     tap, innovation, at = youla["tap_n_per_m"], state["innovation_m"], state["newest"]
-    share *= 1.0 - state["faded"] / youla["fade_ticks"]
+    share *= 1.0 - (1.0 - youla["quiet_share"]) * (state["faded"] / youla["fade_ticks"])
     x, y, z = 0.0, 0.0, 0.0
     for j in range(youla["taps"]):
         x += tap[j, 0] * innovation[at + j, 0]

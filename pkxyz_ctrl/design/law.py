@@ -154,6 +154,7 @@ def _fill_youla(record: Any, youla: Youla, bus: BusConfig) -> None:
         if (taps.period_us, taps.delay_periods) == (bus.period_us, bus.delay_periods):
             record["tap_n_per_m"][:, : len(taps.z)] = np.stack([taps.plane, taps.plane, taps.z], axis=1)
             record["taps"] = len(taps.z)
+    record["quiet_share"] = youla.quiet_share
     record["fade_ticks"] = max(1, round(youla.fade_s / bus.period_s))
 
 

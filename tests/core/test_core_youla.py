@@ -19,9 +19,10 @@ from pkxyz_ctrl.design.model.loop_plant import loop_plant
 from pkxyz_ctrl.trajectory import Steps
 
 
-def filter_of(taps, fade_ticks=10):
+def filter_of(taps, fade_ticks=10, quiet_share=0.0):
     law, state = np.zeros(1, youla.YOULA)[0], np.zeros(1, youla.YOULA_STATE)[0]
-    law["tap_n_per_m"][: len(taps)], law["taps"], law["fade_ticks"] = taps, len(taps), fade_ticks
+    law["tap_n_per_m"][: len(taps)], law["taps"] = taps, len(taps)
+    law["fade_ticks"], law["quiet_share"] = fade_ticks, quiet_share
     return law, state
 
 
@@ -46,12 +47,12 @@ def test_the_force_is_the_convolution_of_taps_and_innovations(count, seed):
 
 
 def test_a_quiet_hold_fades_the_filter_out_and_back_without_a_step():
-    law, state = filter_of(np.full((1, 3), 2.0), fade_ticks=4)
+    law, state = filter_of(np.full((1, 3), 2.0), fade_ticks=4, quiet_share=0.2)
     one, found = np.ones(3), []
     for tick in range(14):
         state["quiet"] = 3 <= tick < 8
         found.append(-force_of(law, state, one)[0])
-    assert found == [2.0, 2.0, 2.0, 1.5, 1.0, 0.5, 0.0, 0.0, 0.5, 1.0, 1.5, 2.0, 2.0, 2.0]
+    assert found == pytest.approx([2.0, 2.0, 2.0, 1.6, 1.2, 0.8, 0.4, 0.4, 0.8, 1.2, 1.6, 2.0, 2.0, 2.0])
 
 
 def test_an_open_loop_leaves_nothing_in_the_filter():

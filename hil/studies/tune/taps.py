@@ -66,6 +66,8 @@ class TapsSearch(FrozenModel):
     bus: Text
     tolerances: Text
     taps: Annotated[int, Field(ge=2, le=48)]
+    across: Annotated[int, Field(ge=2)] = 9
+    """devices from soft and heavy to stiff and light that have all changed at once"""
     bounds: TapBounds
 
 
@@ -109,9 +111,9 @@ def _axis_taps(search: TapsSearch, axis: int, on_progress: Callable[[str], None]
 
     middle = np.array(controller.operating_strokes_m)
     # a comb alone couples the axes, and where the stage stands matters little: both are in the margins' own table
-    single = [c for c in tolerances.cases() if np.array_equal(c.strokes_m, middle) and "comb " not in c.name]
+    single = [c for c in tolerances.cases() if np.allclose(c.strokes_m, middle, atol=1e-9) and "comb " not in c.name]
     changed = [loop(case, asked.peak_s_changed_max) for case in single if case.perturbation != NOMINAL]
-    changed += [loop(case, asked.peak_s_combined_max) for case in tolerances.combined()]
+    changed += [loop(case, asked.peak_s_combined_max) for case in tolerances.combined(search.across)]
     model = linearise(stage, middle)
     noise = Noise(
         float(np.sqrt(np.diag(measurement_noise(stage, model, bus)))[axis]),
@@ -152,8 +154,8 @@ def write_taps(search: TapsSearch, found: FoundTaps, path: Path) -> None:
     table = tomlkit.table()
     table.add("period_us", bus.period_us)
     table.add("delay_periods", bus.delay_periods)
-    table.add("plane", tomlkit.array([*found.plane]).multiline(True))
-    table.add("z", tomlkit.array([*found.z]).multiline(True))
+    table.add("plane", _array(found.plane))
+    table.add("z", _array(found.z))
     x, z = (1e9 * value for value in found.hold_noise_m)
     table.comment(f"pkxyz tune {search.name}: stage {search.stage}, {x:.2f} nm of noise in x and y, {z:.2f} in z")
     filters.append(table)
@@ -163,6 +165,10 @@ def write_taps(search: TapsSearch, found: FoundTaps, path: Path) -> None:
         path.write_text(tomlkit.dumps(document), encoding="utf-8")
     except OSError as error:
         raise ConfigError(f"{path}: {(error.strerror or str(error)).lower()}; give another --out") from None
+
+
+def _array(taps: tuple[float, ...]) -> Any:
+    return tomlkit.item(list(taps)).multiline(True)
 
 
 def _kind(bus: BusConfig) -> tuple[int, int]:

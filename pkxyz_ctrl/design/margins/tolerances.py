@@ -107,7 +107,7 @@ class Tolerances(FrozenModel):
         """
         middle, g, late_s = self.points_m()["middle"], self.comb_gain, self.delay_s
         ends = [(comb, delay_s) for comb in (g, -g) for delay_s in ((late_s, -late_s) if late_s > 0.0 else (0.0,))]
-        found = []
+        found: list[Case] = []
         for quality_factor, count, at in (
             (self.quality_factor[1], across, ends), (self.quality_factor[0], 3, [(g, late_s), (-g, late_s)])
         ):  # fmt: skip
