@@ -22,7 +22,7 @@ from pkxyz_ctrl.design.hold_noise import rounding_force_n
 from pkxyz_ctrl.design.law import design_law
 from pkxyz_ctrl.design.laws.estimator_gain import measurement_noise
 from pkxyz_ctrl.design.laws.youla import Bounds, InnovationLoop, Noise, youla_taps
-from pkxyz_ctrl.design.lqg_equivalent import lqg_equivalent
+from pkxyz_ctrl.design.lqg_equivalent import lqg_equivalent, seen_by
 from pkxyz_ctrl.design.margins.margins import HALF_POWER
 from pkxyz_ctrl.design.margins.tolerances import Case, Tolerances
 from pkxyz_ctrl.design.model.discrete_law import LawError
@@ -101,12 +101,12 @@ def _axis_taps(search: TapsSearch, axis: int, on_progress: Callable[[str], None]
     controller = config.load("controllers", search.controller, ControllerConfig)
     tolerances, asked = config.load("tolerances", search.tolerances, Tolerances), search.bounds
     alone = design_law(stage, without_filter(controller), bus, autostart=True)
-    filter_ = alone["tick"][0]["estimator"]
+    seen = seen_by(alone["tick"][0]["estimator"])
 
     def loop(case: Case, peak_s: float) -> InnovationLoop:
         plant = loop_plant(stage, bus, case.strokes_m, case.perturbation)
         return InnovationLoop(
-            plant, lqg_equivalent(stage, alone, case.strokes_m, case.perturbation), filter_, axis, peak_s
+            plant, lqg_equivalent(stage, alone, case.strokes_m, case.perturbation), seen, axis, peak_s
         )
 
     middle = np.array(controller.operating_strokes_m)

@@ -23,7 +23,6 @@ import scipy.linalg
 import scipy.sparse
 from numpy.typing import NDArray
 
-from pkxyz_ctrl.design.lqg_equivalent import seen_by
 from pkxyz_ctrl.design.model.discrete_law import DiscreteLaw, LawError, response
 from pkxyz_ctrl.design.model.loop_plant import LoopPlant
 
@@ -71,20 +70,21 @@ class InnovationLoop:
     from the demand; outputs y, the innovation nu (m) and the force w (N).
     """
 
-    def __init__(self, plant: LoopPlant, law: DiscreteLaw, filter_: np.void, axis: int, peak_s: float) -> None:
-        """``law`` is the equivalent of the state feedback alone; ``peak_s`` the largest |S| that this plant may have.
+    def __init__(self, plant: LoopPlant, law: DiscreteLaw, seen: Array, axis: int, peak_s: float) -> None:
+        """``law`` is the equivalent of the state feedback alone; ``seen`` (3,9) what a sample shows of the first of its
+        states; ``peak_s`` the largest |S| that this plant may have.
         Raises ``LawError`` where the loop is unstable without the filter.
         """
         one, keep = plant.axis(axis), slice(axis, None, 3)
         a, b = law.a[keep, keep], law.b[keep, axis : axis + 1]
         c, d = law.c[axis : axis + 1, keep], law.d[axis : axis + 1, axis : axis + 1]
-        seen = np.hstack([seen_by(filter_)[axis : axis + 1, keep], np.zeros((1, len(a) - 3))])
+        shown = np.hstack([seen[axis : axis + 1, keep], np.zeros((1, len(a) - 3))])
         told = np.zeros((len(a), 1))
         told[3] = 1.0  # the newest force that the filter was told
         n = len(one.a)
         self.a = np.block([[one.a - one.b @ d @ one.c, -one.b @ c], [b @ one.c, a]])
         self.b = np.block([[-one.b @ d, -one.b], [b, -told]])
-        self.c = np.block([[one.c, np.zeros((1, len(a)))], [one.c, -seen], [-d @ one.c, -c]])
+        self.c = np.block([[one.c, np.zeros((1, len(a)))], [one.c, -shown], [-d @ one.c, -c]])
         self.d = np.array([[0.0, 0.0], [1.0, 0.0], [-d[0, 0], -1.0]])
         self.rounded = np.vstack([one.b, told])
         self.position = np.eye(1, n + len(a))
