@@ -1,18 +1,26 @@
-"""Writes the figures of docs/understand/mechanics.md, and its generated table.
+"""Writes the figures of docs/understand/mechanics.md, and its generated tables.
 
     python docs/figures/mechanics.py
 
-The table stands between ``<!-- generated: numbers -->`` and ``<!-- end -->``.
+A table stands between ``<!-- generated: NAME -->`` and ``<!-- end -->``.
 """
 
 import re
 from pathlib import Path
 
-from hil.pictures.mechanics import draw_design_space, draw_linearisation, draw_modes, draw_selection
+from hil.pictures.mechanics import (
+    draw_design_space,
+    draw_linearisation,
+    draw_modes,
+    draw_modes_over_workspace,
+    draw_selection,
+)
 from hil.pictures.workspace import draw_edge_path, draw_workspace
+from pkxyz_ctrl.config.calibration import Calibration
 from pkxyz_ctrl.config.files import load
 from pkxyz_ctrl.config.stage import StageConfig
 from pkxyz_ctrl.mechanics.linearisation import linearisation_study
+from pkxyz_ctrl.mechanics.modes import modes
 from pkxyz_ctrl.mechanics.published import entries
 from pkxyz_ctrl.mechanics.reproduction import reproduction_table
 from pkxyz_ctrl.mechanics.selection import Requirements, select
@@ -35,6 +43,27 @@ def numbers_table() -> str:
     return "\n".join(lines)
 
 
+def splitting_table() -> str:
+    """Both in-plane modes at rest where the flexures of one chain are stiffer than those of the others (IV.F)."""
+    lines = ["| flexures of chain 1 stiffer by | modes 1, 2 (Hz) | apart (Hz) |", "| --- | --- | --- |"]
+    config = Stage.load("reconstructed").config
+    for share in (0.0, 0.01, 0.02, 0.05, 0.1):
+        stiffer = (1.0 + share, 1.0, 1.0)
+        measured = Calibration(slider_stiffness=stiffer, crank_stiffness=stiffer)
+        stage = Stage(config.model_copy(update={"calibration": measured}))
+        first, second, _ = modes(stage.stiffness([0.0] * 3), stage.mass_kg).frequency_hz
+        lines.append(f"| {share:.0%} | {first:.1f}, {second:.1f} | {second - first:.1f} |")
+    return "\n".join(lines)
+
+
+def filled_in(page: str) -> str:
+    """The page with the current tables."""
+    for name, table in (("numbers", numbers_table()), ("splitting", splitting_table())):
+        pattern = re.compile(rf"(<!-- generated: {name} -->\n).*?(<!-- end -->)", re.DOTALL)
+        page = pattern.sub(lambda m, table=table: f"{m[1]}{table}\n{m[2]}", page)
+    return page
+
+
 def main() -> None:
     """Draw all pictures and renew the page's table."""
     stages = {name: Stage.load(name) for name in ("printed", "reconstructed")}
@@ -42,13 +71,12 @@ def main() -> None:
     draw_design_space(stages, HERE / "mechanics_design_space.png")
     draw_workspace(stage, 130.0, HERE / "mechanics_workspace.png")
     draw_modes(stage, HERE / "mechanics_modes.png")
+    draw_modes_over_workspace(stage, HERE / "mechanics_modes_over_workspace.png")
     draw_edge_path(stage, HERE / "mechanics_edge_path.png")
     draw_linearisation(linearisation_study(stage, points=17), stage.config.name, HERE / "mechanics_linearisation.png")
     chosen = select(Requirements(), load("stages", "reconstructed", StageConfig))
     draw_selection(chosen, HERE / "mechanics_selection.png")
-    page = PAGE.read_text(encoding="utf-8")
-    pattern = re.compile(r"(<!-- generated: numbers -->\n).*?(<!-- end -->)", re.DOTALL)
-    PAGE.write_text(pattern.sub(lambda m: f"{m[1]}{numbers_table()}\n{m[2]}", page), encoding="utf-8")
+    PAGE.write_text(filled_in(PAGE.read_text(encoding="utf-8")), encoding="utf-8")
 
 
 if __name__ == "__main__":

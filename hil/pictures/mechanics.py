@@ -15,7 +15,11 @@ from pkxyz_ctrl.mechanics.jacobians import nominal_jacobians
 from pkxyz_ctrl.mechanics.linearisation import LinearisationStudy
 from pkxyz_ctrl.mechanics.modes import modes
 from pkxyz_ctrl.mechanics.selection import MARGINS, Selection
-from pkxyz_ctrl.mechanics.stiffness import lifting_stiffness_n_per_m, nominal_stiffness_n_per_m
+from pkxyz_ctrl.mechanics.stiffness import (
+    lifting_stiffness_n_per_m,
+    nominal_stiffness_n_per_m,
+    small_signal_stiffness_n_per_m,
+)
 from pkxyz_ctrl.stage import Stage
 
 Array = NDArray[np.float64]
@@ -95,6 +99,29 @@ def draw_modes(stage: Stage, out: Path) -> None:
             plot.plot(0, 0, "o", color=INK, markersize=6, zorder=3)
             plot.add_patch(Circle((0, 0), 0.11, fill=False, edgecolor=INK, linewidth=1.6, zorder=3))
             plot.text(0.3, -0.42, "out of the plane", fontsize=SMALL_PT, color=INK, zorder=3)
+    save(figure, out)
+
+
+def draw_modes_over_workspace(stage: Stage, out: Path) -> None:
+    """Natural frequencies from rest to the top corner, and along one stroke: of the flexures (Eq. 38 with the exact
+    Hessian), and under the comb voltages that hold the point, which a controller meets.
+    """
+    figure = sheet(10.2, 3.9, f"Natural frequencies over the workspace of the {stage.config.name} stage")
+    limit_um = stage.config.limits.stroke_max_m * 1e6
+    stroke_um = np.linspace(0.0, limit_um, 51)
+    ways = (((1.0, 1.0, 1.0), "all three strokes together"), ((1.0, 0.0, 0.0), "stroke 1 alone"))
+    left, right = figure.subplots(1, 2, sharey=True)
+    for plot, (way, words) in zip((left, right), ways, strict=True):
+        points = stage.forward_kinematics(np.outer(stroke_um * 1e-6, way))
+        free = stage.stiffness(points)
+        held = small_signal_stiffness_n_per_m(stage, points, stage.holding_forces(points))
+        for mode, colour in enumerate(SERIES[:3]):
+            for matrices, style, label in ((free, "-", f"mode {mode + 1}"), (held, "--", "")):
+                hz = [modes(k, stage.mass_kg).frequency_hz[mode] for k in matrices]
+                plot.plot(stroke_um, hz, style, color=colour, lw=1.8, label=label)
+        dress(plot, "stroke (µm)", "natural frequency (Hz)" if plot is left else "", words)
+    right.plot([], [], "--", color=INK, lw=1.8, label="at held voltages")
+    legend(right, "center left", anchor=(1.0, 0.5))
     save(figure, out)
 
 

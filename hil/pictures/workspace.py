@@ -86,6 +86,7 @@ def _draw_faces(figure: Figure, stage: Stage) -> None:
 def _dress_space(plot: Any) -> None:
     dress_space(plot, "x (µm)", "y (µm)", "z (µm)")
     plot.set(xlim=(-20, 20), ylim=(-20, 20), zlim=(0, 40))
+    plot.set(xticks=(-15, 0, 15), yticks=(-15, 0, 15), zticks=(0, 10, 20, 30, 40))  # none at a corner of two axes
     plot.view_init(elev=18, azim=-58)
 
 

@@ -29,6 +29,14 @@ APPENDIX_COEFFICIENTS = {
     5: -432.0 * 16.24,
     6: 432.0,
 }
+# the same of the terms in lambda_1 alone, by power of delta; c_0's are too garbled to be read
+APPENDIX_SLOPES = {
+    1: -12.00 * 2.000 * -9139,
+    2: -12.00 * 2.000 * 6947,
+    3: -144.0 * -435.7,
+    4: -72.0 * 10.0 * 16.24,
+    5: -432.0 * -2.0,
+}
 
 
 def spring_n_per_m(stage: Stage) -> float:
@@ -149,6 +157,20 @@ def beams_n_per_mm(stage: Stage, pairs: int) -> float:
 
 def appendix_coefficient(power: int) -> float:
     return float(appendix_coefficients(APPENDIX_RADIUS_MM, 1.0, [0.0] * 3)[power])
+
+
+def appendix_slope(power: int) -> float:
+    """The term of c_k in lambda_1 alone: a difference about 0, exact for the fifth degree, which c_k does not pass."""
+    steps = np.array([-2.0, -1.0, 1.0, 2.0])
+    values = [appendix_coefficients(APPENDIX_RADIUS_MM, 1.0, [step, 0.0, 0.0])[power] for step in steps]
+    return float(np.dot([1.0, -8.0, 8.0, -1.0], values)) / 12.0
+
+
+def stiffness_leaves_once_n_per_mm(stage: Stage) -> float:
+    """K_xx of Eq. 19 if the four leaves, which Eq. 26 has put together already, were not taken four times in Eq. 16."""
+    k_1 = spring_n_per_m(stage)
+    k_2 = flexures.crank_hinge_stiffness(stage.config.flexures) / stage.config.geometry.crank_length_m**2
+    return (1.5 * k_1 + 6.0 * k_2) * 1e-3
 
 
 def mode_strokes(stage: Stage, axis: int) -> np.ndarray:

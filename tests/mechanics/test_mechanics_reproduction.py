@@ -81,6 +81,7 @@ def by_hand(name: str) -> dict[str, float | None]:
         "IV.E largest tilt": None,
         "IV.F K_xx": KXX * 1e-3,
         "IV.F K_zz": k_zz(name) * 1e-3,
+        "Eq. 16, 26 K_xx with the four leaves of a spring counted once": (1.5 * K1 + 6 * K2 / L1**2) * 1e-3,
         "Eq. 19 K_zz with pivots on all three chains": k_zz(name, 3) * 1e-3,
         "Eq. 40 moving mass": KXX / (2 * math.pi * 630.92) ** 2 * 1e6,
         "Eq. 40 f_x = f_y": f_xy,
@@ -95,6 +96,10 @@ def by_hand(name: str) -> dict[str, float | None]:
         "App. A delta at lambda = 0 from the printed coefficients": (1 + math.sqrt(0.5)) * 1e3,
         "App. B largest tilt on the path": None,
     }
+    d1, d2, d3 = np.polynomial.Polynomial([-1.0]), -2 * rho, -(rho**2)  # of e1, e2, e3 by lambda_1
+    slope = 2 * e1 * d1 * e2**2 + 2 * e1**2 * e2 * d2 - 3 * e1**2 * d1 * e3 - e1**3 * d3 - 3 * e2**2 * d2 - 6 * e2 * d2
+    for power in range(1, 6):
+        figures[f"App. A c_{power}, term in lambda_1"] = 16 * float(slope.coef[power])
     return figures | {f"App. A c_{power} at lambda = 0": float(c.coef[power]) for power in range(7)}
 
 
@@ -121,6 +126,7 @@ def test_the_verdicts(table: dict[str, Row]) -> None:
     by_verdict = {v: {key for key, row in table.items() if row.verdict == v} for v in Verdict}
     assert by_verdict[Verdict.NOT_REPRODUCIBLE] == {
         "IV.D pull-in stroke, all that the comb works against",
+        "Eq. 16, 26 K_xx with the four leaves of a spring counted once",
         "IV.E volume of the workspace",
         "IV.E largest tilt",
         "IV.F sag under gravity",
