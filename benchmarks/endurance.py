@@ -231,24 +231,26 @@ def loop_alone(values: list[int], cleared_s: list[int]) -> Array:
 
 def draw(result: dict[str, Any], path: Path) -> None:
     """The picture: everything over time, from 0 up."""
-    figure = sheet(7.2, 4.4)
-    above, below = figure.subplots(2, 1, sharex=True)
+    figure = sheet(7.2, 5.8, "Memory over ten minutes at rate, the garbage collector off")
+    above, middle, below = figure.subplots(3, 1, sharex=True)
     t_min = np.arange(1, len(result["allocated_blocks"]) + 1) / 60.0
     for name, colour in zip(WHO, (BLUE, VERMILION, FAINT), strict=True):
         above.plot(t_min, np.array(result["resident_kb"][name]) / 1000, color=colour, label=name)
     dress(above, "", "resident memory (MB)")
     legend(above, columns=3)
-    below.plot(t_min, np.array(result["traced_bytes"]) / 1000, color=BLUE, label="tracemalloc, kB")
+    middle.plot(t_min, np.array(result["traced_bytes"]) / 1000, color=BLUE, label="what Python has allocated")
+    dress(middle, "", "tracemalloc (kB)")
+    legend(middle)
     blocks = np.array(result["allocated_blocks"])
     alone = loop_alone(result["allocated_blocks"], result["cleared_s"])
     for kept, style, name in ((blocks, ":", "with what faults leave"), (alone, "-", "of the loop alone")):
-        label = f"blocks since the warm-up, {name}"
+        label = f"since the warm-up, {name}"
         below.plot(t_min, kept - kept[result["warm_up_s"]], style, color=VERMILION, label=label)
     for n, second in enumerate(result["cleared_s"]):
         below.axvline(second / 60.0, color=ORANGE, lw=0.8, zorder=0, label="a fault" if n == 0 else None)
-    dress(below, "minutes; dashed: end of the warm-up", "kB, or blocks of Python")
+    dress(below, "minutes; dashed: end of the warm-up", "blocks of Python")
     legend(below, "upper left", columns=2)
-    for axes in (above, below):
+    for axes in (above, middle, below):
         axes.set_ylim(min(0.0, axes.get_ylim()[0]), 1.35 * axes.get_ylim()[1])
         axes.axvline(result["warm_up_s"] / 60.0, color=MUTED, lw=0.8, ls="--")
     save(figure, path)

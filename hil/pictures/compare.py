@@ -56,29 +56,32 @@ def draw(runs: Sequence[Compared], title: str, path: Path) -> None:
 
 
 def _bars(figure: Figure, grid: object, shown: Sequence[Compared]) -> None:
+    """Points, not bars: on a logarithmic axis, where they are needed, a bar's length would mean nothing."""
     axes = figure.add_subplot(grid[:, 1])  # type: ignore[index]
     rows = np.arange(len(shown))
-    for k, (name, words) in enumerate(_SHOWN.items()):
-        values = [max(run.figures[name].values()) if run.figures.get(name) else np.nan for run in shown]
-        alpha = 1.0 if k == 0 else 0.45
-        colours = [COLOURS[n % len(COLOURS)] for n in range(len(shown))]
-        bars = axes.barh(rows + 0.2 - 0.4 * k, values, 0.36, color=colours, alpha=alpha)
-        axes.bar_label(
-            bars, [f" {v:.3g} {words}" if v < 1000.0 else f" {v:.0f} {words}" for v in values], fontsize=TINY_PT
-        )
-    axes.set_yticks(rows, [run.controller for run in shown], fontsize=SMALL_PT)
     seen = [v for run in shown for k in _SHOWN for v in (run.figures.get(k) or {}).values()]
-    right = max(seen)
-    if right > 20.0 * min(seen):
+    is_log = max(seen) > 20.0 * min(seen)
+    for k, (name, words) in enumerate(_SHOWN.items()):
+        for n, run in enumerate(shown):
+            if not run.figures.get(name):
+                continue
+            value, colour = max(run.figures[name].values()), COLOURS[n % len(COLOURS)]
+            row = rows[n] - 0.17 + 0.34 * k
+            axes.plot(value, row, "os"[k], color=colour, markerfacecolor=colour if k == 0 else "white", markersize=6)
+            text = f"{value:.3g} {words}" if value < 1000.0 else f"{value:.0f} {words}"
+            axes.annotate(text, (value, row), (7, 0), textcoords="offset points", va="center", fontsize=TINY_PT)
+    axes.set_yticks(rows, [run.controller for run in shown], fontsize=SMALL_PT)
+    axes.set_ylim(len(shown) - 0.5, -0.5)
+    if is_log:
         axes.set_xscale("log")
-        left, right = axes.get_xlim()
-        axes.set_xlim(left, right * (right / left) ** 0.9)  # room for the words
+        low, high = 10.0 ** np.floor(np.log10(min(seen))), 10.0 ** np.ceil(np.log10(max(seen)))
+        axes.set_xlim(low, high * (high / low) ** 0.9)  # whole decades, and room for the words
+        axes.set_xticks([10.0**n for n in range(-3, 8) if low <= 10.0**n <= high], minor=False)
         axes.xaxis.set_major_formatter("{x:g}")
-        axes.set_xticks([10.0**n for n in range(-3, 7) if left <= 10.0**n <= right], minor=False)
+        axes.minorticks_off()
     else:
-        axes.set_xlim(0.0, 1.8 * right)
-    axes.invert_yaxis()
-    dress(axes, "nm, worst axis", grid="x")
+        axes.set_xlim(0.0, 1.8 * max(seen))
+    dress(axes, "nm, worst axis" + (", logarithmic" if is_log else ""), grid="x")
 
 
 def _scale(shown: Sequence[Compared]) -> float:

@@ -3,21 +3,21 @@
 from collections.abc import Sequence
 from pathlib import Path
 
-from matplotlib.patches import Rectangle
+from matplotlib.patches import Patch, Rectangle
 
 from hil.pictures.style import BAD, GOOD, SMALL_PT, TINY_PT, WASH, dress, save, sheet
 from hil.studies.faults.matrix import Case
 from hil.studies.faults.outcome import Outcome
 
 _SHADES = ((5, GOOD), (12, "#5aa469"), (50, "#a3c585"), (10_000, "#e4cf7b"))
-_MEANING = "ticks from the fault to its decision; -: nothing to notice from inside, and safe"
+_MEANING = "number: ticks from the fault to the decision to go to 0 V"
 
 
 def draw(outcomes: Sequence[Outcome], cases: Sequence[Case], path: Path) -> None:
     """Draw the outcomes of ``cases`` under every law that is among them, and write the picture."""
     laws = list(dict.fromkeys(outcome.law for outcome in outcomes))
     by_key = {(outcome.law, outcome.case): outcome for outcome in outcomes}
-    figure = sheet(4.6 + 0.85 * len(laws), 1.2 + 0.23 * len(cases))
+    figure = sheet(4.6 + 0.85 * len(laws), 1.9 + 0.23 * len(cases), "How soon each fault is noticed, under each law")
     axes = figure.subplots()
     dress(axes, grid="")
     for row, case in enumerate(cases):
@@ -36,10 +36,26 @@ def draw(outcomes: Sequence[Outcome], cases: Sequence[Case], path: Path) -> None
     axes.tick_params(length=0)
     for spine in axes.spines.values():
         spine.set_visible(False)
-    axes.set_xlabel(
-        _MEANING + ("; red: a bound was not kept" if not all(o.ok for o in outcomes) else ""), fontsize=TINY_PT
+    axes.set_xlabel(_MEANING, fontsize=SMALL_PT)
+    figure.legend(
+        handles=_key(outcomes),
+        loc="outside lower center",
+        ncols=max(1, len(laws) // 2),
+        frameon=False,
+        fontsize=SMALL_PT,
     )
     save(figure, path)
+
+
+def _key(outcomes: Sequence[Outcome]) -> list[Patch]:
+    """What the shades mean, those that occur."""
+    lows = (0, *(limit + 1 for limit, _ in _SHADES))
+    words = [f"{low} to {limit} ticks" for low, (limit, _) in zip(lows, _SHADES, strict=False)]
+    words[-1] = f"more than {lows[-2] - 1} ticks"
+    shades = [(colour, text) for (_, colour), text in zip(_SHADES, words, strict=True)]
+    shades += [(WASH, "nothing to notice from inside, and safe"), (BAD, "a bound was not kept")]
+    seen = {_colour(outcome) for outcome in outcomes}
+    return [Patch(color=colour, label=text) for colour, text in shades if colour in seen]
 
 
 def _colour(outcome: Outcome) -> str:

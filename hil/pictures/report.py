@@ -24,6 +24,7 @@ Array = NDArray[np.float64]
 
 _ENVELOPES = 2500  # more points than the picture has pixels across
 _PATH_POINTS = 6000
+_FLAT = 8.0  # an axis whose largest error is this much smaller than another's gets a scale of its own
 
 
 @dataclass
@@ -86,10 +87,10 @@ def draw_report(recording_path: str | Path, frame_log: str | Path | None, summar
     )  # fmt: skip
     rows = [figure.add_subplot(grid[row, 0]) for row in range(8)]
     begin_s = _tracking_begin_s(recording)
-    error_limit_nm = _error_limit_nm(signals, _measured_windows(recording, begin_s))
+    limits_nm = _error_limits_nm(signals, _measured_windows(recording, begin_s))
     for axis in range(3):
         _draw_position(rows[axis], signals, axis)
-        _draw_error(rows[3 + axis], signals, axis, error_limit_nm, summary)
+        _draw_error(rows[3 + axis], signals, axis, limits_nm, summary)
     _draw_voltages(rows[6], signals)
     _draw_bus(rows[7], bus, summary)
     _dress_time_axes(rows, signals.t_s, recording, begin_s)
@@ -112,10 +113,10 @@ def _draw_position(plot: Axes, signals: Signals, axis: int) -> None:
         legend(plot, "lower right", columns=2)
 
 
-def _draw_error(plot: Axes, signals: Signals, axis: int, limit_nm: float, summary: Summary) -> None:
+def _draw_error(plot: Axes, signals: Signals, axis: int, limits_nm: Array, summary: Summary) -> None:
     low, high = signals.low["error_nm"][:, axis], signals.high["error_nm"][:, axis]
     _plot_envelope(plot, signals.t_s, low, high, style.AXIS[axis], 0.6, "")
-    plot.set_ylim(-limit_nm, limit_nm)
+    plot.set_ylim(-limits_nm[axis], limits_nm[axis])
     plot.axhline(0, color=style.INK, linewidth=0.5)
     name, rows = "xyz"[axis], summary.rows
     plot.set_ylabel(f"{name} error\n(nm)", linespacing=1.3)
@@ -129,6 +130,8 @@ def _draw_error(plot: Axes, signals: Signals, axis: int, limit_nm: float, summar
         )
         if measured
     ]
+    if not np.all(limits_nm == limits_nm[0]):
+        words.insert(0, "own scale:")
     plot.text(
         0.995,
         0.97,
@@ -142,13 +145,18 @@ def _draw_error(plot: Axes, signals: Signals, axis: int, limit_nm: float, summar
     )
 
 
-def _error_limit_nm(signals: Signals, windows: Sequence[tuple[float, float]]) -> float:
-    """Half height of the error plots: what was measured fills two thirds; what came before may leave the picture."""
+def _error_limits_nm(signals: Signals, windows: Sequence[tuple[float, float]]) -> Array:
+    """Half heights (3,) of the error plots: what was measured fills two thirds; what came before may leave the picture.
+    All alike, so that axes can be compared, but for one that would be flat at the scale of the largest.
+    """
     t_s = signals.t_s
     inside = np.any([(t_s >= a) & (t_s < b) for a, b in windows], axis=0) if windows else np.ones(len(t_s), bool)
     extremes = np.abs(np.concatenate([signals.low["error_nm"][inside], signals.high["error_nm"][inside]]))
-    largest = float(extremes.max()) if extremes.size else 0.0
-    return 1.5 * largest if np.isfinite(largest) and largest > 0 else 1.0
+    if not extremes.size:
+        return np.ones(3)
+    each = np.where(np.isfinite(extremes), extremes, 0.0).max(axis=0)
+    largest = float(each.max()) or 1.0
+    return np.where((each > largest / _FLAT) | (each == 0.0), 1.5 * largest, 1.5 * each)
 
 
 def _draw_voltages(plot: Axes, signals: Signals) -> None:
