@@ -6,6 +6,7 @@ import sys
 import time
 from array import array
 from collections import deque
+from collections.abc import Callable
 from concurrent.futures import ProcessPoolExecutor, as_completed
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -61,8 +62,15 @@ def settle(world: World) -> tuple[list[Option], tuple[Option, ...]]:
 
 
 def explore(
-    configuration: Configuration, limit_s: float = 1e9, limit_states: int = 1 << 60, show: bool = False
+    configuration: Configuration,
+    limit_s: float = 1e9,
+    show: bool = False,
+    look: Callable[[World], object] = lambda world: None,
 ) -> Explored:
+    """All states from the first on, the nearest first, until none is new, an invariant fails or the time is over.
+
+    ``look`` is called in each of them.
+    """
     world = World(configuration, learnt(configuration))
     found = Explored()
     begin_s = time.monotonic()
@@ -75,6 +83,7 @@ def explore(
         number = numbers.get(key)
         if number is None:
             number = numbers[key] = len(numbers)
+            look(world)
             found.origin.append((origin, way))
             found.marks.append(RUNNING * world.is_running | STARTING * world.is_starting | ENDED * (not options))
             if options:
