@@ -40,6 +40,18 @@ TARGETS = {
     "pkxyz_ctrl.core.voltage": ("core/test_core_voltage.py",),
     "pkxyz_ctrl.core.allocation": ("core/test_core_allocation.py",),
     "pkxyz_ctrl.can.codec": ("can/test_can_codec.py",),
+    "pkxyz_ctrl.can.sense_input": ("can/test_can_sense.py",),
+    "pkxyz_ctrl.can.driver": (
+        "can/test_can_driver.py",
+        "can/test_can_driver_start.py",
+        "can/test_can_sdo.py",
+        "loop/test_overrun.py",
+    ),
+    "pkxyz_ctrl.loop.controller": ("loop/test_controller.py", "loop/test_overrun.py", "loop/test_flood.py"),
+    "pkxyz_ctrl.learning.store": ("learning/test_learning.py",),
+    "hil.node.drive": ("node/test_node_pdo.py", "node/test_node_nmt.py"),
+    "hil.node.amplifier": ("node/test_node_pdo.py", "node/test_node_nmt.py", "node/test_node_sdo.py"),
+    "hil.recording.journal": ("recording/test_recording.py", "recording/test_wall_recorder.py"),
 }
 
 
@@ -73,7 +85,8 @@ def jobs_of(module: str, match: str) -> list[Job]:
 
 
 def run_jobs(jobs: list[Job], end_s: float, workers: int) -> Iterator[tuple[Job, str]]:
-    """Each job with its outcome; until ``end_s`` of the monotonic clock, each module has its share of the time.
+    """Each job with its outcome; until ``end_s`` of the monotonic clock, each module has its share of the time. However
+    short that is, some are tried.
 
     Shuffled, so that if the time is not enough, what was tried stands for the rest.
     """
@@ -84,6 +97,8 @@ def run_jobs(jobs: list[Job], end_s: float, workers: int) -> Iterator[tuple[Job,
         own = [job.mutant for job in jobs if job.module == module]
         random.Random(SEED).shuffle(own)
         now_s = time.monotonic()
+        if now_s >= end_s and left < len(jobs):
+            return  # some were tried; the modules that are left come in the next run
         until_s = now_s + (end_s - now_s) * len(own) / left
         left -= len(own)
         for mutant, result in run_mutants(subject_of(module), own, until_s, workers, len(own) <= FEW):
@@ -200,6 +215,12 @@ Last result: **{len(outcomes)} of {len(jobs)} mutants tried, {killed} killed, {l
     )
 
 
+def tried_by(text: str) -> int:
+    """How many mutants a report tells of; 0 if it is none."""
+    found = re.search(r"\*\*(\d+) of \d+ mutants tried", text)
+    return int(found[1]) if found else 0
+
+
 def main() -> int:
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("--seconds", type=float, default=1200.0, help="stop beginning new mutants after so long")
@@ -227,7 +248,11 @@ def main() -> int:
             print(f"{len(outcomes)}/{len(jobs)} {result}: {where}: {one_line(job.mutant.change)}", flush=True)
     text, unexplained = report(jobs, outcomes)
     if arguments.report:
-        REPORT.write_text(text, encoding="utf-8")
+        said = REPORT.read_text(encoding="utf-8") if REPORT.exists() else ""
+        if len(outcomes) == len(jobs) or len(outcomes) >= tried_by(said):
+            REPORT.write_text(text, encoding="utf-8")
+        else:
+            print(f"{REPORT.name} stays as it is: it tells of {tried_by(said)} mutants, this run of {len(outcomes)}")
     killed = sum(result != "survived" for result in outcomes.values())
     print(
         f"{len(outcomes)} of {len(jobs)} tried, {killed} killed, {unexplained} survivors without a reason, "

@@ -109,7 +109,8 @@ def preload(files: Iterable[str]) -> None:
 def run_mutants(
     subject: Subject, waiting: Sequence[Mutant], end_s: float, workers: int, unmeasured: bool = False
 ) -> Iterator[tuple[Mutant, str]]:
-    """Each mutant with its outcome, as they finish; none begins after ``end_s`` of the monotonic clock.
+    """Each mutant with its outcome, as they finish; but for the first few, none begins after ``end_s`` of the
+    monotonic clock.
 
     ``unmeasured``: a few mutants only; all tests meet them, in their own order, and nothing is run beforehand. Raises
     BaselineError.
@@ -135,11 +136,16 @@ def run_mutants(
 def _outcomes(
     jobs: Sequence[Mutant], begin: Callable[[Mutant], int], end_s: float, workers: int
 ) -> Iterator[tuple[int, str]]:
-    """Place in ``jobs`` and outcome of each; ``begin`` forks and returns the process id."""
+    """Place in ``jobs`` and outcome of each; ``begin`` forks and returns the process id.
+
+    One for each worker is tried even when it is ``end_s`` already: what was measured for them has been paid for.
+    """
     waiting = list(reversed(range(len(jobs))))
     running: dict[int, int] = {}
-    while running or (waiting and time.monotonic() < end_s):
-        while waiting and len(running) < workers and time.monotonic() < end_s:
+    begun = 0
+    while running or (waiting and (begun < workers or time.monotonic() < end_s)):
+        while waiting and len(running) < workers and (begun < workers or time.monotonic() < end_s):
+            begun += 1
             place = waiting.pop()
             running[begin(jobs[place])] = place
         child, status = os.wait()

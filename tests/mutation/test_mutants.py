@@ -4,6 +4,7 @@ import ast
 import math
 from pathlib import Path
 
+import mutate
 import mutation_run
 import pytest
 from mutants import mutants, mutated
@@ -129,6 +130,34 @@ def test_mutants_of_functions_imports_and_caches(
     chosen = [mutant for mutant in mutants(SUBJECT) if (mutant.line, mutant.change) in expected]
     results = run_mutants(subject, chosen, math.inf, 1, unmeasured)
     assert {(mutant.line, mutant.change): result for mutant, result in results} == expected
+
+
+def test_even_without_any_time_left_some_are_tried(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """``make mutate SECONDS=45`` spent all of it on measuring the tests, and tried none."""
+    (tmp_path / "subject.py").write_text(SUBJECT)
+    (tmp_path / "test_subject.py").write_text(SUBJECT_TESTS)
+    monkeypatch.syspath_prepend(tmp_path)
+    subject = Subject("subject", tmp_path / "subject.py", (str(tmp_path / "test_subject.py"),))
+    chosen = [mutant for mutant in mutants(SUBJECT) if mutant.function is not None]
+    assert len(list(run_mutants(subject, chosen, -math.inf, 2))) >= 2
+
+
+def test_a_report_never_tells_of_less_than_the_one_before(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """A short run printed "0 of 1430" into the docs."""
+    page = tmp_path / "mutation.md"
+    page.write_text("Last result: **1430 of 1430 mutants tried, 1387 killed**\n")
+    monkeypatch.setattr(mutate, "REPORT", page)
+    monkeypatch.setattr(mutate, "STATE", tmp_path / "state.jsonl")
+    monkeypatch.setattr(mutate, "run_jobs", lambda jobs, end_s, workers: iter([(jobs[0], "killed")]))
+    monkeypatch.setattr("sys.argv", ["mutate.py", "--report", "--module", "pkxyz_ctrl.safety.modes"])
+    assert mutate.main() == 0
+    assert "1430 of 1430" in page.read_text()
+    assert "stays as it is" in capsys.readouterr().out
+    page.write_text("no report")
+    assert mutate.main() == 0
+    assert "mutants tried" in page.read_text()
 
 
 def test_tests_that_fail_without_a_mutant_are_told(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
