@@ -93,7 +93,7 @@ def _replay(study: Any, seed: int, out: Path, *, as_json: bool) -> None:
     from hil.studies.montecarlo import run_one
 
     scenario = study.drawn(seed)
-    folder = RunFolder(out / f"seed-{seed}")
+    folder = RunFolder(out / f"seed-{seed}", replace=True)
     ran = run_into(folder, scenario, Lane.FAST)
     draw(folder, ran)
     result, case = run_one(study, seed), study.tolerances.draw(seed)

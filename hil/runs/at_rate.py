@@ -15,6 +15,7 @@ from hil.runs.run import Begun
 from hil.runs.run_folder import RunFolder
 from hil.runs.scenario import Scenario
 from hil.runs.summary import LoopFigures, Summary
+from pkxyz_ctrl.config.bus import CanConfig
 from pkxyz_ctrl.io.clocks import percentile_us
 from pkxyz_ctrl.io.realtime import go_real_time, leave_real_time, settle_memory
 from pkxyz_ctrl.learning import Learner
@@ -61,6 +62,13 @@ def run_into(
     ``ConfigError``, ``StartUpError``, ``RecordingError``.
     """
     can_config = require_real_bus(scenario.bus)
+    with folder.taken():
+        return _run_into(folder, scenario, can_config, say, watch)
+
+
+def _run_into(
+    folder: RunFolder, scenario: Scenario, can_config: CanConfig, say: Callable[[str], object], watch: Watch
+) -> RanAtRate:
     begun = Begun.begin(folder, scenario, Lane.WALL)
     setup = scenario.setup()
     watched = _Watched()

@@ -73,6 +73,11 @@ def run_into(
     bus that the lane can't use, and it or ``RecordingError`` when the disk fails.
     """
     require_bus(scenario, lane)
+    with folder.taken():
+        return _run_into(folder, scenario, lane, on_progress)
+
+
+def _run_into(folder: RunFolder, scenario: Scenario, lane: Lane, on_progress: Callable[[int, int], None]) -> Summary:
     begun = Begun.begin(folder, scenario, lane)
     result: lanes.LaneResult | None = None
     with RecordingWriter(folder.recording, begun.metadata) as recording:

@@ -1,5 +1,10 @@
 """The folder that a run leaves: recording, frame log, configuration, summary and picture."""
 
+import errno
+import fcntl
+import glob
+import itertools
+import os
 import re
 import shutil
 from collections.abc import Iterator
@@ -8,9 +13,10 @@ from pathlib import Path
 from typing import Any
 
 from hil.lanes.lane import Lane
+from hil.recording.recording import Recording, RecordingError
 from hil.runs.scenario import LEARNT_FROM, Scenario, resolve, tables
 from hil.runs.versions import versions
-from pkxyz_ctrl.config.files import ConfigError, write_toml
+from pkxyz_ctrl.config.files import ConfigError, digest, read_toml, write_toml
 
 RECORDING, FRAMES, CONFIG, SUMMARY, PICTURE = (
     "recording.parquet",
@@ -20,36 +26,26 @@ RECORDING, FRAMES, CONFIG, SUMMARY, PICTURE = (
     "report.png",
 )
 LEARNT, LEARNING_PICTURE = "learnt.json", "learning.png"
+_UNFINISHED = CONFIG + ".part"
 _OURS = {
     RECORDING, FRAMES, CONFIG, SUMMARY, PICTURE, RECORDING + ".journal", RECORDING + ".part", LEARNT, LEARNT_FROM,
-    LEARNING_PICTURE,
+    LEARNING_PICTURE, _UNFINISHED,
 }  # fmt: skip
 _TABLE = re.compile(r"reference\.\d+\.csv")
+_EARLIER = ".earlier"
+"""Folder inside, where an earlier run waits until the new one has recorded something."""
 
 
 class RunFolder:
-    """A folder of one run, made anew: an earlier run in it is replaced, anything else is left alone and refused.
+    """A folder of one run. Anything but a run is left alone and refused; so is an earlier run, unless it may be
+    replaced, and then it is there until the new one has recorded a tick.
 
     Tables of the reference are copied into it (``reference.3.csv``): they are inputs that a replay needs.
     """
 
-    def __init__(self, path: Path) -> None:
-        """Raises ``ConfigError`` if the folder can't be had or holds what is not a run."""
+    def __init__(self, path: Path, *, replace: bool = False) -> None:
+        """Only looks. Raises ``ConfigError`` if the folder can't be had, or holds what is not to be replaced."""
         self.path = path
-        try:
-            path.mkdir(parents=True, exist_ok=True)
-            present = {item.name for item in path.iterdir()}
-        except OSError as error:
-            raise ConfigError(
-                f"--out: {path}: {(error.strerror or str(error)).lower()}; give a folder that can be written"
-            ) from None
-        if {name for name in present - _OURS if not _TABLE.fullmatch(name)} or (present and CONFIG not in present):
-            raise ConfigError(f"--out: {path}: holds files that are not a run's; give an empty or a new folder")
-        try:
-            for name in present:
-                (path / name).unlink()
-        except OSError as error:
-            raise ConfigError(f"--out: {path}: {(error.strerror or str(error)).lower()}; give another folder") from None
         self.recording = path / RECORDING
         self.frames = path / FRAMES
         self.config = path / CONFIG
@@ -57,14 +53,45 @@ class RunFolder:
         self.picture = path / PICTURE
         self.learnt = path / LEARNT
         self.learning_picture = path / LEARNING_PICTURE
+        self._earlier = path / _EARLIER
+        self._replace = replace
+        try:
+            path.mkdir(parents=True, exist_ok=True)
+            self._look()
+        except OSError as error:
+            raise ConfigError(
+                f"--out: {path}: {(error.strerror or str(error)).lower()}; give a folder that can be written"
+            ) from None
+        if not os.access(path, os.W_OK):
+            raise ConfigError(f"--out: {path}: permission denied; give a folder that can be written")
+
+    @contextmanager
+    def taken(self) -> Iterator[None]:
+        """Hold the folder for one run: no other process may write to it meanwhile, nor one that this one leaves behind.
+
+        An earlier run comes back if this one ends before it has recorded a tick. Raises ``ConfigError``.
+        """
+        held = self._lock()
+        try:
+            with self.in_one_line():
+                self._settle()  # what a process that was killed has left undone
+                self._look()
+                self._set_aside()
+            try:
+                yield
+            finally:
+                self._settle()
+        finally:
+            os.close(held)
 
     def write_config(self, scenario: Scenario) -> dict[str, Any]:
         """Write everything that decides about the run, and return it."""
         resolved = resolve(scenario)
         try:
             for name, table in tables(scenario).items():
-                shutil.copyfile(table, self.path / name)
-            write_toml(resolved, self.config)
+                shutil.copyfile(self._where_it_is(table), self.path / name)
+            write_toml(resolved, self.path / _UNFINISHED)
+            (self.path / _UNFINISHED).replace(self.config)
         except OSError as error:
             raise ConfigError(f"{self.config}: {(error.strerror or str(error)).lower()}; give another --out") from None
         return resolved
@@ -87,12 +114,102 @@ class RunFolder:
                 "room, or give another --out"
             ) from None
 
+    def _look(self) -> None:
+        """Raise ``ConfigError`` for what is not a run, and for a run that may not be replaced."""
+        present = self._present()
+        foreign = sorted(name for name in present if name not in _OURS and not _TABLE.fullmatch(name))
+        if foreign or (CONFIG in present and not _is_of_a_run(self.config)):
+            name = foreign[0] if foreign else CONFIG
+            raise ConfigError(
+                f"--out: {self.path}: holds files that are not a run's ({name}); give an empty or a new folder"
+            )
+        if present - {_UNFINISHED} and CONFIG not in present and not self._earlier.is_dir():
+            raise ConfigError(f"--out: {self.path}: holds parts of a run without its {CONFIG}; give a new folder")
+        if (CONFIG in present or self._earlier.is_dir()) and not self._replace:
+            raise ConfigError(
+                f"--out: {self.path}: holds an earlier run; give another folder, or --replace to have it replaced"
+            )
+
+    def _present(self) -> set[str]:
+        return {item.name for item in self.path.iterdir()} - {_EARLIER}
+
+    def _lock(self) -> int:
+        """Of the folder itself, so that nothing has to be tidied up: it goes with the last process that holds it."""
+        try:
+            held = os.open(self.path, os.O_RDONLY)
+        except OSError as error:
+            raise ConfigError(f"--out: {self.path}: {(error.strerror or str(error)).lower()}") from None
+        try:
+            fcntl.flock(held, fcntl.LOCK_EX | fcntl.LOCK_NB)
+        except OSError as error:
+            if error.errno in (errno.EWOULDBLOCK, errno.EACCES):
+                os.close(held)
+                raise ConfigError(
+                    f"--out: {self.path}: another run is being written there; give another folder, or wait for it"
+                ) from None
+        return held  # a file system without locks has none
+
+    def _set_aside(self) -> None:
+        if present := self._present():
+            self._earlier.mkdir()
+            for name in sorted(present, key=lambda name: name == CONFIG):  # last: until then it is a run that is here
+                (self.path / name).rename(self._earlier / name)
+
+    def _settle(self) -> None:
+        """The new run stays if it has recorded anything; else the earlier one comes back.
+
+        The configuration is what tells how far a process that was killed had come: it is the last to be set aside, the
+        first to come back and the last to go.
+        """
+        if not self._earlier.is_dir():
+            return
+        waiting = sorted((item.name for item in self._earlier.iterdir()), key=lambda name: name != CONFIG)
+        if CONFIG in waiting and self._has_recorded():
+            for name in reversed(waiting):
+                (self._earlier / name).unlink()
+            waiting = []
+        elif CONFIG in waiting:
+            for name in self._present():
+                (self.path / name).unlink()
+        for name in waiting:
+            (self._earlier / name).rename(self.path / name)
+        self._earlier.rmdir()
+
+    def _has_recorded(self) -> bool:
+        try:
+            return Recording.open(self.recording).ticks > 0
+        except RecordingError:
+            return False
+
+    def _where_it_is(self, table: Path) -> Path:
+        """A table of the run that is being replaced by its own configuration has been set aside with it."""
+        aside = self._earlier / table.name
+        return aside if table.parent.resolve() == self.path.resolve() and aside.is_file() else table
+
+
+def _is_of_a_run(path: Path) -> bool:
+    """Whether a configuration carries its own digest, as every one that was written here does."""
+    try:
+        data = read_toml(path)
+    except ConfigError:
+        return False
+    told = data.pop("digest", None)
+    return told is not None and told == digest(data)
+
 
 def next_free(runs: Path, scenario: str, lane: Lane) -> Path:
-    """``runs/<scenario>-<lane>-<n>`` with the lowest n above those that exist."""
+    """``runs/<scenario>-<lane>-<n>``, made here, with the lowest n above those that exist."""
     stem = f"{scenario}-{lane}-"
-    taken = [int(p.name[len(stem) :]) for p in runs.glob(f"{stem}*") if p.name[len(stem) :].isdigit()]
-    return runs / f"{stem}{max(taken, default=0) + 1}"
+    taken = [int(p.name[len(stem) :]) for p in runs.glob(f"{glob.escape(stem)}*") if p.name[len(stem) :].isdigit()]
+    for n in itertools.count(max(taken, default=0) + 1):
+        try:
+            (runs / f"{stem}{n}").mkdir(parents=True)
+        except FileExistsError:  # another process was quicker
+            continue
+        except OSError as error:
+            raise ConfigError(f"--out: {runs}: {(error.strerror or str(error)).lower()}; give a folder") from None
+        return runs / f"{stem}{n}"
+    raise AssertionError("numbers have no end")
 
 
 def metadata_of(scenario: Scenario, lane: Lane, resolved: dict[str, Any]) -> dict[str, Any]:

@@ -10,7 +10,7 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any, Self
+from typing import TYPE_CHECKING, Annotated, Any, NamedTuple, Self
 
 from pydantic import BaseModel, Field, field_validator, model_validator
 
@@ -38,6 +38,9 @@ Text = Annotated[str, Field(min_length=1)]
 
 LEARNT_FROM = "learnt_from.json"
 """Name in a run's folder of the correction that it began with."""
+
+
+_PARTS = ("stage", "plant", "controller", "bus")
 
 
 class Bound(FrozenModel):
@@ -103,6 +106,8 @@ class Scenario:
     trajectory: Trajectory
     stored_file: Path | None = None
     """of a learnt correction that the run begins with"""
+    held_in: Path | None = None
+    """the folder of a run whose ``config.toml`` this is: its tables lie there"""
 
     def setup(self) -> "Setup":
         """What the lanes are handed."""
@@ -144,7 +149,8 @@ def load_scenario(
     learning: dict[str, str] | None = None,
 ) -> Scenario:
     """Read a scenario and all that it names, with what the caller wants otherwise (paths from the working folder).
-    ``faults`` come on top of the scenario's own.
+    ``faults`` come on top of the scenario's own. The ``config.toml`` of a run is a scenario, too, with all that it
+    named inside.
 
     Raises ``ConfigError`` with one line for each thing that is wrong, over all the files; ``TrajectoryError``, which is
     one, for a reference that the stage can't follow.
@@ -152,13 +158,14 @@ def load_scenario(
     source = config.find("scenarios", name_or_path)
     wanted = {"seed": seed, "stage": stage, "plant": plant, "controller": controller, "bus": bus}
     given = {key: value for key, value in wanted.items() if value is not None}
-    data = {**config.read_toml(source), **given}
+    written, held = _taken_apart(config.read_toml(source))
+    data = {**written, **given}
     if learning is not None:
         own = data.get("learning", {})
         data["learning"] = {key: value for key, value in own.items() if key != "file"} | learning
     scenario = config.parse(data, ScenarioConfig, str(source))
     scenario = scenario.model_copy(update={"faults": (*scenario.faults, *faults)})
-    return _resolved(scenario, source, from_here=tuple(given), learning_from_here=learning is not None)
+    return _resolved(scenario, source, held, from_here=tuple(given), learning_from_here=learning is not None)
 
 
 def build_scenario(data: Mapping[str, Any], folder: str | Path = ".") -> Scenario:
@@ -174,10 +181,15 @@ def build_scenario(data: Mapping[str, Any], folder: str | Path = ".") -> Scenari
 
 
 def _resolved(
-    scenario: ScenarioConfig, source: Path, *, from_here: Sequence[str] = (), learning_from_here: bool = False
+    scenario: ScenarioConfig,
+    source: Path,
+    held: "_Held | None" = None,
+    *,
+    from_here: Sequence[str] = (),
+    learning_from_here: bool = False,
 ) -> Scenario:
-    """Read and check what a scenario names: from the folder of ``source``, or from the working folder for parts that
-    the caller wants otherwise.
+    """Read and check what a scenario names: from the folder of ``source`` or from what ``source`` holds itself, or from
+    the working folder for parts that the caller wants otherwise.
     """
     parts: dict[str, Any] = {}
     models: dict[str, tuple[str, str, type[BaseModel]]] = {
@@ -189,24 +201,66 @@ def _resolved(
     }
     problems: list[str] = []
     for key, (kind, name, model) in models.items():
-        folder = Path() if kind.startswith(tuple(from_here)) else source.parent  # kinds are plurals of keys
+        named = "stage" if key == "device" else key
         try:
-            parts[key] = _part(kind, name, model, folder)
+            if held is not None and named not in from_here:
+                parts[key] = config.parse(held.parts[named], model, f"{source}: {named}")
+            else:
+                parts[key] = _part(kind, name, model, Path() if named in from_here else source.parent)
         except ConfigError as error:
             problems += str(error).splitlines()
     if problems:
         raise ConfigError("\n".join(dict.fromkeys(problems)))
     try:
-        trajectory = Trajectory(in_folder(scenario.reference, source.parent))
-        _check_duration(source, scenario, trajectory)  # first: to sample one of 10^18 s would never end
+        if held is None:
+            trajectory = Trajectory(in_folder(scenario.reference, source.parent))
+            _check_duration(source, scenario, trajectory)  # first: to look at each instant of ten hours takes minutes
+        else:
+            trajectory = _held_trajectory(
+                scenario, source.parent, held.sha256
+            )  # its run may have been shorter, on purpose
         check_against(Stage(parts["stage"]), trajectory, _drive_limits(parts["controller"], parts["bus"]))
     except TrajectoryError as error:
         raise TrajectoryError(f"{source}: {error}") from None
     file = scenario.learning.file if scenario.learning is not None else None
     stored_file = None if file is None else (Path() if learning_from_here else source.parent) / file
-    loaded = Scenario(source, scenario, trajectory=trajectory, stored_file=stored_file, **parts)
+    held_in = None if held is None else source.parent
+    loaded = Scenario(source, scenario, trajectory=trajectory, stored_file=stored_file, held_in=held_in, **parts)
     loaded.stored()
     return loaded
+
+
+class _Held(NamedTuple):
+    """What the ``config.toml`` of a run holds besides the keys of a scenario file."""
+
+    parts: dict[str, dict[str, Any]]
+    """in place of names"""
+    sha256: dict[str, str]
+    """of the tables in its folder"""
+
+
+def _taken_apart(data: dict[str, Any]) -> tuple[dict[str, Any], _Held | None]:
+    """The keys of a scenario file, and what else a run's ``config.toml`` holds; None for a scenario file."""
+    inside = {key: data[key] for key in _PARTS if isinstance(data.get(key), dict)}
+    if len(inside) < len(_PARTS):
+        return data, None
+    own = {key: value for key, value in data.items() if key not in ("sha256", "digest")}
+    names = {key: str(part.get("name", key)) for key, part in inside.items()}
+    sha256 = data.get("sha256")
+    return own | names, _Held(inside, sha256 if isinstance(sha256, dict) else {})
+
+
+def _held_trajectory(scenario: ScenarioConfig, folder: Path, sha256: dict[str, str]) -> Trajectory:
+    """The reference of a run from its folder. Raises ``ConfigError`` for a table that is not the one of then."""
+    held = [
+        segment.model_copy(update={"file": table_name(n)}) if isinstance(segment, Table) else segment
+        for n, segment in enumerate(scenario.reference)
+    ]
+    trajectory = Trajectory(in_folder(held, folder))
+    for n, segment in enumerate(trajectory.segments):
+        if segment.source_sha256 != sha256.get(f"reference.{n}"):
+            raise ConfigError(f"{folder}: reference.{n}: its table is not the one of the run")
+    return trajectory
 
 
 def _drive_limits(controller: ControllerConfig, bus: BusConfig) -> DriveLimits:
@@ -241,10 +295,12 @@ def table_name(n: int) -> str:
 
 def tables(scenario: Scenario) -> dict[str, Path]:
     """The files that the reference and its correction are read from, by their names in a run's folder."""
-    folder = scenario.source.parent
     learnt = {} if scenario.stored_file is None else {LEARNT_FROM: scenario.stored_file}
+    held, beside = scenario.held_in, scenario.source.parent
     return learnt | {
-        table_name(n): folder / s.file for n, s in enumerate(scenario.config.reference) if isinstance(s, Table)
+        table_name(n): beside / s.file if held is None else held / table_name(n)
+        for n, s in enumerate(scenario.config.reference)
+        if isinstance(s, Table)
     }
 
 
@@ -254,24 +310,20 @@ def restore(resolved: dict[str, Any], folder: Path) -> Scenario:
     Raises ``ConfigError`` for data of another version of this program, and for a table that is not the one of then.
     """
     source = str(folder)
-    names = ("stage", "plant", "controller", "bus")
-    own = {key: value for key, value in resolved.items() if key not in (*names, "sha256", "digest")}
-    scenario = config.parse({**own, **{key: resolved[key]["name"] for key in names}}, ScenarioConfig, source)
+    written, held = _taken_apart(resolved)
+    if held is None:
+        raise ConfigError(f"{source}: is not the configuration of a run: it lacks its {', '.join(_PARTS)}")
+    scenario = config.parse(written, ScenarioConfig, source)
     models: dict[str, type[BaseModel]] = {
         "stage": StageConfig, "plant": PlantConfig, "controller": ControllerConfig, "bus": BusConfig,
     }  # fmt: skip
-    parts: dict[str, Any] = {key: config.parse(resolved[key], model, source) for key, model in models.items()}
-    held = [
-        segment.model_copy(update={"file": table_name(n)}) if isinstance(segment, Table) else segment
-        for n, segment in enumerate(scenario.reference)
-    ]
-    trajectory = Trajectory(in_folder(held, folder))
-    for n, segment in enumerate(trajectory.segments):
-        if segment.source_sha256 != resolved.get("sha256", {}).get(f"reference.{n}"):
-            raise ConfigError(f"{folder}: reference.{n}: its table is not the one of the run")
-    device = config.parse(resolved["stage"], Device, source)
+    parts: dict[str, Any] = {key: config.parse(held.parts[key], model, source) for key, model in models.items()}
+    trajectory = _held_trajectory(scenario, folder, held.sha256)
+    device = config.parse(held.parts["stage"], Device, source)
     begins_with = folder / LEARNT_FROM if scenario.learning is not None and scenario.learning.file else None
-    return Scenario(folder, scenario, device=device, trajectory=trajectory, stored_file=begins_with, **parts)
+    return Scenario(
+        folder, scenario, device=device, trajectory=trajectory, stored_file=begins_with, held_in=folder, **parts
+    )
 
 
 def _check_duration(source: Path, scenario: ScenarioConfig, trajectory: Trajectory) -> None:

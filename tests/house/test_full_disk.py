@@ -55,8 +55,13 @@ def test_a_folder_that_may_not_be_written_is_refused_before_anything_runs(comman
 
 @pytest.mark.parametrize("name", [FRAMES, SUMMARY, PICTURE])
 def test_whichever_file_meets_the_end_of_the_disk_the_recording_beside_it_opens(tmp_path, name):
-    folder = RunFolder(tmp_path / "run")
-    (folder.path / name).symlink_to("/dev/full")
+
+    class OnAFullDisk(RunFolder):
+        def write_config(self, scenario):
+            (self.path / name).symlink_to("/dev/full")
+            return super().write_config(scenario)
+
+    folder = OnAFullDisk(tmp_path / "run")
     with pytest.raises((ConfigError, RecordingError), match="no space left on device"):
         draw(folder, run_into(folder, load_scenario("raster"), Lane.LOCKSTEP))
     recording = Recording.open(folder.recording)
