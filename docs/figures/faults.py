@@ -12,7 +12,7 @@ import shutil
 import sys
 from pathlib import Path
 
-from hil.commands.faults import run_matrix
+from hil.commands.studies.faults import run_matrix
 from hil.faults.catalogue import KINDS, PARTS
 from hil.pictures.faults import draw
 from hil.studies.faults.matrix import CASES

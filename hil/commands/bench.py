@@ -2,17 +2,18 @@
 
 import json
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated
+from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
-from rich.console import Console
-from rich.table import Table
+
+from hil.screen.progress import progress_bar
+from hil.screen.terminal import bad, good, notes, plain_table, screen
 
 if TYPE_CHECKING:
+    from rich.table import Table
+
     from hil.bench.figure import Figure
 
-_screen = Console(highlight=False)
-_notes = Console(stderr=True, highlight=False)
 _WIDE = 120
 """Columns of a terminal from which on there is room for what a figure means."""
 _COLUMNS = (("figure", "left"), ("best", "right"), ("median", "right"), ("", "left"), ("target", "left"), ("", "left"))
@@ -33,27 +34,20 @@ def bench(
     if as_json:
         print(json.dumps(results(machine, figures), allow_nan=False))
     else:
-        _screen.print(table_of(figures, with_details=_screen.width >= _WIDE))
+        screen().print(table_of(figures, with_details=screen().width >= _WIDE))
 
 
 def measure_all(only: list[str], *, quiet: bool) -> "list[Figure]":
     """Take the measurements one after the other, with progress on a terminal. Raises ``ConfigError`` for bad names."""
-    from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn
-
     from hil.bench.suite import chosen, measure
 
     names = chosen(only)
     _say_if_compiling(quiet=quiet)
     figures = []
-    columns = (BarColumn(), MofNCompleteColumn(), TextColumn("{task.description}"))
-    with Progress(*columns, console=_notes, transient=True, disable=quiet or not _notes.is_terminal) as progress:
-        # No refreshing thread beside what is being measured: it is redrawn between measurements only.
-        progress.live.auto_refresh = False
-        task = progress.add_task("", total=len(names))
-        for name in names:
-            progress.update(task, description=name, refresh=True)
+    with progress_bar("", quiet=quiet, still=True) as tell:
+        for n, name in enumerate(names):
+            tell(n, len(names), name)
             figures += measure(name, only)
-            progress.advance(task)
     return figures
 
 
@@ -62,12 +56,13 @@ def _say_if_compiling(*, quiet: bool) -> None:
 
     cache = getattr(replay_cycle, "_cache", None)  # absent when the compiler is switched off
     if not quiet and cache is not None and not any(Path(cache.cache_path).glob("kernels.replay_cycle-*.nbi")):
-        _notes.print("First run here: the kernels are compiled as they are needed, which takes a minute or two.")
+        notes().print("First run here: the kernels are compiled as they are needed, which takes a minute or two.")
 
 
-def table_of(figures: "list[Figure]", *, with_details: bool) -> Table:
+def table_of(figures: "list[Figure]", *, with_details: bool) -> "Table":
     """A row for each figure, with a blank between measurements."""
-    table = Table(box=None, pad_edge=False, header_style="dim")
+    table = plain_table()
+    table.show_header = True
     for heading, side in _COLUMNS:
         table.add_column(heading, justify=side, no_wrap=True)  # type: ignore[arg-type]
     if with_details:
@@ -77,9 +72,9 @@ def table_of(figures: "list[Figure]", *, with_details: bool) -> Table:
         if group and figure.name.partition(".")[0] != group:
             table.add_row()
         group = figure.name.partition(".")[0]
-        verdict = {True: "[green]met[/]", False: "[bold red]missed[/]", None: ""}[figure.met]
+        verdict = {True: good("met"), False: bad("missed"), None: ""}[figure.met]
         median = "" if figure.median is None else in_digits(figure.median)
-        cells = (figure.name, in_digits(figure.value), median, figure.unit, bound_of(figure), verdict)
+        cells: tuple[Any, ...] = (figure.name, in_digits(figure.value), median, figure.unit, bound_of(figure), verdict)
         table.add_row(*cells, *((figure.detail,) if with_details else ()))
     return table
 

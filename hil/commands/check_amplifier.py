@@ -7,10 +7,9 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
 import typer
-from rich.console import Console
-from rich.markup import escape
 
 from hil.screen.outputs import folder_to_write, writing
+from hil.screen.terminal import bad, faint, good, say
 from pkxyz_ctrl.config.files import CONFIG_DIR, load
 
 if TYPE_CHECKING:
@@ -18,8 +17,7 @@ if TYPE_CHECKING:
     from hil.conformance.verdict import Line
     from pkxyz_ctrl.config.bus import BusConfig
 
-_screen = Console(highlight=False)
-_COLOURS = {"PASS": "green", "FAIL": "bold red", "NOT TESTED": "dim"}
+_STYLES = {"PASS": good, "FAIL": bad, "NOT TESTED": faint}
 
 
 def check_amplifier(
@@ -50,7 +48,7 @@ def check_amplifier(
         print(json.dumps(result))
     else:
         counts = f"{result['passed']} passed, {result['failed']} failed, {result['not_tested']} not tested"
-        _screen.print(f"{counts}. {report.conclusion(result)}", soft_wrap=True)
+        say(f"{counts}. {report.conclusion(result)}")
     raise typer.Exit(0 if result["ok"] else 1)
 
 
@@ -77,11 +75,10 @@ def _talker(config: "BusConfig", eds: Path, allow_voltage: bool) -> "Iterator[Ta
 
 
 def _show(line: "Line") -> None:
-    colour = _COLOURS[line.verdict.value]
     name = f"{line.group}: {line.name}"
-    _screen.print(f"[{colour}]{line.verdict.value:10}[/] {escape(name):45} {escape(line.got)}", soft_wrap=True)
+    say(_STYLES[line.verdict.value](f"{line.verdict.value:10}"), f" {name:45} {line.got}")
     if line.verdict.value == "FAIL":
-        _screen.print(f"{'':10} {'expected':45} {escape(line.expected)}", soft_wrap=True)
+        say(f"{'':10} {'expected':45} {line.expected}")
 
 
 def _save(out: Path, name: str, text: str) -> None:

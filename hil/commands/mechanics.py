@@ -12,21 +12,21 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
-from rich.console import Console
-from rich.markup import escape
-from rich.table import Table
 
 from hil.screen.outputs import folder_to_write, picture_to_write
+from hil.screen.terminal import bad, good, plain_table, say, screen, warned
 from pkxyz_ctrl.config.files import ConfigError, load, require_finite
 
 if TYPE_CHECKING:
+    from rich.table import Table
+    from rich.text import Text
+
     from pkxyz_ctrl.mechanics.reproduction import Row
     from pkxyz_ctrl.mechanics.selection import Selection
     from pkxyz_ctrl.stage import Stage
 
-_screen = Console(highlight=False)
 _WIDE = 150  # columns that the table of the paper's numbers needs
-_VERDICT_COLOURS = {"reproduces": "green", "rounded": "cyan", "misprint": "yellow", "not reproducible": "red"}
+_STYLES = {"reproduces": good, "rounded": good, "misprint": warned, "not reproducible": bad}
 
 AsJson = Annotated[bool, typer.Option("--json", help="Print JSON, and nothing else.")]
 StageName = Annotated[str, typer.Option("--stage", help="A shipped stage's name or a TOML file.")]
@@ -64,13 +64,13 @@ def paper(as_json: AsJson = False, out: OutFolder = None) -> None:
     if as_json:
         print(json.dumps({"rows": [_row_data(row) for row in rows]}, allow_nan=False))
         return
-    if _screen.width >= _WIDE:
-        _screen.print(_paper_table(rows))
+    if screen().width >= _WIDE:
+        screen().print(_paper_table(rows))
     else:
         for row in rows:
-            _screen.print(_paper_lines(row), soft_wrap=True)
+            say(*_paper_lines(row))
     counts = {v: sum(row.verdict == v for row in rows) for v in dict.fromkeys(row.verdict for row in rows)}
-    _screen.print(f"{len(rows)} numbers: " + ", ".join(f"{n} {v}" for v, n in counts.items()))
+    say(f"{len(rows)} numbers: " + ", ".join(f"{n} {v}" for v, n in counts.items()))
 
 
 def _row_data(row: "Row") -> dict[str, Any]:
@@ -80,17 +80,18 @@ def _row_data(row: "Row") -> dict[str, Any]:
     return {key: value for key, value in vars(row).items() if key != "corrected_from_to"} | {"corrected": corrected}
 
 
-def _paper_lines(row: "Row") -> str:
+def _paper_lines(row: "Row") -> "tuple[str | Text, ...]":
     """A row for a narrow screen or a pipe: one line of figures, one of reason."""
     figures = [f"{row.published_text} {row.unit}".rstrip() + " published"]
     for design, value in (("printed", row.printed), ("reconstructed", row.reconstructed)):
         figures += [] if value is None else [f"{value:.6g} {design}"]
-    verdict = f"[{_VERDICT_COLOURS[row.verdict]}]{row.verdict}[/]"
-    return f"{row.where}  {escape(row.quantity)}: {', '.join(figures)}: {verdict}\n    {row.why}"
+    verdict = _STYLES[row.verdict](row.verdict)
+    return f"{row.where}  {row.quantity}: {', '.join(figures)}: ", verdict, f"\n    {row.why}"
 
 
-def _paper_table(rows: "list[Row]") -> Table:
-    table = Table(box=None, pad_edge=False, header_style="dim")
+def _paper_table(rows: "list[Row]") -> "Table":
+    table = plain_table()
+    table.show_header = True
     for heading in ("where", "number", "unit", "published", "printed", "reconstr.", "off (%)", "verdict", "why"):
         numeric = heading in ("published", "printed", "reconstr.", "off (%)")
         table.add_column(
@@ -100,10 +101,8 @@ def _paper_table(rows: "list[Row]") -> Table:
         off = [d for d in (row.difference_printed, row.difference_reconstructed) if d is not None]
         nearest = f"{round(min(off, key=abs) * 100, 9):+.2g}" if off else ""  # what rounding leaves is no difference
         figures = ["" if v is None else f"{v:.6g}" for v in (row.printed, row.reconstructed)]
-        verdict = f"[{_VERDICT_COLOURS[row.verdict]}]{row.verdict}[/]"
-        table.add_row(
-            row.where, escape(row.quantity), row.unit, row.published_text, *figures, nearest, verdict, row.why
-        )
+        verdict = _STYLES[row.verdict](row.verdict)
+        table.add_row(row.where, row.quantity, row.unit, row.published_text, *figures, nearest, verdict, row.why)
     return table
 
 
@@ -175,8 +174,8 @@ def _workspace_data(device: "Stage", limit_v: float) -> dict[str, Any]:
 
 def _print_workspace(data: dict[str, Any]) -> None:
     volume, cube = data["volume_um3"], data["inscribed_cube_um"]
-    _screen.print(f"Stage {data['stage']}, limit {data['v_max']:g} V")
-    table = Table(box=None, pad_edge=False, show_header=False)
+    say(f"Stage {data['stage']}, limit {data['v_max']:g} V")
+    table = plain_table()
     table.add_row("volume, exact", f"{volume['exact']:.1f} um^3", f"linear {volume['linear']:.1f} um^3")
     share = f"{volume['held_share']:.1%} of it, ± {volume['held_error']:.2g} um^3"
     table.add_row(f"held with {data['v_max']:g} V", f"{volume['held']:.1f} um^3", share)
@@ -188,16 +187,14 @@ def _print_workspace(data: dict[str, Any]) -> None:
         f"{cube['standing']:.2f} um",
         f"standing on its corner; along x, y, z {cube['along_axes']:.2f} um",
     )
-    _screen.print(table)
-    corners = Table(box=None, pad_edge=False, header_style="dim")
-    for heading in ("corner: strokes (um)", "position (um)", "needs (V)"):
-        corners.add_column(heading, justify="right")
+    screen().print(table)
+    corners = plain_table("corner: strokes (um)", "position (um)", "needs (V)")
     for corner in data["corners"]:
         strokes, position = (", ".join(f"{v:.4g}" for v in corner[k]) for k in ("stroke_um", "position_um"))
         volts = corner["voltage_v"]
         words = "a push" if volts is None else f"{volts:.1f}" + ("" if volts <= data["v_max"] else " too much")
         corners.add_row(strokes, position, words)
-    _screen.print(corners)
+    screen().print(corners)
 
 
 def design(
@@ -293,14 +290,12 @@ def _report_design(chosen: "Selection", out: Path, as_json: bool) -> None:
     if as_json:
         print(json.dumps(data, allow_nan=False))
         return
-    _screen.print(f"L1 = {data['l1_um']:.1f} um, L2 = {data['l2_um']:.1f} um, alpha_0 = {data['alpha_0_rad']:.4f} rad")
-    table = Table(box=None, pad_edge=False, header_style="dim")
-    table.add_column("requirement")
-    table.add_column("margin", justify="right")
+    say(f"L1 = {data['l1_um']:.1f} um, L2 = {data['l2_um']:.1f} um, alpha_0 = {data['alpha_0_rad']:.4f} rad")
+    table = plain_table("requirement", "margin")
     for name, margin in zip(MARGINS, chosen.margin, strict=True):
         table.add_row(name, f"{margin:.1%}" if margin < 10 else "ample")
-    _screen.print(table)
-    _screen.print(f"written to {out}; run it with: pkxyz sil --stage {out}", soft_wrap=True)
+    screen().print(table)
+    say(f"written to {out}; run it with: pkxyz sil --stage {out}")
 
 
 def linearisation(
@@ -332,9 +327,7 @@ def linearisation(
     if as_json:
         print(json.dumps({"stage": device.config.name, "move_um": move, "worst_nm": worst}, allow_nan=False))
         return
-    table = Table(box=None, pad_edge=False, header_style="dim")
-    for heading in ("worst error (nm)", "x", "y", "z"):
-        table.add_column(heading, justify="left" if " " in heading else "right")
+    table = plain_table("worst error (nm)", "x", "y", "z")
     for kind, error in worst.items():
         table.add_row(kind.replace("_", " "), *(f"{error[axis]:.3g}" for axis in "xyz"))
-    _screen.print(table)
+    screen().print(table)

@@ -7,15 +7,13 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
 import typer
-from rich.console import Console
 
 from hil.screen.outputs import writing
+from hil.screen.terminal import say
 from pkxyz_ctrl.config.files import ConfigError, find, load, read_toml
 
 if TYPE_CHECKING:
     from pydantic import BaseModel
-
-_screen = Console(highlight=False)
 
 
 class Kind(StrEnum):
@@ -59,7 +57,7 @@ def new(
         for name in _tables_of(source):
             if not (file.parent / name).exists():
                 shutil.copyfile(source.parent / name, file.parent / name)
-    _screen.print(f"{file}: as {source.stem}, with comments; run it with: {command}", soft_wrap=True)
+    say(f"{file}: as {source.stem}, with comments; run it with: {command}")
 
 
 def commented(source: Path, model: "type[BaseModel]", name: str, command: str) -> str:

@@ -8,15 +8,14 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
 import typer
-from rich.console import Console
-from rich.table import Table
+
+from hil.screen.progress import progress_bar
+from hil.screen.terminal import plain_table, say, screen
 
 if TYPE_CHECKING:
     from hil.runs.replay import Replay
     from pkxyz_ctrl.config.controller import ControllerConfig
 
-_screen = Console(highlight=False)
-_notes = Console(stderr=True, highlight=False)
 _SHOWN = 8
 
 
@@ -50,13 +49,8 @@ def replay(
 def _with_progress(path: Path, controller: "ControllerConfig | None", *, quiet: bool) -> "Replay":
     from hil.runs.replay import replay as played
 
-    if quiet or not _notes.is_terminal:
-        return played(path, controller)
-    from rich.progress import Progress
-
-    with Progress(console=_notes, transient=True) as progress:
-        task = progress.add_task(f"replaying {path.parent.name}", total=None)
-        return played(path, controller, lambda done, total: progress.update(task, completed=done, total=total))
+    with progress_bar(f"replaying {path.parent.name}", quiet=quiet) as tell:
+        return played(path, controller, tell)
 
 
 def _plain(result: "Replay", folder: Path) -> dict[str, object]:
@@ -79,21 +73,18 @@ def _plain(result: "Replay", folder: Path) -> dict[str, object]:
 
 def _show(result: "Replay") -> None:
     if result.identical:
-        _screen.print(f"{result.ticks} ticks replayed, identical in every bit")
+        say(f"{result.ticks} ticks replayed, identical in every bit")
     else:
         first = result.differences[0]
-        _screen.print(
+        say(
             f"first difference: tick {first.tick}, at {first.t_us * 1e-6:.6f} s, {first.signal}: recorded "
             f"{first.recorded!r}, replayed {first.replayed!r}",
-            soft_wrap=True,
         )
-        table = Table(box=None, pad_edge=False, header_style="dim")
-        for heading in ("signal", "from tick", "ticks", "recorded", "replayed"):
-            table.add_column(heading, justify="left" if heading == "signal" else "right")
+        table = plain_table("signal", "from tick", "ticks", "recorded", "replayed")
         for d in result.differences[:_SHOWN]:
             table.add_row(d.signal, str(d.tick), str(d.ticks), f"{d.recorded:.9g}", f"{d.replayed:.9g}")
-        _screen.print(table)
+        screen().print(table)
         left = len(result.differences) - _SHOWN
-        _screen.print(f"{f'and {left} signals more; ' if left > 0 else ''}{result.ticks} ticks replayed")
+        say(f"{f'and {left} signals more; ' if left > 0 else ''}{result.ticks} ticks replayed")
     for note in result.notes:
-        _screen.print(f"note: {note}", soft_wrap=True)
+        say(f"note: {note}")

@@ -7,8 +7,8 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
+from hil.screen.figures import error_lines
 from hil.screen.first_run import say_if_compiling
-from hil.screen.tables import error_lines
 from pkxyz_ctrl.config.files import ConfigError
 
 if TYPE_CHECKING:

@@ -17,7 +17,7 @@ from hil.bus.load_trace import BusTrace, read_bus_trace
 from hil.pictures import style
 from hil.pictures.style import box, dress, dress_space, legend, save, sheet
 from hil.recording.recording import Recording
-from hil.runs.metrics import Verdict
+from hil.runs.metrics import bound_words
 from hil.runs.summary import Summary
 
 Array = NDArray[np.float64]
@@ -255,14 +255,6 @@ def _draw_figures(plot: Axes, summary: Summary) -> None:
                 color=colour if text is words else style.INK,
                 fontweight="bold" if text is words and ok is False else "normal",
             )  # fmt: skip
-
-
-def bound_words(check: Verdict) -> str:
-    """The bound of a check as people write it."""
-    low, high = check.min, check.max
-    if low is None:
-        return f"≤ {high:g}"
-    return f"≥ {low:g}" if high is None else f"{low:g} to {high:g}"
 
 
 def _draw_title(figure: Figure, summary: Summary) -> None:

@@ -214,3 +214,11 @@ def _values(measured: Any) -> list[float]:
 
 def _by_axis(values_m: NDArray[np.float64]) -> dict[str, float]:
     return {axis: float(value) * _NM for axis, value in zip(AXES, values_m, strict=True)}
+
+
+def bound_words(check: Verdict) -> str:
+    """The bound of a check as people write it."""
+    low, high = check.min, check.max
+    if low is None:
+        return f"≤ {high:g}"
+    return f"≥ {low:g}" if high is None else f"{low:g} to {high:g}"

@@ -10,7 +10,6 @@ from typing import Any
 
 import numpy as np
 import pytest
-from rich.console import Console
 from typer import Typer
 from typer.testing import CliRunner, Result
 
@@ -61,7 +60,7 @@ def test_paper_as_json_and_with_its_figures(tmp_path: Path) -> None:
 
 @pytest.mark.parametrize("width", [80, 200])
 def test_paper_on_a_narrow_and_a_wide_screen(width: int, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(mechanics_cli, "_screen", Console(width=width, highlight=False))
+    monkeypatch.setenv("COLUMNS", str(width))
     out = run("paper").stdout
     assert "51 numbers: 26 reproduces, 13 misprint, 5 rounded, 7 not reproducible" in out
     assert "sec^2[a]" in out

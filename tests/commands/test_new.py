@@ -9,7 +9,7 @@ from command_line import pkxyz
 
 from hil.commands.new import _FOLDERS, Kind, _model, commented
 from hil.runs.metrics import RowFigures
-from hil.screen.tables import error_lines
+from hil.screen.figures import error_lines
 from pkxyz_ctrl.config.files import CONFIG_DIR, load, names
 
 SHIPPED = [(kind, name) for kind in Kind for name in names(_FOLDERS[kind])]

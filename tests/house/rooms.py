@@ -101,14 +101,17 @@ HOUSE: Mapping[str, Room] = MappingProxyType({
         "pkxyz_ctrl.*", "hil.recording", "hil.lanes", "hil.runs", "hil.studies.spread", "hil.studies.margins",
         "hil.studies.identify", "hil.studies.tune", "hil.studies", "hil.pictures",
     )),
+    "hil.commands.studies": Room((
+        "pkxyz_ctrl.*", "hil.recording", "hil.lanes", "hil.runs", "hil.studies.spread", "hil.studies.margins",
+        "hil.studies.identify", "hil.studies.tune", "hil.studies.faults", "hil.studies", "hil.pictures", "hil.screen",
+        "hil.api",
+    )),
     "hil.commands": Room((
-        "pkxyz_ctrl.*", "hil.recording", "hil.lanes", "hil.conformance", "hil.runs", "hil.studies.spread",
-        "hil.studies.margins", "hil.studies.identify", "hil.studies.tune", "hil.studies.faults", "hil.studies",
-        "hil.pictures", "hil.screen", "hil.bench.rigs", "hil.bench", "hil.api",
+        "pkxyz_ctrl.*", "hil.recording", "hil.faults", "hil.lanes", "hil.conformance", "hil.runs", "hil.studies",
+        "hil.pictures", "hil.screen", "hil.bench.rigs", "hil.bench",
     )),
     "hil": Room((
-        "pkxyz_ctrl.*", "hil.recording", "hil.faults", "hil.lanes", "hil.runs", "hil.pictures", "hil.screen",
-        "hil.api", "hil.commands",
+        "pkxyz_ctrl.*", "hil.lanes", "hil.runs", "hil.screen", "hil.api", "hil.commands.studies", "hil.commands",
     )),
 })  # fmt: skip
 
@@ -169,7 +172,7 @@ class House:
         ]
 
     def _imports(self, module: str) -> Iterator[str]:
-        """All that a module names in an import: anywhere in it, for type checkers only, or by ``import_module``."""
+        """All that a module names in an import, anywhere in it, for type checkers only, too; and in a string."""
         package = module if module in self.packages else module.rpartition(".")[0]
         for node in ast.walk(ast.parse(self.sources[module])):
             if isinstance(node, ast.Import):
@@ -182,8 +185,9 @@ class House:
                 yield from named & self.sources.keys()  # a name that is a module counts as that module
                 if not named <= self.sources.keys():
                     yield base
-            elif isinstance(node, ast.Call) and ast.unparse(node.func).endswith(("import_module", "__import__")):
-                yield from (a.value for a in node.args if isinstance(a, ast.Constant) and isinstance(a.value, str))
+            elif isinstance(node, ast.Constant) and isinstance(node.value, str):
+                place = node.value.partition(":")[0]
+                yield from {place} & self.sources.keys() if "." in place else ()  # for importlib, or a table of places
 
 
 def may_use(table: Mapping[str, Room], room: str, other: str) -> bool:

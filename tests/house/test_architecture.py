@@ -84,6 +84,7 @@ def test_the_small_house_is_in_order():
         "def late():\n    from high.c import anything\n",
         "class Late:\n    async def load(self):\n        import high.c as other\n",
         "import importlib\nmodule = importlib.import_module('high.c')\n",
+        "PLACES = {'name': ('high.c:function', 'words')}\n",
         "try:\n    from high.c import anything\nexcept ImportError:\n    pass\n",
     ],
 )

@@ -2,7 +2,6 @@
 
 import contextlib
 import errno
-import io
 import json
 import os
 import signal
@@ -12,12 +11,10 @@ import time
 from pathlib import Path
 
 import pytest
-from rich.console import Console
-from rich.table import Table
 
 from hil import cli
+from hil.screen.errors import was_interrupted
 from hil.screen.outputs import what_to_do
-from hil.screen.tables import print_whole
 from pkxyz_ctrl.config.files import CONFIG_DIR
 
 ROOT = Path(__file__).parents[2]
@@ -109,8 +106,8 @@ def test_a_disk_that_refuses_is_one_line_and_other_errors_of_the_system_are_not_
 def test_ctrl_c_is_ctrl_c_whatever_an_import_makes_of_it():
     interrupted = ImportError("numba._devicearray failed to import")
     interrupted.__context__ = KeyboardInterrupt()
-    assert cli._was_interrupted(interrupted)
-    assert not cli._was_interrupted(ImportError("no module named numba"))
+    assert was_interrupted(interrupted)
+    assert not was_interrupted(ImportError("no module named numba"))
 
 
 def ended(tmp_path, ready, *words, by=signal.SIGINT):
@@ -162,15 +159,6 @@ def test_a_study_that_is_killed_leaves_no_process_behind(tmp_path):
     lines = lambda: results.is_file() and len(results.read_text().splitlines())  # noqa: E731
     words = ("montecarlo", "--plants", "4000", "--workers", "2")
     assert ended(tmp_path, lambda: lines() > 2, *words, by=signal.SIGKILL)[0] == -signal.SIGKILL
-
-
-def test_a_narrow_terminal_cuts_no_number():
-    table = Table("law", "Ms", box=None, pad_edge=False)
-    table.columns[1].no_wrap = True
-    table.add_row("lqg", "1.6234567890123456789")
-    screen = Console(width=12, file=io.StringIO())
-    print_whole(screen, table)
-    assert "lqg  1.6234567890123456789" in screen.file.getvalue()
 
 
 def test_where_no_law_ran_there_is_no_picture(tmp_path, monkeypatch, capsys):

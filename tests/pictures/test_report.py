@@ -9,9 +9,9 @@ from synthetic_rows import START_TICKS, default_scenario, metadata, tracking_row
 from hil.bus.frame_time import frame_duration_ns
 from hil.bus.load_trace import read_bus_trace
 from hil.lanes.lane import Lane
-from hil.pictures.report import bound_words, draw_report, read_signals
+from hil.pictures.report import draw_report, read_signals
 from hil.recording.recording import Recording, RecordingWriter
-from hil.runs.metrics import Metrics, Verdict
+from hil.runs.metrics import Metrics, Verdict, bound_words
 from hil.runs.summary import LoopFigures, summarise
 from pkxyz_ctrl.can.frame import Frame
 

@@ -7,16 +7,12 @@ from pathlib import Path
 from typing import Annotated, Any
 
 import typer
-from rich.console import Console
-from rich.table import Table
 
 from hil.lanes.lane import Lane
 from hil.screen.first_run import say_if_compiling
 from hil.screen.outputs import folder_to_write
 from hil.screen.progress import progress_bar
-from hil.screen.tables import print_whole
-
-_screen = Console(highlight=False)
+from hil.screen.terminal import bad, plain_table, print_whole, say
 
 
 def montecarlo(
@@ -103,19 +99,17 @@ def _replay(study: Any, seed: int, out: Path, *, as_json: bool) -> None:
         print(json.dumps(data, allow_nan=False))
     else:
         for name, value in data.items():
-            _screen.print(f"{name}: {value}", soft_wrap=True)
+            say(f"{name}: {value}")
     raise typer.Exit(0 if result.ok else 1)
 
 
 def _show(data: dict[str, Any], worst_alone: str) -> None:
-    _screen.print(f"{data['controller']}, {data['scenario']}, {data['plants']} plants of {data['tolerances']!r}")
-    table = Table(box=None, pad_edge=False, header_style="dim")
-    for n, heading in enumerate(("", "median", "95 %", "largest", "its seed")):
-        table.add_column(heading, justify="right" if n else "left")
+    say(f"{data['controller']}, {data['scenario']}, {data['plants']} plants of {data['tolerances']!r}")
+    table = plain_table("", "median", "95 %", "largest", "its seed")
     for name in ("rms_error_nm", "hold_noise_nm", "peak_s"):
         if (d := data[name]) is not None:
             table.add_row(name, *(f"{d[key]:.3g}" for key in ("median", "p95", "max")), str(d["max_seed"]))
-    print_whole(_screen, table)
+    print_whole(table)
     if data["not_held"]:
-        _screen.print(f"[bold red]{data['not_held']} did not hold[/]", markup=True)
-    _screen.print(f"the worst one alone: {worst_alone}", soft_wrap=True)
+        say(bad(f"{data['not_held']} did not hold"))
+    say(f"the worst one alone: {worst_alone}")

@@ -7,14 +7,12 @@ from pathlib import Path
 from typing import Annotated
 
 import typer
-from rich.console import Console
 
 from hil.screen.first_run import say_if_compiling
 from hil.screen.outputs import folder_to_write, writing
 from hil.screen.progress import progress_bar
+from hil.screen.terminal import bad, say
 from pkxyz_ctrl.config.files import ConfigError
-
-_screen = Console(highlight=False)
 
 
 def soak(
@@ -57,22 +55,18 @@ def soak(
         print(json.dumps(soaking.as_json(soaked)))
     else:
         until = " until interrupted" if soaked.interrupted else ""
-        _screen.print(
+        say(
             f"{soaked.ticks} ticks{until}, {soaked.realtime_factor:.1f} times real time; {soaked.faults} faults, "
             f"{soaked.decisions} decisions, {soaked.returns} times back to tracking",
-            soft_wrap=True,
         )
-        _screen.print(
+        say(
             f"{soaked.recorded_ticks} ticks read back from the recordings; memory {soaked.memory_mb[0]:.0f} to "
             f"{soaked.memory_mb[-1]:.0f} MB; at most {soaked.voltage_max_v:.1f} V, and {soaked.slew_max_v:.1f} V up "
             "in a tick",
-            soft_wrap=True,
         )
-        _screen.print(
-            "reasons: " + ", ".join(f"{name} {count}" for name, count in soaked.reasons.items()), soft_wrap=True
-        )
+        say("reasons: " + ", ".join(f"{name} {count}" for name, count in soaked.reasons.items()))
         for problem in soaked.problems:
-            _screen.print(f"[bold red]{problem}[/]")
+            say(bad(problem))
     raise typer.Exit(130 if soaked.interrupted else 0 if soaked.ok else 1)
 
 

@@ -6,8 +6,6 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
-from rich.console import Console
-from rich.table import Table
 
 from hil.lanes.lane import Lane
 from hil.screen.choices import InProcessLane, Tones
@@ -15,17 +13,17 @@ from hil.screen.errors import one_line_errors
 from hil.screen.first_run import say_if_compiling
 from hil.screen.outputs import folder_to_write, writing
 from hil.screen.progress import progress_bar
-from hil.screen.tables import print_whole
+from hil.screen.terminal import bad, plain_table, print_whole, say, warned
 from pkxyz_ctrl.config.files import ConfigError, load
 
 if TYPE_CHECKING:
     from collections.abc import Callable
 
+    from rich.table import Table
+
     from hil.studies.margins.loop import Agreement, ChangedPlants, Loop
     from hil.studies.margins.measured import MeasuredLoop
     from pkxyz_ctrl.design.margins.margins import Margins, Sensitivities
-
-_screen = Console(highlight=False)
 
 
 def margins(
@@ -169,33 +167,32 @@ def _show(
     compared: "Agreement | None",
 ) -> None:  # fmt: skip
     strokes = " / ".join(f"{q:g}" for q in data["strokes_um"])
-    _screen.print(f"{data['controller']} on {data['bus']}, strokes {strokes} um")
+    say(f"{data['controller']} on {data['bus']}, strokes {strokes} um")
     if data["holds"] == _WHILE_FREE:
-        _screen.print(f"[yellow]holds {_WHILE_FREE}[/]: there it is linear")
+        say(warned(f"holds {_WHILE_FREE}"), ": there it is linear")
     if not computed.stable:
-        _screen.print(f"[bold red]unstable[/]: spectral radius {computed.spectral_radius:.4f}")
-    table = Table(box=None, pad_edge=False, header_style="dim")
-    for n, heading in enumerate(_COLUMNS):
-        table.add_column(heading, justify="right" if n else "left", no_wrap=True)
+        say(bad("unstable"), f": spectral radius {computed.spectral_radius:.4f}")
+    table = plain_table(*_COLUMNS)
     _rows(table, computed, "")
     if measured is not None:
         _rows(table, measured.margins(), ", measured")
-    print_whole(_screen, table)
+    print_whole(table)
     if changed is not None:
         worst, peak = changed.worst
         unstable = sum(not math.isfinite(p) for p in changed.peak_s)
-        verdict = f"[bold red]{unstable} unstable[/], among them" if unstable else f"all stable, Ms at most {peak:.2f}:"
-        _screen.print(f"{len(changed.peak_s)} changed plants: {verdict} {worst.name}", soft_wrap=True)
+        verdict = bad(f"{unstable} unstable, among them") if unstable else f"all stable, Ms at most {peak:.2f}:"
+        say(f"{len(changed.peak_s)} changed plants: ", verdict, f" {worst.name}")
     if compared is not None:
-        verdict = "agrees" if compared.holds else "[bold red]disagrees[/]"
-        _screen.print(
-            f"measured S {verdict}: at most {compared.largest:.1f} deviations from the computed one (noise alone stays "
+        verdict = "agrees" if compared.holds else bad("disagrees")
+        say(
+            "measured S ",
+            verdict,
+            f": at most {compared.largest:.1f} deviations from the computed one (noise alone stays "
             f"below {compared.bound:.1f}), {compared.largest_difference:.3f} in |S|",
-            soft_wrap=True,
         )
 
 
-def _rows(table: Table, found: "Margins", suffix: str) -> None:
+def _rows(table: "Table", found: "Margins", suffix: str) -> None:
     for name, axis in zip("xyz", found.axes, strict=True):
         phase = "any" if math.isinf(axis.phase_margin_rad) else f"{math.degrees(axis.phase_margin_rad):.1f}"
         delay = "any" if math.isinf(axis.delay_margin_s) else f"{axis.delay_margin_s * 1e6:.0f}"

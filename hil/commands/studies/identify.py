@@ -5,8 +5,6 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
-from rich.console import Console
-from rich.table import Table
 
 from hil.lanes.lane import Lane
 from hil.screen.choices import InProcessLane, Tones
@@ -14,13 +12,12 @@ from hil.screen.errors import one_line_errors
 from hil.screen.first_run import say_if_compiling
 from hil.screen.outputs import folder_to_write, writing
 from hil.screen.progress import progress_bar
-from hil.screen.tables import print_whole
+from hil.screen.terminal import bad, plain_table, print_whole, say
 from pkxyz_ctrl.config.files import ConfigError, find
 
 if TYPE_CHECKING:
     from hil.studies.identify.identification import Identification
 
-_screen = Console(highlight=False)
 
 STAGE = "stage.toml"
 
@@ -115,59 +112,55 @@ def _show(found: "Identification", data: dict[str, Any], folder: Path) -> None:
 
     modes, zero = found.modes, found.response.zero
     strokes = " / ".join(f"{q:.2f}" for q in data["strokes_um"])
-    _screen.print(
-        f"{data['stage']} on plant {data['plant']}, {data['controller']} on {data['bus']}, strokes {strokes} um"
-    )
-    table = _table("mode", "frequency (Hz)", "by the stage file", "damping ratio", "Q")
+    say(f"{data['stage']} on plant {data['plant']}, {data['controller']} on {data['bus']}, strokes {strokes} um")
+    table = plain_table("mode", "frequency (Hz)", "by the stage file", "damping ratio", "Q")
     for n, mode in enumerate(data["modes"]):
         table.add_row(
             f"{n + 1}", _pm(mode["frequency_hz"], mode["frequency_error_hz"]), f"{mode['drawn_hz']:.1f}",
             _pm(mode["damping"], mode["damping_error"]), f"{mode['quality_factor']:.1f}",
         )  # fmt: skip
-    print_whole(_screen, table)
+    print_whole(table)
     if not modes.apart.all():
         n = int(np.argmin(modes.apart))
-        _screen.print(f"modes {n} and {n + 1} coincide: one pair of poles tells them as well as two")
-    table = _table("chain", "own comb (counts/V^2)", "comb 1", "comb 2", "comb 3", "sense zero (fF)", "counts")
+        say(f"modes {n} and {n + 1} coincide: one pair of poles tells them as well as two")
+    table = plain_table("chain", "own comb (counts/V^2)", "comb 1", "comb 2", "comb 3", "sense zero (fF)", "counts")
     for i in range(3):
         entries = [f"{v:.3f}" for v in modes.static_gain[i]]
         table.add_row(
             f"{i + 1}", _pm(modes.static_gain[i, i], modes.static_gain_deviation[i, i]), *entries,
             _pm(zero.offset_f[i] * 1e15, zero.deviation_f[i] * 1e15), f"{zero.offset_count[i]:.1f}",
         )  # fmt: skip
-    print_whole(_screen, table)
+    print_whole(table)
     fit = data["fit"]
-    verdict = (
-        "noise alone is left" if modes.noise_alone else "[bold red]more than noise is left: the errors are no bounds[/]"
-    )
-    _screen.print(
-        f"{fit['tones']} tones, fitted to {fit['highest_hz']:.0f} Hz: chi-square {fit['chi_square']:.2f}, {verdict}; "
-        f"coherence there at least {fit['least_coherence']:.3f}",
-        soft_wrap=True,
+    verdict = "noise alone is left" if modes.noise_alone else bad("more than noise is left: the errors are no bounds")
+    say(
+        f"{fit['tones']} tones, fitted to {fit['highest_hz']:.0f} Hz: chi-square {fit['chi_square']:.2f}, ",
+        verdict,
+        f"; coherence there at least {fit['least_coherence']:.3f}",
     )
     _show_gains(found)
     _show_calibration(found)
     if found.outside is None:
-        _screen.print(f"not known from inside: {data['not_known_from_inside']}", soft_wrap=True)
-    _screen.print(f"written: {folder}", soft_wrap=True)
+        say(f"not known from inside: {data['not_known_from_inside']}")
+    say(f"written: {folder}")
     if modes.noise_alone:
-        _screen.print(f"to run with it: pkxyz sil --stage {folder / STAGE}", soft_wrap=True)
+        say(f"to run with it: pkxyz sil --stage {folder / STAGE}")
     else:
-        _screen.print("no stage file was written, as the errors are no bounds; raise --amplitude or --periods")
+        say("no stage file was written, as the errors are no bounds; raise --amplitude or --periods")
 
 
 def _show_gains(found: "Identification") -> None:
     """Of each chain relative to the stage file; apart from each other with an outside reference only."""
     outside, comb, (product, deviation) = found.outside, found.comb_gain, found.chain_gain
-    table = _table("chain", "sense x comb / mass", "sense", "comb")
+    table = plain_table("chain", "sense x comb / mass", "sense", "comb")
     for i in range(3):
         sense = "?" if outside is None else _pm(outside.sense_gain[i], outside.deviation[i])
         pull = "?" if comb is None else _pm(comb[0][i], comb[1][i])
         table.add_row(f"{i + 1}", _pm(product[i], deviation[i]), sense, pull)
-    _screen.print("relative to the stage file, the combs if its mass is right:")
-    print_whole(_screen, table)
+    say("relative to the stage file, the combs if its mass is right:")
+    print_whole(table)
     if outside is not None:
-        _screen.print(f"reference: {outside.points} points, {outside.residual_m * 1e9:.2f} nm rms left")
+        say(f"reference: {outside.points} points, {outside.residual_m * 1e9:.2f} nm rms left")
 
 
 def _show_calibration(found: "Identification") -> None:
@@ -175,7 +168,7 @@ def _show_calibration(found: "Identification") -> None:
     numbers = found.calibrated.calibration
     errors = numbers.standard_error
     assert errors is not None
-    table = _table("chain", "sense", "comb", "sliders", "cranks")
+    table = plain_table("chain", "sense", "comb", "sliders", "cranks")
     for i in range(3):
         sense = _pm(numbers.sense_gain[i], errors.sense_gain[i]) if errors.sense_gain[i] else "as drawn"
         table.add_row(
@@ -183,25 +176,17 @@ def _show_calibration(found: "Identification") -> None:
             _pm(numbers.slider_stiffness[i], errors.slider_stiffness[i]),
             _pm(numbers.crank_stiffness[i], errors.crank_stiffness[i]),
         )  # fmt: skip
-    _screen.print("calibration, relative to the drawing and its mass:")
-    print_whole(_screen, table)
+    say("calibration, relative to the drawing and its mass:")
+    print_whole(table)
     assert numbers.quality_factor is not None
     assert numbers.sense_delay_s is not None
-    _screen.print(
+    say(
         f"links {_pm(numbers.link_stiffness, errors.link_stiffness)}, lift {_pm(numbers.lift, errors.lift)}, "
         f"Q {_pm(numbers.quality_factor, errors.quality_factor)}, "
         f"delay {_pm(numbers.sense_delay_s * 1e6, errors.sense_delay_s * 1e6)} us",
-        soft_wrap=True,
     )
     if found.calibrated.differ and not errors.sense_gain[0]:
-        _screen.print("[bold red]the ratios of the sense gains contradict reciprocity[/]")
-
-
-def _table(*headings: str) -> Table:
-    table = Table(box=None, pad_edge=False, header_style="dim")
-    for n, heading in enumerate(headings):
-        table.add_column(heading, justify="right" if n else "left", no_wrap=True)
-    return table
+        say(bad("the ratios of the sense gains contradict reciprocity"))
 
 
 def _pm(value: float, error: float) -> str:

@@ -7,11 +7,11 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
 import typer
-from rich.console import Console
-from rich.table import Table
 
 from hil.screen.first_run import say_if_compiling
 from hil.screen.outputs import folder_to_write, writing
+from hil.screen.progress import progress_bar
+from hil.screen.terminal import bad, faint, good, plain_table, say, screen
 from hil.studies.spread.processes import processes
 from pkxyz_ctrl.config.files import ConfigError, names
 
@@ -19,8 +19,6 @@ if TYPE_CHECKING:
     from hil.studies.faults.matrix import Case
     from hil.studies.faults.outcome import Outcome
 
-_screen = Console(highlight=False)
-_notes = Console(stderr=True, highlight=False)
 INTERRUPTED = "interrupted"
 """Why a law is not among the results."""
 _CHUNKS = 3  # of the matrix for each law, so that the last process does not run alone for long
@@ -77,7 +75,7 @@ def faults(
     else:
         _show(outcomes, cases, laws)
         for name, reason in refused.items():
-            _screen.print(f"[dim]not run under {name}: {reason}[/]", soft_wrap=True)
+            say(faint(f"not run under {name}: {reason}"))
     raise typer.Exit(130 if interrupted else 0 if result["ok"] else 1)
 
 
@@ -87,22 +85,19 @@ def run_matrix(
     """Every case under every law, over processes, in the order of laws and cases; and the laws that can't be run here,
     with the reason; interrupted, those that are not through.
     """
-    from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn
-
     size = -(-len(cases) // _CHUNKS)
     chunks = [(law, first, cases[first : first + size]) for law in laws for first in range(0, len(cases), size)]
     found: dict[tuple[str, int], list[Outcome]] = {}
     refused: dict[str, str] = {}
-    columns = (BarColumn(), MofNCompleteColumn(), TextColumn("{task.description}"), TimeRemainingColumn())
-    with Progress(*columns, console=_notes, transient=True, disable=quiet or not _notes.is_terminal) as progress:
-        task = progress.add_task("faults", total=len(laws) * len(cases))
+    with progress_bar("faults", quiet=quiet) as tell:
 
         def done(law: str, first: int, outcomes: "list[Outcome] | str") -> None:
             if isinstance(outcomes, str):
                 refused[law] = outcomes
             else:
                 found[law, first] = outcomes
-            progress.update(task, advance=size, description=law)
+            through = sum(len(some) for some in found.values())
+            tell(through, (len(laws) - len(refused)) * len(cases), law)
 
         try:
             if workers == 1:
@@ -141,25 +136,23 @@ def _run_chunk(law: str, cases: "list[Case]") -> "list[Outcome] | str":
 
 def _show(outcomes: "list[Outcome]", cases: "list[Case]", laws: list[str]) -> None:
     for law in laws:
-        table = Table(box=None, pad_edge=False, header_style="dim")
+        table = plain_table()
+        table.show_header = True
         for heading, side in (
             (law, "left"), ("ticks", "right"), ("latched", "left"), ("peak V", "right"), ("V/tick", "right"),
             ("0 V ms", "right"), ("off um", "right"), ("", "left"),
         ):  # fmt: skip
             table.add_column(heading, justify=side, overflow="fold")  # type: ignore[arg-type]
         for outcome, case in zip((o for o in outcomes if o.law == law), cases, strict=True):
-            verdict = "[green]saved[/]" if outcome.ok else f"[bold red]{'; '.join(outcome.problems)}[/]"
-            reason = ", ".join(outcome.reason) or f"[dim]nothing: {case.note}[/]"
+            verdict = good("saved") if outcome.ok else bad("; ".join(outcome.problems))
+            reason = ", ".join(outcome.reason) or faint(f"nothing: {case.note}")
             table.add_row(
                 outcome.case, _or_dash(outcome.ticks, "d"), reason, f"{outcome.voltage_max_v:.0f}",
                 f"{outcome.slew_max_v:.1f}", _or_dash(outcome.zero_ms, ".1f"), f"{outcome.excursion_um:.2f}", verdict,
             )  # fmt: skip
-        _screen.print(table)
-    bad = sum(not o.ok for o in outcomes)
-    _screen.print(
-        f"{len(outcomes)} faults, {len(outcomes) - bad} as they have to be"
-        + (f", [bold red]{bad} not[/]" if bad else "")
-    )
+        screen().print(table)
+    lost = sum(not o.ok for o in outcomes)
+    say(f"{len(outcomes)} faults, {len(outcomes) - lost} as they have to be", bad(f", {lost} not") if lost else "")
 
 
 def _or_dash(value: float | None, form: str) -> str:

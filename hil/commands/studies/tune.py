@@ -5,15 +5,12 @@ from pathlib import Path
 from typing import Annotated
 
 import typer
-from rich.console import Console
-from rich.table import Table
 
 from hil.screen.first_run import say_if_compiling
 from hil.screen.outputs import folder_to_write
 from hil.screen.progress import progress_bar
+from hil.screen.terminal import plain_table, say, screen
 from pkxyz_ctrl.config.files import ConfigError
-
-_screen = Console(highlight=False)
 
 
 def tune(
@@ -94,29 +91,27 @@ def _tune_taps(search: str, stage: str | None, out: Path, *, as_json: bool) -> N
     if stage is not None:
         asked = asked.model_copy(update={"stage": stage})
     folder_to_write(out)
-    found = find_taps(asked, on_progress=lambda line: None if as_json else _screen.print(line))
+    found = find_taps(asked, on_progress=lambda line: None if as_json else say(line))
     path = out / f"{asked.name}_tuned.toml"
     write_taps(asked, found, path)
     noise_nm = dict(zip(("plane", "z"), (1e9 * v for v in found.hold_noise_m), strict=True))
     if as_json:
         print(json.dumps({"search": asked.name, "hold_noise_nm": noise_nm, "controller": str(path)}))
     else:
-        _screen.print(
-            f"noise at hold {noise_nm['plane']:.2f} nm in x and y, {noise_nm['z']:.2f} nm in z", soft_wrap=True
-        )
-        _screen.print(f"run it: pkxyz sil --controller {path}", soft_wrap=True)
+        say(f"noise at hold {noise_nm['plane']:.2f} nm in x and y, {noise_nm['z']:.2f} nm in z")
+        say(f"run it: pkxyz sil --controller {path}")
 
 
 def _show(data: dict, objective: str) -> None:  # type: ignore[type-arg]
     found = data["best"]
-    _screen.print(f"{data['search']}: {data['trials']} trials in the study")
+    say(f"{data['search']}: {data['trials']} trials in the study")
     if not data["trials"]:
         return
     if found is None:
         missed = ", ".join(f"{name} by {beyond:.0%}" for name, beyond in data["missed"].items())
-        _screen.print(f"none keeps every constraint; the nearest one misses {missed or 'nothing, but did not run'}")
+        say(f"none keeps every constraint; the nearest one misses {missed or 'nothing, but did not run'}")
         return
-    table = Table(box=None, pad_edge=False, show_header=False)
+    table = plain_table()
     table.add_row(objective, f"{found['value']:.4g}", f"trial {found['number']}")
     for name, value in found["figures"].items():
         if name == objective:
@@ -125,5 +120,5 @@ def _show(data: dict, objective: str) -> None:  # type: ignore[type-arg]
     for key, value in found["numbers"].items():
         share = data["importance"].get(key)
         table.add_row(key, f"{value:.4g}", "" if share is None else f"importance {share:.2f}")
-    _screen.print(table)
-    _screen.print(f"run it: pkxyz sil --controller {found['controller']}", soft_wrap=True)
+    screen().print(table)
+    say(f"run it: pkxyz sil --controller {found['controller']}")

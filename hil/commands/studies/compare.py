@@ -5,20 +5,16 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
 import typer
-from rich.console import Console
-from rich.table import Table
 
 from hil.lanes.lane import Lane
 from hil.screen.choices import InProcessLane
 from hil.screen.first_run import say_if_compiling
 from hil.screen.outputs import picture_to_write
 from hil.screen.progress import progress_bar
-from hil.screen.tables import print_whole
+from hil.screen.terminal import bad, plain_table, print_whole, say
 
 if TYPE_CHECKING:
     from hil.studies.compare import Compared
-
-_screen = Console(highlight=False)
 
 
 def compare(
@@ -64,19 +60,18 @@ def compare(
 
 
 def _show(runs: "list[Compared]", title: str, out: Path | None) -> None:
-    table = Table(box=None, pad_edge=False, header_style="dim", title=title, title_justify="left")
-    for heading in ("controller", "rms x / y / z (nm)", "largest (nm)", "hold (nm)", "at a limit", "gave up", ""):
-        table.add_column(heading, justify="left" if heading in ("controller", "") else "right")
+    headings = ("controller", "rms x / y / z (nm)", "largest (nm)", "hold (nm)", "at a limit", "gave up", "")
+    table = plain_table(*headings, left=("",), title=title)
     for run in runs:
         found = run.figures
         worst = {k: max(found[k].values()) if found.get(k) else None for k in ("max_error_nm", "hold_noise_nm")}
         rms = " / ".join(f"{v:.2f}" for v in found["rms_error_nm"].values()) if found.get("rms_error_nm") else "none"
         cells = [f"{worst[k]:.2f}" if worst[k] is not None else "none" for k in worst]
         ticks = [str(found["saturated_ticks"]), str(run.gave_up)] if found else ["", ""]
-        verdict = "" if run.problem is None else ("[bold red]fault[/]" if found else "[bold red]refused[/]")
+        verdict = "" if run.problem is None else bad("fault" if found else "refused")
         table.add_row(run.controller, rms, *cells, *ticks, verdict)
-    print_whole(_screen, table)
+    print_whole(table)
     for run in runs:
         if run.problem is not None:
-            _screen.print(f"[red]{run.controller}[/]: {run.problem}", soft_wrap=True)
-    _screen.print("no law ran, so there is no picture" if out is None else f"picture: {out}", soft_wrap=True)
+            say(bad(run.controller), f": {run.problem}")
+    say("no law ran, so there is no picture" if out is None else f"picture: {out}")

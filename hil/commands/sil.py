@@ -1,0 +1,100 @@
+"""``pkxyz sil``: the loop closed on a scenario, in one process."""
+
+import json
+import sys
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated
+
+import typer
+
+from hil.commands.run import Learn, Refresh, Replay, learning_of
+from hil.lanes.lane import Lane
+from hil.screen.choices import InProcessLane
+from hil.screen.figures import error_lines
+from hil.screen.first_run import say_if_compiling
+from hil.screen.progress import progress_bar
+from hil.screen.terminal import bad, faint, good, plain_table, say, screen
+from pkxyz_ctrl.config.files import ConfigError, find
+
+if TYPE_CHECKING:
+    from hil.runs.summary import Summary
+
+
+def sil(
+    scenario: Annotated[str, typer.Argument(help="A shipped scenario's name or a TOML file.")] = "raster",
+    in_process: Annotated[
+        InProcessLane, typer.Option("--lane", help="lockstep: over the simulated bus; fast: compiled, no frames.")
+    ] = InProcessLane.LOCKSTEP,
+    seed: Annotated[int | None, typer.Option(help="Instead of the scenario's.")] = None,
+    out: Annotated[Path | None, typer.Option(help="Folder to write; default: runs/<scenario>-<lane>-<n>.")] = None,
+    stage: Annotated[str | None, typer.Option(help="Name or file, instead of the scenario's.")] = None,
+    plant: Annotated[str | None, typer.Option(help="Name or file, instead of the scenario's.")] = None,
+    controller: Annotated[str | None, typer.Option(help="Name or file, instead of the scenario's.")] = None,
+    bus: Annotated[str | None, typer.Option(help="Name or file, instead of the scenario's.")] = None,
+    fault: Annotated[
+        list[str] | None,
+        typer.Option(metavar="TARGET:KIND@S[+S][,NAME=VALUE]", help="Such as sense.2:stuck@0.3+0.05; may be repeated."),
+    ] = None,
+    learn: Learn = False,
+    replay: Replay = None,
+    refresh: Refresh = None,
+    as_json: Annotated[bool, typer.Option("--json", help="Print the summary as JSON, and nothing else.")] = False,
+) -> None:
+    """Close the loop on a scenario; exit code 0 if its checks hold, 1 if not, 2 for bad input or a full disk, 130 if
+    interrupted.
+    """
+    lane = Lane(in_process.value)
+    find("scenarios", scenario)  # a typo is said before anything is compiled
+    say_if_compiling(quiet=as_json)
+    from hil.faults.fault import parse
+    from hil.runs.scenario import load_scenario
+
+    faults = [parse(text) for text in fault or ()]
+    learning = learning_of(learn, replay, refresh)
+    loaded = load_scenario(
+        scenario, seed=seed, stage=stage, plant=plant, controller=controller, bus=bus, faults=faults, learning=learning
+    )
+    from hil.pictures.run import draw
+    from hil.recording.recording import RecordingError
+    from hil.runs.run import require_bus, run_into
+    from hil.runs.run_folder import RunFolder, next_free
+    from pkxyz_ctrl.design.model.design_error import DesignError
+    from pkxyz_ctrl.loop.controller import StartUpError
+
+    require_bus(loaded, lane)
+    folder = RunFolder(out if out is not None else next_free(Path("runs"), loaded.config.name, lane))
+    try:
+        with progress_bar(f"{loaded.config.name}, {lane} lane", quiet=as_json) as tell:
+            summary = run_into(folder, loaded, lane, tell)
+        draw(folder, summary)
+    except RecordingError as error:
+        raise ConfigError(str(error)) from None
+    except (StartUpError, DesignError) as error:
+        print(f"pkxyz: {error}", file=sys.stderr)
+        raise typer.Exit(1) from None
+    if as_json:
+        print(json.dumps(summary.as_json() | {"folder": str(folder.path)}, allow_nan=False))
+    else:
+        _show(summary, folder.path)
+    raise typer.Exit(130 if summary.interrupted else 0 if summary.ok else 1)
+
+
+def _show(summary: "Summary", folder: Path) -> None:
+    from hil.runs.metrics import bound_words
+
+    table = plain_table("check", "value", "bound", "", left=("",))
+    for check in summary.checks:
+        value = "none" if check.value is None else f"{check.value:.4g}"
+        verdict = {True: good("holds"), False: bad("fails"), None: faint("no bus")}[check.ok]
+        table.add_row(check.name, value, bound_words(check), verdict)
+    speed = summary.loop.realtime_factor
+    pace = f", {speed:.1f} times real time" if speed is not None else ""
+    say(f"{summary.scenario}, {summary.lane} lane, seed {summary.seed}: {summary.rows.ticks} ticks{pace}")
+    screen().print(table)
+    for line in error_lines(summary.rows, summary.loop.errors_are_of):
+        say(line)
+    for fault in summary.loop.faults:
+        say(bad("fault"), f": {fault}")
+    if summary.interrupted:
+        say("interrupted: what was recorded until then is kept")
+    say(f"recording, frame log, config, summary and picture are in {folder}/")
