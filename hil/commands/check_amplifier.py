@@ -17,7 +17,9 @@ if TYPE_CHECKING:
     from hil.conformance.verdict import Line
     from pkxyz_ctrl.config.bus import BusConfig
 
-_STYLES = {"PASS": good, "FAIL": bad, "NOT TESTED": faint}
+_STYLES = {
+    "PASS": good, "UNSAFE": bad, "MEASURE": bad, "AGAINST CIA": bad, "OTHER CONTRACT": bad, "NOT TESTED": faint,
+}  # fmt: skip
 
 
 def check_amplifier(
@@ -29,7 +31,7 @@ def check_amplifier(
     out: Annotated[Path | None, typer.Option(help="Folder for conformance.md and conformance.json.")] = None,
     as_json: Annotated[bool, typer.Option("--json", help="Print JSON, and nothing else.")] = False,
 ) -> None:
-    """Conformance run for a CANopen amplifier; exit code 0 if no line fails, 1 if one does."""
+    """Conformance run for a CANopen amplifier; exit code 1 if it is unsafe here, or a voltmeter has to tell, else 0."""
     from hil.conformance import report
     from hil.conformance.run import run_all
     from pkxyz_ctrl.config.bus import BusConfig
@@ -47,8 +49,7 @@ def check_amplifier(
     if as_json:
         print(json.dumps(result))
     else:
-        counts = f"{result['passed']} passed, {result['failed']} failed, {result['not_tested']} not tested"
-        say(f"{counts}. {report.conclusion(result)}")
+        say(f"{report.counted(result)}. {report.conclusion(result)}")
     raise typer.Exit(0 if result["ok"] else 1)
 
 
@@ -76,9 +77,9 @@ def _talker(config: "BusConfig", eds: Path, allow_voltage: bool) -> "Iterator[Ta
 
 def _show(line: "Line") -> None:
     name = f"{line.group}: {line.name}"
-    say(_STYLES[line.verdict.value](f"{line.verdict.value:10}"), f" {name:45} {line.got}")
-    if line.verdict.value == "FAIL":
-        say(f"{'':10} {'expected':45} {line.expected}")
+    say(_STYLES[line.verdict.value](f"{line.verdict.value:14}"), f" {name:45} {line.got}")
+    if line.verdict.value not in ("PASS", "NOT TESTED"):
+        say(f"{'':14} {'expected':45} {line.expected} ({line.basis})")
 
 
 def _save(out: Path, name: str, text: str) -> None:

@@ -1,8 +1,18 @@
-"""How a check ends that does not pass: with what came instead, or with why it could not be made."""
+"""How a check ends that does not pass: with what came instead, what has to be measured, or why it was not made."""
 
 
 class DeviationError(Exception):
-    """The node did something else than expected; the text says what came."""
+    """The node did something else than expected; the text says what came. ``is_unsafe``: whatever the check is about,
+    this node must not be enabled.
+    """
+
+    def __init__(self, text: str, *, is_unsafe: bool = False) -> None:
+        super().__init__(text)
+        self.is_unsafe = is_unsafe
+
+
+class UndecidedError(Exception):
+    """What the node says of itself decides nothing; the text says what to measure, and what it must be."""
 
 
 class NotTestedError(Exception):

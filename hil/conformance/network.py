@@ -4,7 +4,7 @@ from itertools import pairwise
 
 from hil.conformance.deviation import DeviationError, NotTestedError, deviate_if
 from hil.conformance.talker import SETTLE_US, ZERO, Talker
-from hil.conformance.verdict import Check
+from hil.conformance.verdict import OUR_CONTRACT, Check
 from pkxyz_ctrl.can import cob_id
 from pkxyz_ctrl.can.cob_id import NmtCommand, NmtState
 
@@ -57,6 +57,7 @@ def _state(talker: Talker) -> int | None:
 
 def _beating_node(talker: Talker) -> None:
     talker.reset()
+    talker.nmt(NmtCommand.PRE_OPERATIONAL)  # where a node that starts by itself is not
     talker.write(0x1017, 0, _PERIOD_MS, 2)
     if _state(talker) is None:
         raise NotTestedError("no heartbeats, so no state is seen")
@@ -64,8 +65,13 @@ def _beating_node(talker: Talker) -> None:
 
 def _states(talker: Talker) -> str:
     _beating_node(talker)
+    talker.reset()
+    talker.write(0x1017, 0, _PERIOD_MS, 2)
+    booted = _state(talker)
+    if booted not in (NmtState.PRE_OPERATIONAL, NmtState.OPERATIONAL):
+        raise DeviationError(f"after boot-up: {_NAMES.get(booted, booted) if booted is not None else 'silent'}")
     path = (
-        (None, NmtState.PRE_OPERATIONAL),
+        (NmtCommand.PRE_OPERATIONAL, NmtState.PRE_OPERATIONAL),
         (NmtCommand.START, NmtState.OPERATIONAL),
         (NmtCommand.STOP, NmtState.STOPPED),
         (NmtCommand.PRE_OPERATIONAL, NmtState.PRE_OPERATIONAL),
@@ -75,20 +81,20 @@ def _states(talker: Talker) -> str:
     )
     deviations = []
     for command, expected in path:
-        if command is not None:
-            talker.nmt(command)
+        talker.nmt(command)
         state = _state(talker)
         if state != expected:
-            after = command.name.lower().replace("_", "-") if command else "boot-up"
+            after = command.name.lower().replace("_", "-")
             deviations.append(f"after {after}: {_NAMES.get(state, state) if state is not None else 'silent'}")
     deviate_if(deviations)
-    return "boot-up, " + ", ".join(_NAMES[state] for _, state in path)
+    by_itself = " by itself (CiA 302-2, object 1F80h)" if booted == NmtState.OPERATIONAL else ""
+    return f"boot-up, {_NAMES[booted]}{by_itself}, " + ", ".join(_NAMES[state] for _, state in path)
 
 
 def _addressing(talker: Talker) -> str:
     _beating_node(talker)
     other = talker.node_id % 127 + 1
-    deviations = []
+    deviations: list[str] = []
     for node_id, expected in ((other, NmtState.PRE_OPERATIONAL), (0, NmtState.OPERATIONAL)):
         talker.nmt(NmtCommand.START, node_id)
         if (state := _state(talker)) != expected:
@@ -181,7 +187,8 @@ def _formats(talker: Talker) -> str:
         mark = talker.mark()
         talker.send(cob_id.SDO_REQUEST_BASE + talker.node_id, bytes.fromhex("40 00 10 00 00 00 00 00"), fd=fd)
         talker.first(cob_id.SDO_RESPONSE_BASE + talker.node_id, talker.driver.sdo_timeout_us)
-        frames = [frame for _, frame in talker.heard[mark:]]
+        answers = cob_id.SDO_RESPONSE_BASE + talker.node_id  # some adapters return our own frames, too
+        frames = [frame for _, frame in talker.heard[mark:] if frame.can_id == answers]
         asked = "FD" if fd else "classic"
         if not frames:
             deviations.append(f"{asked} request: no answer")
@@ -210,25 +217,28 @@ def _extended(talker: Talker) -> str:
 
 
 _A, _B, _C = "boot-up and NMT", "heartbeat", "frames"
+_NMT, _STATES, _ERRORS = "CiA 301, 7.2.8 (NMT)", "CiA 301, 7.3.2 (NMT states)", "CiA 301, 7.2.8 (heartbeat)"
 CHECKS = (
-    Check(_A, "boot-up", "one frame, 00, within the boot time-out after NMT reset node", _boot_up),
+    Check(_A, "boot-up", "one frame, 00, within the boot time-out after NMT reset node", _NMT, _boot_up),
     Check(
-        _A, "communication reset", "communication objects at defaults, application objects kept", _communication_reset
+        _A, "communication reset", "communication objects at defaults, application objects kept", _STATES,
+        _communication_reset,
     ),
-    Check(_A, "states", "pre-operational after boot-up, then as commanded", _states),
-    Check(_A, "addressing", "commands to other nodes are ignored, those to node 0 obeyed", _addressing),
-    Check(_A, "SDO by state", "answered in pre-operational and operational, not in stopped", _sdo_by_state),
-    Check(_A, "PDO by state", "sense PDOs in operational only", _pdo_by_state),
+    Check(_A, "states", "pre-operational or by itself operational after boot-up, then as commanded", _STATES, _states),
+    Check(_A, "addressing", "commands to other nodes are ignored, those to node 0 obeyed", _NMT, _addressing),
+    Check(_A, "SDO by state", "answered in pre-operational and operational, not in stopped", _STATES, _sdo_by_state),
+    Check(_A, "PDO by state", "sense PDOs in operational only", _STATES, _pdo_by_state),
     Check(
-        _B,
-        "heartbeat period",
-        f"0x1017 = {_PERIOD_MS} ms: every {_PERIOD_MS // 2} to {_PERIOD_MS * 1.1:g} ms",
-        _heartbeat_period,
+        _B, "heartbeat period", f"0x1017 = {_PERIOD_MS} ms: every {_PERIOD_MS // 2} to {_PERIOD_MS * 1.1:g} ms",
+        _ERRORS, _heartbeat_period,
     ),
     Check(
-        _B, "heartbeat in the loop", "with SYNC at rate, never later than the driver's time-out", _heartbeat_in_the_loop
+        _B, "heartbeat in the loop", "with SYNC at rate, never later than the driver's time-out", OUR_CONTRACT,
+        _heartbeat_in_the_loop,
     ),
-    Check(_B, "heartbeat off", "0x1017 = 0: none", _heartbeat_off),
-    Check(_C, "formats", "on an FD bus, FD and classic requests are heard and answers are FD", _formats),
-    Check(_C, "29-bit identifiers", "not taken for those with 11 bits", _extended),
-)
+    Check(_B, "heartbeat off", "0x1017 = 0: none", _ERRORS, _heartbeat_off),
+    Check(
+        _C, "formats", "on an FD bus, FD and classic requests are heard and answers are FD", OUR_CONTRACT, _formats
+    ),
+    Check(_C, "29-bit identifiers", "not taken for those with 11 bits", "CiA 301, 7.3.3 (identifiers)", _extended),
+)  # fmt: skip

@@ -2,10 +2,10 @@
 
 from collections.abc import Callable
 
-from hil.conformance.deviation import DeviationError, NotTestedError, deviate_if
+from hil.conformance.deviation import DeviationError, NotTestedError, UndecidedError, deviate_if, first_few
 from hil.conformance.process import TEST_COUNTS
 from hil.conformance.talker import SETTLE_US, ZERO, Talker
-from hil.conformance.verdict import Check
+from hil.conformance.verdict import OUR_CONTRACT, SAFETY, Check
 from pkxyz_ctrl.can.cob_id import NmtCommand
 from pkxyz_ctrl.can.codec import Counts
 
@@ -25,6 +25,14 @@ def _energised(talker: Talker) -> None:
         raise NotTestedError(f"0x6411 reads {outputs} after {TEST_COUNTS} was sent")
 
 
+def _measure_if(found: list[str]) -> None:
+    """0x6411 may hold what was written last and not what is at the terminals (CiA 401 leaves it open): it decides
+    nothing.
+    """
+    if found:
+        raise UndecidedError(f"{first_few(found)}: hold a voltmeter to the terminals; 0 V there is needed where 0 is")
+
+
 def _after_reset(talker: Talker) -> str:
     if talker.allow_voltage:
         talker.operational()
@@ -33,9 +41,9 @@ def _after_reset(talker: Talker) -> str:
     for command in (NmtCommand.RESET_COMMUNICATION, NmtCommand.RESET_NODE):
         talker.reset(command)
         if (outputs := talker.outputs()) != ZERO:
-            deviations.append(f"after {command.name.lower().replace('_', ' ')}: {outputs}")
-    deviate_if(deviations)
-    return "0, 0, 0"
+            deviations.append(f"after {command.name.lower().replace('_', ' ')} 0x6411 reads {outputs}")
+    _measure_if(deviations)
+    return "0x6411 reads 0, 0, 0"
 
 
 def _error_objects(talker: Talker) -> str:
@@ -64,15 +72,17 @@ def _heartbeat_lost(talker: Talker) -> str:
     talker.run(2000 * limit_ms + SETTLE_US)
     frames = talker.since(mark, talker.emergency_id)
     times_us = [t_us for t_us, data in frames if data[:2] == b"\x30\x81"]
-    if not times_us:
-        raise DeviationError(f"no EMCY 0x8130 within {2 * limit_ms} ms")
-    after_ms = (times_us[0] - last_us) / 1000
     state = [data for _, data in talker.since(mark, talker.heartbeat_id)][-1:]
+    if not times_us:
+        told = f"no EMCY 0x8130 within {2 * limit_ms} ms"
+        raise DeviationError(told, is_unsafe=state != [b"\x7f"])
+    after_ms = (times_us[0] - last_us) / 1000
     told = (
         f"EMCY 0x8130 {after_ms:.2f} ms after our last heartbeat, then state {state[0].hex() if state else 'unknown'}"
     )
-    if not limit_ms - 1 <= after_ms <= limit_ms + _HEARTBEAT_TOLERANCE_MS or (state and state[0] != b"\x7f"):
-        raise DeviationError(told)
+    stays = bool(state) and state[0] != b"\x7f"
+    if not limit_ms - 1 <= after_ms <= limit_ms + _HEARTBEAT_TOLERANCE_MS or stays:
+        raise DeviationError(told, is_unsafe=stays)
     return told
 
 
@@ -81,8 +91,8 @@ def _heartbeat_outputs(talker: Talker) -> str:
     talker.beating = False
     talker.run(1000 * (talker.driver.controller_heartbeat_timeout_ms + _HEARTBEAT_TOLERANCE_MS))
     if (outputs := talker.outputs()) != ZERO:
-        raise DeviationError(f"0x6411 {outputs}")
-    return "0, 0, 0"
+        _measure_if([f"after our heartbeat ended 0x6411 reads {outputs}"])
+    return "0x6411 reads 0, 0, 0"
 
 
 def _leaving(talker: Talker) -> str:
@@ -92,9 +102,9 @@ def _leaving(talker: Talker) -> str:
         talker.nmt(command)
         talker.nmt(NmtCommand.PRE_OPERATIONAL)  # where SDO is answered
         if (outputs := talker.outputs()) != ZERO:
-            deviations.append(f"after {command.name.lower().replace('_', '-')}: 0x6411 {outputs}")
-    deviate_if(deviations)
-    return "0, 0, 0"
+            deviations.append(f"after {command.name.lower().replace('_', '-')} 0x6411 reads {outputs}")
+    _measure_if(deviations)
+    return "0x6411 reads 0, 0, 0"
 
 
 def _error_value(talker: Talker) -> str:
@@ -105,7 +115,7 @@ def _error_value(talker: Talker) -> str:
     outputs, expected = talker.outputs(), (_OTHER[0], TEST_COUNTS[1], 0)
     talker.reset()
     if outputs != expected:
-        raise DeviationError(f"0x6411 {outputs}, expected {expected}")
+        _measure_if([f"0x6411 reads {outputs}, error modes and values say {expected}"])
     return f"0x6411 {outputs}"
 
 
@@ -125,8 +135,10 @@ def _drive_missing(talker: Talker) -> str:
     told = f"0x6411 {before} before SYNC {limit} without drive PDO, {after} after it, EMCY " + (
         ", ".join(f"0x{code:04X}" for code in codes) or "none"
     )
-    if before != TEST_COUNTS or after != ZERO or 0x8250 not in codes:
+    if before != TEST_COUNTS or 0x8250 not in codes:
         raise DeviationError(told)
+    if after != ZERO:
+        _measure_if([told])
     return told
 
 
@@ -188,15 +200,24 @@ def _zeroed_first(perform: Callable[[Talker], str]) -> Callable[[Talker], str]:
 
 
 _A, _B = "outputs", "outputs, with voltage"
+_MODES, _PDO = "CiA 401, objects 6443h and 6444h", "CiA 301, 7.2.2 (PDO)"
 CHECKS = (
-    Check(_A, "after reset", "0x6411 reads 0 after either reset", _zeroed_first(_after_reset)),
-    Check(_A, "error mode and value", "0x6443 and 0x6444 keep what is written", _error_objects),
-    Check(_A, "heartbeat consumer", "when ours stops: EMCY 0x8130 in time, pre-operational", _heartbeat_lost),
-    Check(_B, "heartbeat lost", "outputs at their error value, 0", _zeroed_first(_heartbeat_outputs)),
-    Check(_B, "leaving operational", "outputs at their error value, 0", _zeroed_first(_leaving)),
-    Check(_B, "error value", "mode 1 takes 0x6444, mode 0 keeps what is there", _zeroed_first(_error_value)),
-    Check(_B, "drive PDO missing", "after 0x2010 SYNCs without: outputs 0, EMCY 0x8250", _zeroed_first(_drive_missing)),
-    Check(_B, "applied at SYNC", "a drive PDO takes effect at the next SYNC", _zeroed_first(_at_sync)),
-    Check(_B, "drive by SDO", "with protection, counts other than 0 are refused", _zeroed_first(_by_sdo)),
-    Check(_B, "scaling", "0x6411 reads what was sent, comb by comb", _zeroed_first(_scaling)),
+    Check(_A, "after reset", "0x6411 reads 0 after either reset", SAFETY, _zeroed_first(_after_reset)),
+    Check(_A, "error mode and value", "0x6443 and 0x6444 keep what is written", _MODES, _error_objects),
+    Check(
+        _A, "heartbeat consumer", "when ours stops: EMCY 0x8130 in time, pre-operational", OUR_CONTRACT, _heartbeat_lost
+    ),
+    Check(_B, "heartbeat lost", "outputs at their error value, 0", SAFETY, _zeroed_first(_heartbeat_outputs)),
+    Check(_B, "leaving operational", "outputs at their error value, 0", SAFETY, _zeroed_first(_leaving)),
+    Check(_B, "error value", "mode 1 takes 0x6444, mode 0 keeps what is there", _MODES, _zeroed_first(_error_value)),
+    Check(
+        _B,
+        "drive PDO missing",
+        "after 0x2010 SYNCs without: outputs 0, EMCY 0x8250",
+        OUR_CONTRACT,
+        _zeroed_first(_drive_missing),
+    ),
+    Check(_B, "applied at SYNC", "a drive PDO takes effect at the next SYNC", _PDO, _zeroed_first(_at_sync)),
+    Check(_B, "drive by SDO", "with protection, counts other than 0 are refused", OUR_CONTRACT, _zeroed_first(_by_sdo)),
+    Check(_B, "scaling", "0x6411 reads what was sent, comb by comb", OUR_CONTRACT, _zeroed_first(_scaling)),
 )

@@ -9,7 +9,9 @@ from hil.conformance.verdict import Line, Verdict
 
 
 def as_json(talker: Talker, eds: str, lines: list[Line]) -> dict[str, Any]:
-    """Everything, as plain data. ``ok``: no line failed; ``complete``: none was left out either."""
+    """Everything, as plain data. ``ok``: nothing unsafe was seen, and nothing is left that only a voltmeter can tell;
+    ``complete``: no line was left out.
+    """
     counts = Counter(line.verdict for line in lines)
     return {
         "bus": talker.bus.name,
@@ -18,10 +20,13 @@ def as_json(talker: Talker, eds: str, lines: list[Line]) -> dict[str, Any]:
         "node_id": talker.node_id,
         "eds": eds,
         "allow_voltage": talker.allow_voltage,
-        "ok": counts[Verdict.FAIL] == 0,
+        "ok": counts[Verdict.UNSAFE] + counts[Verdict.MEASURE] == 0,
         "complete": counts[Verdict.NOT_TESTED] == 0,
         "passed": counts[Verdict.PASS],
-        "failed": counts[Verdict.FAIL],
+        "unsafe": counts[Verdict.UNSAFE],
+        "against_cia": counts[Verdict.AGAINST_CIA],
+        "other_contract": counts[Verdict.OTHER_CONTRACT],
+        "to_measure": counts[Verdict.MEASURE],
         "not_tested": counts[Verdict.NOT_TESTED],
         "frames_heard": len(talker.heard),
         "lines": [
@@ -30,6 +35,7 @@ def as_json(talker: Talker, eds: str, lines: list[Line]) -> dict[str, Any]:
                 "name": line.name,
                 "verdict": line.verdict.value,
                 "expected": line.expected,
+                "basis": line.basis,
                 "got": line.got,
             }
             for line in lines
@@ -39,11 +45,29 @@ def as_json(talker: Talker, eds: str, lines: list[Line]) -> dict[str, Any]:
 
 def conclusion(report: dict[str, Any]) -> str:
     """One sentence for the person who wants to enable it."""
-    if not report["ok"]:
-        return "Do not enable this amplifier: a line failed."
+    if report["unsafe"]:
+        return "Do not enable this amplifier: it is unsafe here."
+    if report["to_measure"]:
+        return "Do not enable this amplifier before a voltmeter has said what its own words do not."
+    others = report["against_cia"] + report["other_contract"]
+    told = []
+    if others:
+        told.append(
+            "Nothing unsafe was seen, but it is not the amplifier of our contract: `pkxyz run` may refuse it, and each "
+            "protection that deviates is missing."
+        )
     if not report["complete"]:
-        return "Nothing failed, but lines were not tested; enable it only if you know why each of them may be left out."
-    return "All lines pass."
+        told.append("Lines were not tested: enable it only if you know why each of them may be left out.")
+    return " ".join(told) or "All lines pass."
+
+
+def counted(report: dict[str, Any]) -> str:
+    """How many lines came out how."""
+    return (
+        f"{report['passed']} passed, {report['unsafe']} unsafe, {report['to_measure']} to measure, "
+        f"{report['against_cia']} against CiA, {report['other_contract']} other than our contract, "
+        f"{report['not_tested']} not tested"
+    )
 
 
 def as_markdown(report: dict[str, Any]) -> str:
@@ -54,18 +78,17 @@ def as_markdown(report: dict[str, Any]) -> str:
         f"- bus {report['bus']}: {report['interface']} {report['channel']}, node {report['node_id']}",
         f"- EDS: {report['eds']}",
         f"- counts other than 0: {'allowed' if report['allow_voltage'] else 'not allowed (--allow-voltage)'}",
-        f"- {report['passed']} passed, {report['failed']} failed, {report['not_tested']} not tested; "
-        f"{report['frames_heard']} frames heard",
+        f"- {counted(report)}; {report['frames_heard']} frames heard",
         "",
         f"**{conclusion(report)}**",
     ]
     for group, lines in groupby(report["lines"], key=lambda line: line["group"]):
-        text += ["", f"## {group}", "", "| line | verdict | expected | what came |", "|---|---|---|---|"]
+        text += ["", f"## {group}", "", "| line | verdict | expected | by | what came |", "|---|---|---|---|---|"]
         text += [" | ".join(("|", *(_cell(line[key]) for key in _COLUMNS), "|")).strip() for line in lines]
     return "\n".join(text).replace("| |", "|") + "\n"
 
 
-_COLUMNS = ("name", "verdict", "expected", "got")
+_COLUMNS = ("name", "verdict", "expected", "basis", "got")
 
 
 def _cell(text: str) -> str:

@@ -14,7 +14,9 @@ def conformance(talker: Talker, checks: tuple[Check, ...] = CHECKS) -> Iterator[
     silent = False
     for check in checks:
         if silent:
-            yield Line(check.group, check.name, Verdict.NOT_TESTED, check.expected, "the node does not answer SDO")
+            yield Line(
+                check.group, check.name, Verdict.NOT_TESTED, check.expected, check.basis, "the node does not answer SDO"
+            )
             continue
         line = judge(check, talker)
         silent = check is objects.ANSWERS and line.verdict is not Verdict.PASS

@@ -47,6 +47,15 @@ def download_request(index: int, subindex: int, data: bytes) -> bytes:
     return struct.pack("<BHB", 0x23 | (4 - len(data)) << 2, index, subindex) + data.ljust(4, b"\0")
 
 
+def is_answer(request: bytes, reply: bytes) -> bool:
+    """Whether ``reply`` can be the one to ``request``: initiated transfers and their aborts name the object."""
+    command, is_abort = request[0] >> 5, reply[0] == 0x80
+    if command in (1, 2):
+        expected = 3 if command == 1 else 2
+        return request[1:4] == reply[1:4] and (is_abort or reply[0] >> 5 == expected)
+    return is_abort or reply[0] >> 5 == 0 if command == 3 else True
+
+
 def read(exchange: Exchange, index: int, subindex: int) -> Outcome:
     """Upload of an object of any length."""
     head = struct.pack("<HB", index, subindex)

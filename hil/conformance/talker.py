@@ -3,7 +3,7 @@
 from collections.abc import Callable
 
 from hil.conformance import sdo_client
-from hil.conformance.deviation import DeviationError
+from hil.conformance.deviation import UndecidedError
 from hil.conformance.eds import Variable
 from hil.conformance.sdo_client import Outcome
 from pkxyz_ctrl.can import cob_id
@@ -16,6 +16,9 @@ from pkxyz_ctrl.config.bus import BusConfig
 from pkxyz_ctrl.config.files import ConfigError
 from pkxyz_ctrl.loop.runtime import Clock, Port
 
+_LATE_US = 500  # less is not worth to be called late; at slow rates, a quarter of a period
+_READ_ON = 64  # frames that wait already, when the time is over
+_LATE_ANSWERS_US = 10  # times the time-out of an answer: how long one is waited for that must not be taken for the next
 SETTLE_US = 5_000  # for a node to take note of a command; also longer than the usual EMCY inhibit time
 ZERO: Counts = (0, 0, 0)
 SAMPLE_CYCLES = 500  # of which distributions are made: p99 is then the fifth from the top
@@ -66,6 +69,7 @@ class Talker:
         self.beating = False
         self.drive_counter = 0
         self._sync_counter = 0
+        self.late_us = 0
         self.last_beat_us = 0
         self._beat_us = 0
 
@@ -74,6 +78,11 @@ class Talker:
     @property
     def now_us(self) -> int:
         return self._clock.now_us
+
+    @property
+    def was_late(self) -> bool:
+        """Whether this side kept its own times badly since ``late_us`` was set to 0."""
+        return self.late_us > max(_LATE_US, self.bus.period_us // 4)
 
     def send(self, can_id: int, data: bytes, *, extended: bool = False, fd: bool | None = None) -> None:
         """One frame in the format of the bus, or classic with ``fd=False``."""
@@ -97,6 +106,7 @@ class Talker:
         return len(self.heard)
 
     def _listen(self, deadline_us: int, wanted: int | None) -> tuple[int, Frame] | None:
+        read_on = _READ_ON
         while True:
             self._beat_if_due()
             until_us = min(deadline_us, self._beat_us) if self.beating else deadline_us
@@ -106,11 +116,14 @@ class Talker:
                 self.heard.append(entry)
                 if frame.can_id == wanted and _is_base(frame):
                     return entry
-            elif self.now_us >= deadline_us:
+                read_on -= self.now_us > deadline_us  # on a flooded bus there is always one more
+            if (frame is None and self.now_us >= deadline_us) or read_on == 0:
+                self.late_us = max(self.late_us, self.now_us - deadline_us)
                 return None
 
     def _beat_if_due(self) -> None:
         if self.beating and self.now_us >= self._beat_us:
+            self.late_us = max(self.late_us, self.now_us - self._beat_us)
             self.last_beat_us = self.now_us
             self._beat_us = self.last_beat_us + 1000 * self.driver.controller_heartbeat_period_ms
             self.send(cob_id.HEARTBEAT_BASE + self.driver.controller_node_id, b"\x05")
@@ -118,10 +131,20 @@ class Talker:
     # -- services ----------------------------------------------------------------------------------------------------
 
     def exchange(self, request: bytes) -> bytes | None:
-        """One SDO request and its reply; None if none came within the configured time."""
+        """One SDO request and its reply; None if none came within the configured time.
+
+        A reply that is about another object is an earlier one's, and passed over; so is one that comes too late.
+        """
         self.send(cob_id.SDO_REQUEST_BASE + self.node_id, request)
-        reply = self.first(cob_id.SDO_RESPONSE_BASE + self.node_id, self.driver.sdo_timeout_us)
-        return reply[1].data if reply is not None and len(reply[1].data) == 8 else None
+        replies, timeout_us = cob_id.SDO_RESPONSE_BASE + self.node_id, self.driver.sdo_timeout_us
+        end_us = self.now_us + timeout_us
+        while (reply := self.first(replies, max(0, end_us - self.now_us))) is not None:
+            if len(reply[1].data) != 8:
+                return None
+            if sdo_client.is_answer(request, reply[1].data):
+                return reply[1].data
+        self.first(replies, _LATE_ANSWERS_US * timeout_us)
+        return None
 
     def read(self, index: int, subindex: int) -> Outcome:
         return sdo_client.read(self.exchange, index, subindex)
@@ -149,6 +172,7 @@ class Talker:
     def operational(self) -> None:
         """From reset to operational as our driver does it. What it could not write, the line on configuration tells."""
         self.reset()
+        self.nmt(NmtCommand.PRE_OPERATIONAL)  # a node may start by itself (CiA 302-2, object 1F80h)
         unhurried = self.driver.model_copy(update={"drive_timeout_ms": OUR_TIMEOUT_MAX_MS})  # SDO reads come in between
         for step in configuration_steps(unhurried):
             if step.write and step.value is not None:
@@ -191,10 +215,10 @@ class Talker:
         return [int.from_bytes(data[:2], "little") for _, data in self.since(mark, self.emergency_id) if len(data) == 8]
 
     def outputs(self) -> Counts:
-        """0x6411 as the node tells it. Raises DeviationError if it does not."""
+        """0x6411 as the node tells it. Raises UndecidedError if it does not."""
         outcomes = [self.read(0x6411, comb) for comb in (1, 2, 3)]
         if silent := next((outcome for outcome in outcomes if not outcome.ok), None):
-            raise DeviationError(f"0x6411 cannot be read: {silent.text}")
+            raise UndecidedError(f"0x6411 cannot be read ({silent.text}): hold a voltmeter to the terminals")
         a, b, c = (outcome.unsigned for outcome in outcomes)
         return a, b, c
 

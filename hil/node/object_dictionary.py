@@ -52,6 +52,7 @@ class Abort(IntEnum):
     VALUE_RANGE = 0x06090030
     LOCAL_CONTROL = 0x08000021
     DEVICE_STATE = 0x08000022
+    NO_DATA = 0x08000024
 
 
 class SdoAbortError(Exception):

@@ -32,7 +32,13 @@ class NodeObjects:
         entry = self._od.entry(index, subindex)
         entry.check_readable()
         self._refresh(index)
+        if index == 0x1003 and subindex > self._count(index):
+            raise SdoAbortError(Abort.NO_DATA)  # CiA 301, 7.5.2, object 1003h: there is no such error
         return entry.encode()
+
+    def _count(self, index: int) -> int:
+        count = self._od.entry(index, 0).value
+        return count if isinstance(count, int) else 0
 
     def check_download(self, index: int, subindex: int, length: int | None) -> None:
         """What can be refused before the data are there. ``length`` in bytes, None if the client does not say."""

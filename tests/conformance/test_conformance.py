@@ -2,17 +2,26 @@
 
 import can
 import pytest
-from conformance_defects import DEFECTS, NoHeartbeatConsumer, Silent, StillPlant
+from conformance_defects import (
+    DEFECTS,
+    EverySenseLate,
+    NoHeartbeatConsumer,
+    SelfStarting,
+    Silent,
+    StillPlant,
+    WaitsOnce,
+)
 
 from hil.bus.clock import Lockstep
 from hil.bus.published_wires import publish
 from hil.bus.wire import Wire
 from hil.conformance import report
+from hil.conformance.deviation import DeviationError
 from hil.conformance.eds import read_eds
 from hil.conformance.run import CHECKS, run_all
 from hil.conformance.simulated import EDS, simulated_talker
 from hil.conformance.talker import Talker
-from hil.conformance.verdict import Line, Verdict
+from hil.conformance.verdict import DEVIATIONS, OUR_CONTRACT, Check, Line, Verdict, judge
 from hil.node.amplifier import AmplifierNode
 from pkxyz_ctrl.can.codec import ProcessCodec
 from pkxyz_ctrl.can.frame import Frame
@@ -34,11 +43,15 @@ def named(lines: list[Line], verdict: Verdict) -> list[str]:
     return [f"{line.group}: {line.name}" for line in lines if line.verdict is verdict]
 
 
+def deviating(lines: list[Line]) -> list[str]:
+    return [f"{line.group}: {line.name}" for line in lines if line.verdict in DEVIATIONS]
+
+
 @pytest.mark.parametrize("bus_name", ["fd_5k", "classic_2k"])
 def test_our_own_node_passes(bus_name: str) -> None:
     talker = talk_to(AmplifierNode, bus=load("buses", bus_name, BusConfig))
     lines = run_all(talker)
-    assert named(lines, Verdict.FAIL) == []
+    assert deviating(lines) == []
     left_out = {"fd_5k": [], "classic_2k": ["frames: formats", "drive PDO: too long"]}[bus_name]
     assert named(lines, Verdict.NOT_TESTED) == left_out
     assert len(lines) == len(CHECKS)
@@ -50,7 +63,7 @@ def test_a_plain_cia_401_module_passes_what_applies_to_it() -> None:
     driver = can_config.driver.model_copy(update={"protection": False})
     plain = BUS.model_copy(update={"can": can_config.model_copy(update={"driver": driver})})
     lines = run_all(talk_to(AmplifierNode, bus=plain))
-    assert named(lines, Verdict.FAIL) == []
+    assert deviating(lines) == []
     assert set(named(lines, Verdict.NOT_TESTED)) == {
         "sense PDO: alive counter",
         "sense PDO: CRC",
@@ -67,9 +80,58 @@ def test_a_defect_shows_on_its_line_and_no_other(defect: type[AmplifierNode]) ->
     # Without a heartbeat consumer the voltage stays as well, which would be a second line.
     talker = talk_to(defect, allow_voltage=defect is not NoHeartbeatConsumer)
     lines = run_all(talker)
-    assert named(lines, Verdict.FAIL) == [defect.__doc__]
+    assert deviating(lines) == [defect.__doc__]
     if defect is Silent:
         assert len(named(lines, Verdict.NOT_TESTED)) == len(CHECKS) - 1
+
+
+KINDS = {
+    Verdict.UNSAFE: {
+        "drive PDO: wrong CRC", "drive PDO: wrong alive counter", "drive PDO: late",
+        "drive PDO: negative count", "outputs: heartbeat consumer",
+    },
+    Verdict.MEASURE: {
+        "outputs: after reset", "outputs, with voltage: heartbeat lost", "outputs, with voltage: leaving operational",
+        "outputs, with voltage: error value",
+    },
+    Verdict.OTHER_CONTRACT: {
+        "identity: identity", "object dictionary: configuration", "frames: formats", "sense PDO: latency",
+        "sense PDO: alive counter", "sense PDO: CRC", "SYNC: SYNC counter", "drive PDO: too long",
+        "outputs, with voltage: drive by SDO", "outputs, with voltage: scaling",
+        "outputs, with voltage: drive PDO missing",
+    },
+}  # fmt: skip
+
+
+@pytest.mark.parametrize("defect", DEFECTS, ids=lambda defect: defect.__name__)
+def test_a_deviation_is_of_its_kind(defect: type[AmplifierNode]) -> None:
+    """Unsafe: a frame that must be refused is applied, or nobody notices that we are gone. To be measured: where the
+    node's own word on its outputs is all there is. All others are against a clause of CiA's, which the line names.
+    """
+    talker = talk_to(defect)
+    check = next(check for check in CHECKS if f"{check.group}: {check.name}" == defect.__doc__)
+    line = judge(check, talker)
+    expected = next((kind for kind, names in KINDS.items() if defect.__doc__ in names), Verdict.AGAINST_CIA)
+    assert line.verdict is expected, line
+    if expected is Verdict.AGAINST_CIA:
+        assert line.basis.startswith("CiA")
+
+
+def test_a_node_that_starts_by_itself_passes() -> None:
+    assert deviating(run_all(talk_to(SelfStarting))) == []
+
+
+def test_answers_that_all_come_too_late_are_no_fast_answers() -> None:
+    """Each 7 ms after its SYNC, 35 periods: not dropped, and not taken for a very fast answer to a later one."""
+    line = judge(next(check for check in CHECKS if check.name == "latency"), talk_to(EverySenseLate))
+    assert line.verdict is Verdict.OTHER_CONTRACT
+    words = line.got.replace(",", "").split()
+    assert 7000 <= int(words[words.index("minimum") + 1]) <= int(words[words.index("maximum") + 1]) <= 7200
+
+
+def test_an_answer_that_comes_too_late_is_not_taken_for_the_next_one() -> None:
+    lines = run_all(talk_to(WaitsOnce))
+    assert deviating(lines) == [WaitsOnce.__doc__]
 
 
 def test_every_line_is_made_to_fail_by_some_defect() -> None:
@@ -102,13 +164,87 @@ class Spy:
         return self._port.unsent()  # type: ignore[attr-defined, no-any-return]
 
 
+class Echo(Spy):
+    """An adapter that returns what it has sent, as with ``receive_own_messages``."""
+
+    def receive(self, deadline_us: int) -> Frame | None:
+        return self.sent.pop(0) if self.sent else super().receive(deadline_us)
+
+
+def test_our_own_frames_are_no_answers() -> None:
+    talker = talk_to(AmplifierNode)
+    talker._port = Echo(talker._port)
+    assert deviating(run_all(talker)) == []
+
+
+class Endless:
+    """A port on a flooded bus: each read costs 10 us and brings somebody else's frame."""
+
+    def __init__(self, talker: Talker) -> None:
+        self._clock, self.reads = talker._clock, 0
+
+    def send(self, frame: Frame) -> object:
+        return None
+
+    def receive(self, deadline_us: int) -> Frame | None:
+        self.reads += 1
+        assert self.reads < 100_000
+        self._clock.spend(10)
+        return Frame(0x123, b"")
+
+    def unsent(self) -> int:
+        return 0
+
+
+def test_on_a_flooded_bus_listening_ends() -> None:
+    talker = talk_to(AmplifierNode)
+    talker._port = Endless(talker)
+    begin_us = talker.now_us
+    talker.run(5000)
+    assert 5000 <= talker.now_us - begin_us <= 6000
+    assert talker.first(talker.sense_id, 5000) is None
+
+
+def test_a_tester_that_is_late_itself_blames_nobody() -> None:
+    """Made again, three times in all; a check that is about no times is believed at once, and so is one that passes."""
+    talker, made = talk_to(AmplifierNode), []
+
+    def late_until(attempt: int, is_timed: bool = True) -> Line:
+        made.clear()
+
+        def perform(talker: Talker) -> str:
+            made.append(1)
+            talker.late_us = 30_000 if len(made) <= attempt else 0
+            raise DeviationError("EMCY 0x8130")
+
+        return judge(Check("g", "n", "e", OUR_CONTRACT, perform, is_timed), talker)
+
+    assert (late_until(0).verdict, len(made)) == (Verdict.OTHER_CONTRACT, 1)
+    assert (late_until(2).verdict, len(made)) == (Verdict.OTHER_CONTRACT, 3)
+    line = late_until(3)
+    assert (line.verdict, len(made)) == (Verdict.NOT_TESTED, 3)
+    assert "30.0 ms late" in line.got
+    assert (late_until(3, is_timed=False).verdict, len(made)) == (Verdict.OTHER_CONTRACT, 1)
+
+
+def test_lateness_is_that_of_waits_and_of_our_heartbeats() -> None:
+    talker = talk_to(AmplifierNode)
+    talker.operational()
+    talker.cycles(10)
+    assert talker.late_us == 0
+    talker._clock.spend(45_000)  # held up; our heartbeat is due every 20 ms
+    talker.run(100)
+    assert talker.late_us >= 25_000
+    assert talker.was_late
+
+
 def test_without_permission_no_frame_asks_for_a_voltage() -> None:
     """Neither a drive PDO, however wrong, nor an SDO write to outputs or error values."""
     talker = talk_to(AmplifierNode, allow_voltage=False)
     spy = Spy(talker._port)
     talker._port = spy
     lines = run_all(talker)
-    assert named(lines, Verdict.FAIL) == []
+    assert deviating(lines) == []
     drives = [frame.data for frame in spy.sent if frame.can_id == 0x30A]
     assert len(drives) > SAMPLE_CYCLES
     assert all(not any(data[:6]) for data in drives)
@@ -206,4 +342,4 @@ def test_another_eds_or_none() -> None:
 def test_the_doc_lists_the_lines_that_are_made() -> None:
     text = (EDS.parents[1] / "docs" / "do" / "conformance.md").read_text(encoding="utf-8")
     listed = [line for line in text.partition("## Lines")[2].partition("\n## ")[0].splitlines() if line[:2] == "| "][1:]
-    assert listed == [f"| {check.group} | {check.name} | {check.expected} |" for check in CHECKS]
+    assert listed == [f"| {check.group} | {check.name} | {check.expected} | {check.basis} |" for check in CHECKS]

@@ -1,14 +1,13 @@
 """`pkxyz check-amplifier` on a real bus: our own node, served by `pkxyz plant` in another process, passes every line.
 
-The bus is a slow one, so only a machine that stands still for milliseconds can make an answer late. Whether it did
-is looked at all the while: then the lines that are about time are the machine's, and the others are still the node's.
+The bus is a slow one, so only a machine that stands still can make an answer late. The run itself looks at that all the
+while: a line that it spoils three times is not tested, and none is ever held against the node.
 """
 
 import json
 import os
 import subprocess
 import sys
-import threading
 import time
 from pathlib import Path
 
@@ -18,37 +17,6 @@ from hil.conformance.run import CHECKS
 from pkxyz_ctrl.config.files import CONFIG_DIR
 
 ROOT = Path(__file__).parents[2]
-ABOUT_TIME = {
-    "boot-up and NMT: boot-up",
-    "heartbeat: heartbeat period",
-    "heartbeat: heartbeat in the loop",
-    "sense PDO: latency",
-    "outputs: heartbeat consumer",
-}
-SLACK_S = 1.0e-3  # a heartbeat of 20 ms may come 2 ms late, an answer 2.3
-
-
-class Stillness:
-    """Looks at the clock every half millisecond; ``longest_s`` is how long the machine gave no processor in between."""
-
-    def __init__(self):
-        self.longest_s = 0.0
-        self._ended = threading.Event()
-        self._thread = threading.Thread(target=self._look)
-
-    def _look(self):
-        last_s = time.monotonic()
-        while not self._ended.wait(0.5e-3):
-            now_s = time.monotonic()
-            self.longest_s, last_s = max(self.longest_s, now_s - last_s - 0.5e-3), now_s
-
-    def __enter__(self):
-        self._thread.start()
-        return self
-
-    def __exit__(self, *_):
-        self._ended.set()
-        self._thread.join()
 
 
 def pkxyz(*words, stdout):
@@ -87,15 +55,16 @@ def bus(tmp_path):
 
 
 def test_our_node_in_another_process_passes(bus, tmp_path):
-    with Stillness() as machine:
-        words = ("check-amplifier", "--bus", bus, "--allow-voltage", "--out", tmp_path / "report", "--json")
-        check = pkxyz(*words, stdout=subprocess.PIPE)
-        out, err = check.communicate(timeout=240)
+    words = ("check-amplifier", "--bus", bus, "--allow-voltage", "--out", tmp_path / "report", "--json")
+    check = pkxyz(*words, stdout=subprocess.PIPE)
+    out, err = check.communicate(timeout=400)
     result = json.loads(out)
     assert len(result["lines"]) == len(CHECKS)
-    assert result["not_tested"] == 0
-    failed = {f"{line['group']}: {line['name']}" for line in result["lines"] if line["verdict"] != "PASS"}
-    assert failed <= (ABOUT_TIME if machine.longest_s > SLACK_S else set()), (machine.longest_s, out, err)
-    assert check.returncode == (1 if failed else 0)
+    deviating = [line for line in result["lines"] if line["verdict"] not in ("PASS", "NOT TESTED")]
+    assert deviating == [], err
+    left_out = [line for line in result["lines"] if line["verdict"] == "NOT TESTED"]
+    assert all(line["got"].startswith("this machine itself was") for line in left_out), left_out
+    assert result["passed"] > len(CHECKS) // 2  # those that are about no times cannot be left out
+    assert check.returncode == 0
     assert json.loads((tmp_path / "report" / "conformance.json").read_text(encoding="utf-8")) == result
     assert "Traceback" not in err

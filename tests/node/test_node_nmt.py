@@ -3,6 +3,7 @@
 from collections.abc import Callable
 from itertools import pairwise
 
+import canopen
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
@@ -372,9 +373,13 @@ def test_canopen_reads_the_emergencies() -> None:
     assert [(e.code, e.register) for e in node.emcy.log] == [(0x2310, 3), (0x3210, 7), (0x4210, 15), (0, 11)]
     assert node.emcy.log[-1].data[:2] == (0x4210).to_bytes(2, "little")
     assert node.sdo[0x1003][0].raw == 3
-    assert [node.sdo[0x1003][i].raw for i in (1, 2, 3, 4)] == [0x4210, 0x3210, 0x2310, 0]
+    assert [node.sdo[0x1003][i].raw for i in (1, 2, 3)] == [0x4210, 0x3210, 0x2310]
+    with pytest.raises(canopen.SdoAbortedError, match="08000024"):
+        node.sdo[0x1003][4].raw  # noqa: B018
     node.sdo[0x1003][0].raw = 0
-    assert [node.sdo[0x1003][i].raw for i in range(4)] == [0, 0, 0, 0]
+    assert node.sdo[0x1003][0].raw == 0
+    with pytest.raises(canopen.SdoAbortedError, match="08000024"):
+        node.sdo[0x1003][1].raw  # noqa: B018
 
 
 def test_history_keeps_the_newest_eight() -> None:

@@ -440,6 +440,34 @@ DEFECTS: tuple[type[AmplifierNode], ...] = tuple(
 )
 
 
+class SelfStarting(AmplifierNode):
+    """No defect: operational after boot-up without being asked (CiA 302-2, object 1F80h)."""
+
+    def _boot(self, now_us: int) -> None:
+        super()._boot(now_us)
+        self._enter(NmtState.OPERATIONAL)
+
+
+class EverySenseLate(AmplifierNode):
+    """sense PDO: latency"""
+
+    def _transmit(self, cob_id: int, data: bytes) -> None:
+        if cob_id == 0x28A:
+            self._clock.call_at(self._clock.now_us + 7000, lambda: super(EverySenseLate, self)._transmit(cob_id, data))
+        else:
+            super()._transmit(cob_id, data)
+
+
+class WaitsOnce(AmplifierNode):
+    """object dictionary: objects exist"""
+
+    def _transmit(self, cob_id: int, data: bytes) -> None:
+        if cob_id == 0x58A and data[1:4] == bytes.fromhex("0a 10 00"):
+            self._clock.call_at(self._clock.now_us + 70_000, lambda: super(WaitsOnce, self)._transmit(cob_id, data))
+        else:
+            super()._transmit(cob_id, data)
+
+
 class StillPlant:
     """Takes what it is given; its samples differ from one to the next."""
 
