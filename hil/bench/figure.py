@@ -33,7 +33,7 @@ class Figure:
             return None
         return self.value <= self.target if self.direction == "at most" else self.value >= self.target
 
-    def as_dict(self) -> dict[str, Any]:
+    def as_json(self) -> dict[str, Any]:
         """Plain data, for JSON."""
         return {
             "name": self.name,

@@ -63,7 +63,7 @@ def measure(name: str, only: list[str]) -> list[Figure]:
 
 def results(machine: dict[str, Any], figures: list[Figure]) -> dict[str, Any]:
     """What is printed as JSON: figures, and on what they were taken."""
-    return {"machine": machine, "figures": [f.as_dict() for f in figures]}
+    return {"machine": machine, "figures": [f.as_json() for f in figures]}
 
 
 def describe_machine() -> dict[str, Any]:

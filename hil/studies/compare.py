@@ -38,7 +38,7 @@ class Compared:
     error_nm: NDArray[np.float64]
     """(n, 3), true position less reference"""
 
-    def as_dict(self) -> dict[str, Any]:
+    def as_json(self) -> dict[str, Any]:
         """Plain data, without the traces."""
         return {
             "controller": self.controller, "law": self.law, "gave_up": self.gave_up, "problem": self.problem,

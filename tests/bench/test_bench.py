@@ -74,7 +74,7 @@ def test_figures_are_positive_and_named_after_their_measurement(name: str) -> No
         assert f.detail
         if f.unit == "us" and f.median is not None:
             assert f.value <= f.median
-        assert json.loads(json.dumps(f.as_dict(), allow_nan=False))["met"] is f.met
+        assert json.loads(json.dumps(f.as_json(), allow_nan=False))["met"] is f.met
 
 
 def test_all_measurements_unless_some_are_named() -> None:

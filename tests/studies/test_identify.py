@@ -16,7 +16,7 @@ from typer.testing import CliRunner
 from hil.cli import app
 from hil.lanes.excitation import Passage, excitation, tones
 from hil.lanes.setup import bare_setup
-from hil.studies.identify.identification import as_data, exciting, identify, modes_hz
+from hil.studies.identify.identification import as_json, exciting, identify, modes_hz
 from hil.studies.identify.outside_scale import outside_scale, read_points
 from hil.studies.identify.plant_response import _spectra, measure_plant
 from hil.studies.margins.measured import at_point
@@ -258,7 +258,7 @@ def test_the_command_prints_and_writes_what_was_found(tmp_path):
     done = CliRunner().invoke(app, ["identify", "--plant", "harsh", "--json", "--out", str(tmp_path / "new")])
     assert done.exit_code == 0, done.output
     data = json.loads(done.stdout)
-    expected = as_data(found())
+    expected = as_json(found())
     assert {k: v for k, v in data.items() if k in expected} == json.loads(json.dumps(expected))
     names = {p.name for p in (tmp_path / "new").iterdir()}
     assert {"identification.json", "response.csv", "response.png"} <= names
@@ -275,4 +275,4 @@ def test_no_frames_no_lockstep():
 
 def test_another_seed_is_another_digest():
     again = dataclasses.replace(found(), setup=dataclasses.replace(found().setup, seed=2))
-    assert as_data(again)["digest"] != as_data(found())["digest"]
+    assert as_json(again)["digest"] != as_json(found())["digest"]

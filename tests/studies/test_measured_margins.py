@@ -14,7 +14,7 @@ from typer.testing import CliRunner
 from hil.cli import app
 from hil.lanes.excitation import excitation, tones
 from hil.lanes.lane import Lane
-from hil.studies.margins.loop import Loop, agreement, as_data, over_changed_plants
+from hil.studies.margins.loop import Loop, agreement, as_json, over_changed_plants
 from hil.studies.margins.measured import MeasurementError, at_point, measure, sampled_margins
 from pkxyz_ctrl.config.files import ConfigError, load, parse, plain
 from pkxyz_ctrl.core.tick import LINEAR
@@ -203,7 +203,7 @@ def test_the_command_prints_what_was_computed_and_writes_pictures(tmp_path):
     from pkxyz_ctrl.design.law import design_law
 
     wide_law = design_law(stage(), load("controllers", "lqg_wide", ControllerConfig), bus(), autostart=True)
-    assert data["computed"] == as_data(Loop(stage(), bus(), wide_law).margins(MIDDLE))
+    assert data["computed"] == as_json(Loop(stage(), bus(), wide_law).margins(MIDDLE))
     assert sorted(p.name for p in (tmp_path / "new").iterdir()) == ["bode.png", "margins.json", "nyquist.png"]
     assert json.loads((tmp_path / "new" / "margins.json").read_text()) == data
 

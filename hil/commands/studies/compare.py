@@ -53,7 +53,7 @@ def compare(
             "lane": lane.value,
             "picture": str(out) if drawn else None,
         }
-        print(json.dumps(data | {"laws": [run.as_dict() for run in runs]}, allow_nan=False))
+        print(json.dumps(data | {"laws": [run.as_json() for run in runs]}, allow_nan=False))
     else:
         _show(runs, title, out if drawn else None)
     raise typer.Exit(0 if all(run.problem is None for run in runs) else 1)

@@ -63,7 +63,7 @@ def identify(
     from dataclasses import replace
 
     from hil.api.identify import identify as identified
-    from hil.studies.identify.identification import as_data
+    from hil.studies.identify import identification
     from hil.studies.identify.outside_scale import outside_scale, read_points
     from pkxyz_ctrl.stage import Stage
 
@@ -80,7 +80,7 @@ def identify(
         )  # fmt: skip
     found = replace(found, outside=outside)
     with one_line_errors():
-        data = as_data(found)
+        data = identification.as_json(found)
     folder = _write(out, found, data, find("stages", stage))
     if as_json:
         print(json.dumps(data, allow_nan=False))

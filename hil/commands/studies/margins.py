@@ -54,7 +54,8 @@ def margins(
     not; 2 for bad input.
     """
     from hil.api.design import design
-    from hil.studies.margins.loop import agreement, as_data, over_changed_plants
+    from hil.studies.margins import loop as loops
+    from hil.studies.margins.loop import agreement, over_changed_plants
     from hil.studies.operating_point import operating_strokes
     from pkxyz_ctrl.design.margins.tolerances import Tolerances
     from pkxyz_ctrl.stage import Stage
@@ -71,7 +72,7 @@ def margins(
         computed = law.margins(at_um)
         data: dict[str, Any] = {
             "controller": config.name, "stage": device.config.name, "bus": on_bus.name,
-            "strokes_um": [float(q) * 1e6 for q in strokes], "computed": as_data(computed),
+            "strokes_um": [float(q) * 1e6 for q in strokes], "computed": loops.as_json(computed),
             "holds": _WHILE_FREE if config.law == "mpc" else "everywhere inside the limits",
         }  # fmt: skip
         changed = None
@@ -86,7 +87,7 @@ def margins(
                     stage, plant, config, on_bus, strokes, lane, tones, amplitude_nm, periods, seed, tell
                 )
             compared = agreement(response, loop.response(strokes, response.frequency_hz), periods)
-            data["measured"] = as_data(response.margins()) | {
+            data["measured"] = loops.as_json(response.margins()) | {
                 "lane": lane.value, "plant": plant, "seed": seed, "tones": len(response.frequency_hz),
                 "amplitude_nm": amplitude_nm, "periods": periods,
                 "agreement": vars(compared) | {"holds": compared.holds},

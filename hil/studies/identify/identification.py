@@ -173,7 +173,7 @@ def provenance(found: Identification) -> dict[str, Any]:
     }  # fmt: skip
 
 
-def as_data(found: Identification) -> dict[str, Any]:
+def as_json(found: Identification) -> dict[str, Any]:
     """Plain data of all that was found, with standard errors."""
     modes, response, zero = found.modes, found.response, found.response.zero
     return provenance(found) | {

@@ -109,7 +109,7 @@ def agreement(measured: MeasuredLoop, computed: LoopResponse, periods: int) -> A
     )
 
 
-def as_data(found: Margins) -> dict[str, Any]:
+def as_json(found: Margins) -> dict[str, Any]:
     """Plain data for JSON. None stands for no limit (an infinite margin), and for a radius that was not computed."""
     axes = {name: _numbers(vars(axis)) for name, axis in zip("xyz", found.axes, strict=True)}
     radius = found.spectral_radius if math.isfinite(found.spectral_radius) else None
