@@ -15,6 +15,7 @@ from annotated_types import Ge, Gt, Le, Lt, MinLen
 from pydantic import BaseModel
 from pydantic.fields import FieldInfo
 
+import hil
 from hil import cli
 from hil.runs.scenario import ScenarioConfig
 from hil.studies.tune.search import SearchConfig
@@ -38,15 +39,12 @@ MODELS: dict[str, type[BaseModel]] = {
 """The model of each folder of configs/."""
 
 API: dict[str, tuple[str, ...]] = {
+    "Runs and studies: the package `hil`": tuple(f"{home}.{name}" for name, home in hil._HOME.items()),
     "One device": ("pkxyz_ctrl.stage.Stage", "pkxyz_ctrl.stage.StageDomainError"),
     "Trajectories": ("pkxyz_ctrl.trajectory.Trajectory", "pkxyz_ctrl.trajectory.check.check_against"),
-    "Configuration files": (
-        "pkxyz_ctrl.config.files.load",
-        "pkxyz_ctrl.config.files.parse",
-        "pkxyz_ctrl.config.files.ConfigError",
-    ),
-    "Laws and margins": ("pkxyz_ctrl.design.laws.chosen_law.with_law", "pkxyz_ctrl.design.margins.margins.margins"),
-    "Scenarios and recordings": ("hil.runs.scenario.load_scenario", "hil.recording.recording.Recording"),
+    "Configuration files": ("pkxyz_ctrl.config.files.load", "pkxyz_ctrl.config.files.parse"),
+    "A law of one's own": ("pkxyz_ctrl.design.laws.chosen_law.with_law",),
+    "A recording": ("hil.recording.recording.Recording",),
 }
 """What a program may rely on, by task."""
 
@@ -271,7 +269,8 @@ def _dtype(name: str) -> str:
 
 def api_page() -> str:
     """The parts of the Python interface that a program may rely on, from their docstrings."""
-    parts = ["# Python\n\nArrays have SI units and the shapes that are given; positions are relative to rest."]
+    parts = ["# Python\n\nArrays have SI units and the shapes that are given; positions are relative to rest. "
+             "`import hil` has the names of the first section, kept stable by semantic versioning."]  # fmt: skip
     for task, members in API.items():
         parts.append(f"## {task}")
         parts += [f"::: {member}\n    options:\n      heading_level: 3" for member in members]

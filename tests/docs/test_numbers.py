@@ -1,0 +1,138 @@
+"""Numbers in the prose of README and docs, computed again: what a page says is what the program does today."""
+
+import json
+import math
+import re
+import runpy
+from functools import cache
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+import hil
+from pkxyz_ctrl import Stage
+from pkxyz_ctrl.mechanics.modes import modes
+
+ROOT = Path(__file__).parents[2]
+
+
+def page(name: str) -> str:
+    """The text of a page with its lines joined."""
+    return " ".join((ROOT / name).read_text(encoding="utf-8").split())
+
+
+@cache
+def rms_nm(scenario: str, controller: str | None = None) -> tuple[float, ...]:
+    """RMS error of a run of the fast lane by axis; lockstep has the same bits."""
+    run = hil.run(hil.load_scenario(scenario, controller=controller))
+    return tuple(run.summary["rms_error_nm"].values())
+
+
+def row_of(text: str, start: str) -> list[float]:
+    """The numbers of the table row that begins with ``start``, behind it."""
+    found = re.search(rf"\| {re.escape(start)}[^|]*\|([^|]*)\|", text)
+    assert found is not None, start
+    return [float(n) for n in re.findall(r"\d+\.?\d*", found[1])]
+
+
+@pytest.mark.parametrize("script", ["readme", "mechanics"])
+def test_generated_tables_are_those_of_today(script: str) -> None:
+    made = runpy.run_path(str(ROOT / "docs" / "figures" / f"{script}.py"))
+    text = made["PAGE"].read_text(encoding="utf-8")
+    assert made["filled_in"](text) == text, f"run: python docs/figures/{script}.py"
+
+
+@pytest.mark.parametrize("scenario", ["circle", "spiral", "lissajous", "sweep", "path"])
+def test_how_well_trajectories_are_followed(scenario: str) -> None:
+    shown = row_of(page("docs/lookup/trajectories.md").partition("## How well")[2], f"`{scenario}`")
+    assert shown == [float(f"{v:.1f}") for v in rms_nm(scenario)]
+
+
+def test_the_tutorial_tells_what_its_commands_print(tmp_path: Path) -> None:
+    text = page("docs/learn/index.md")
+    assert row_of(text, "`lqg`, the default") == [float(f"{v:.1f}") for v in rms_nm("raster_mild", "lqg")]
+    assert row_of(text, "`open_loop`") == [float(f"{v:.0f}") for v in rms_nm("raster_mild", "open_loop")]
+    base = (ROOT / "configs/controllers/lqg.toml").read_text(encoding="utf-8").replace('law = "lqg"', 'law = "linear"')
+    laws = {
+        "integral": ("[14600.0]", "[1.0, 0.0]", "Ms 2.4, disturbances attenuated to 30 Hz in x and y, {} nm"),
+        "notch": ("[3.0e4, 1.4e7, 4.538e11]", "[1.0, 3889.0, 1.513e7, 0.0]", "the error falls to {} nm"),
+    }
+    for name, (numerator, denominator, words) in laws.items():
+        path = tmp_path / f"{name}.toml"
+        path.write_text(f"{base}\n[linear]\n[[linear.axis]]\nnumerator = {numerator}\ndenominator = {denominator}\n")
+        assert numerator[1:-1] in text
+        assert words.format(" / ".join(f"{v:.1f}" for v in rms_nm("raster_mild", str(path)))) in text
+    integral, notch = (hil.design(str(tmp_path / f"{name}.toml")).margins().axes[0] for name in laws)
+    assert (f"{integral.peak_s:.1f}", f"{integral.bandwidth_hz:.0f}") == ("2.4", "30")
+    assert (f"{notch.peak_s:.1f}", f"{notch.bandwidth_hz:.0f}") == ("1.3", "55")
+    assert "Ms is 1.3 in x and y and disturbances are attenuated to 55 Hz" in text
+
+
+def test_the_heights_that_voltages_hold() -> None:
+    text, stage = page("docs/do/hardware.md"), Stage.load("reconstructed")
+    for volts in (5, 31, 69, 182):
+        height_m = row_of(text, f"{volts} ")[0] * 1e-6
+        assert stage.holding_voltages([0.0, 0.0, height_m])[0] == pytest.approx(volts, rel=0.04)
+
+
+def test_the_stage_about_rest_and_over_its_workspace() -> None:
+    stage = Stage.load("reconstructed")
+    stiffness = np.diag(stage.stiffness([0.0, 0.0, 0.0]))
+    words = f"{stiffness[0]:.0f} N/m in x and y and {stiffness[2]:.0f} N/m in z at rest"
+    assert words in page("docs/do/own-law.md")
+    text = page("docs/understand/mechanics.md")
+    strokes = np.stack(np.meshgrid(*[np.linspace(0, 25e-6, 6)] * 3), axis=-1).reshape(-1, 3)
+    hessians = stage.stiffness(stage.forward_kinematics(strokes))
+    found = np.array([modes(h, stage.mass_kg).frequency_hz for h in hessians])
+    growth = hessians[:, 2, 2].max() / stiffness[2] - 1
+    assert f"H_zz grows by {growth:.0%} from rest to the top, f_z from".replace("%", " %") in text
+    assert f"f_z from {found[:, 2].min():.0f} to {found[:, 2].max():.0f} Hz" in text
+    assert f"stay within {found[:, :2].min():.0f} to {found[:, :2].max():.0f} Hz" in text
+    assert f"{(90 / 50) ** 3:.1f} times that of 50 um and {(90 / 70) ** 3:.1f} times that of 70 um" in text
+    for name, words in (("reconstructed", "slider at {:.0f} um"), ("printed", "({:.0f} um in the printed design")):
+        geometry = Stage.load(name).config.geometry
+        other = geometry.base_radius_m - geometry.projection_rest_m + geometry.crank_length_m
+        assert words.format(other * 1e6) in text
+
+
+def test_the_modes_that_a_law_acts_on() -> None:
+    stage = Stage.load("reconstructed")
+    middle = stage.forward_kinematics([12.5e-6] * 3)
+    from pkxyz_ctrl.mechanics.stiffness import small_signal_stiffness_n_per_m
+
+    held = small_signal_stiffness_n_per_m(stage, middle, stage.holding_forces(middle))
+    hz = modes(held, stage.mass_kg).frequency_hz
+    words = f"{hz[0]:.0f}, {hz[1]:.0f} and {hz[2]:.0f} Hz"
+    assert words in page("docs/learn/index.md")
+    assert words in page("docs/do/own-law.md")
+    assert stage.quality_factor == 20
+
+
+def test_measured_figures_of_the_readme_are_those_of_the_benchmarks() -> None:
+    results = json.loads((ROOT / "benchmarks" / "results.json").read_text(encoding="utf-8"))["figures"]
+    value = {f["name"]: f["value"] for f in results}
+    text = page("README.md")
+    assert f"{value['control.gain_1262']:.1f} dB, -2 degrees" in text
+    assert f"within 10 nm after {value['control.step_settle']:.1f} ms" in text
+    assert f"{value['control.step_overshoot']:.0f} % overshoot" in text
+    assert f"{value['control.circle']:.2f} % of the diameter" in text
+    assert f"{value['control.raster']:.3f} % of a line" in text
+    assert f"({value['lockstep.realtime']:.0f} times real time)" in text
+    assert f"({value['fast.realtime']:.0f} times)" in text
+
+
+def test_what_learning_reaches_period_by_period() -> None:
+    text = (ROOT / "docs/understand/learning.md").read_text(encoding="utf-8")
+    run = hil.run(hil.load_scenario("frames_harsh"))
+    periods = run.summary["learning"]["periods"]
+    for words, key in (("as sensed", "sensed_nm"), ("true", "true_nm")):
+        line = next(row for row in text.splitlines() if row.startswith(f"| harsh plant, {words} (nm)"))
+        assert [float(c) for c in line.split("|")[2:-1]] == [float(f"{v:.1f}") for v in periods[key][:6]]
+
+
+def test_the_paper_s_ratio_and_the_band() -> None:
+    text, stage = page("docs/understand/mechanics.md"), Stage.load("reconstructed")
+    k = np.diag(stage.stiffness([0.0, 0.0, 0.0]))
+    assert f"is {math.sqrt(k[2] / k[0]):.5f} against the published 1.22321" in text
+    assert all(500 < f < 1000 for f in modes(np.diag(k), stage.mass_kg).frequency_hz)
