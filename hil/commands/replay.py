@@ -26,7 +26,9 @@ def replay(
     ] = None,
     as_json: Annotated[bool, typer.Option("--json", help="Print JSON, and nothing else.")] = False,
 ) -> None:
-    """Put a recording through the tick again; exit code 0 if it agrees in every bit, 1 if not, 2 for bad input."""
+    """Put a recording through the tick again; exit code 0 if it agrees in every bit, is whole, and its files are as the
+    run left them, 1 if not, 2 for what can't be read.
+    """
     from hil.recording.recording import RecordingError
     from hil.runs.run_folder import RECORDING
     from pkxyz_ctrl.config.controller import ControllerConfig
@@ -36,14 +38,14 @@ def replay(
     other = None if controller is None else load("controllers", controller, ControllerConfig)
     try:
         result = _with_progress(folder / RECORDING, other, quiet=as_json)
-    except (RecordingError, DesignError) as error:
+    except (RecordingError, DesignError, OSError) as error:
         print(f"pkxyz: {error}", file=sys.stderr)
         raise typer.Exit(2) from None
     if as_json:
         print(json.dumps(_plain(result, folder), allow_nan=False))
     else:
         _show(result)
-    raise typer.Exit(0 if result.identical else 1)
+    raise typer.Exit(0 if result.sound else 1)
 
 
 def _with_progress(path: Path, controller: "ControllerConfig | None", *, quiet: bool) -> "Replay":
@@ -65,6 +67,9 @@ def _plain(result: "Replay", folder: Path) -> dict[str, object]:
         "folder": str(folder),
         "ticks": result.ticks,
         "identical": result.identical,
+        "sound": result.sound,
+        "kept": result.kept,
+        "damages": result.damages,
         "first_difference": found[0] if found else None,
         "differences": found,
         "notes": result.notes,
@@ -74,6 +79,8 @@ def _plain(result: "Replay", folder: Path) -> dict[str, object]:
 def _show(result: "Replay") -> None:
     if result.identical:
         say(f"{result.ticks} ticks replayed, identical in every bit")
+        if result.kept:
+            say(f"as the run left them: {', '.join(result.kept)}")
     else:
         first = result.differences[0]
         say(
@@ -86,5 +93,7 @@ def _show(result: "Replay") -> None:
         screen().print(table)
         left = len(result.differences) - _SHOWN
         say(f"{f'and {left} signals more; ' if left > 0 else ''}{result.ticks} ticks replayed")
+    for line in result.damages:
+        say(f"but {line}")
     for note in result.notes:
         say(f"note: {note}")

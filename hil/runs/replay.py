@@ -15,9 +15,12 @@ from numpy.typing import NDArray
 
 from hil.lanes.blocks import Handout
 from hil.recording.recording import Recording, RecordingError
+from hil.runs.run_folder import CONFIG, SUMMARY
 from hil.runs.scenario import Scenario, resolve, restore
+from hil.runs.seal import changed
 from hil.runs.versions import versions
 from pkxyz_ctrl.config.controller import ControllerConfig
+from pkxyz_ctrl.config.files import read_toml
 from pkxyz_ctrl.loop import cycle as cycling
 from pkxyz_ctrl.loop.period import period_of
 from pkxyz_ctrl.loop.reference import standing_still
@@ -68,11 +71,20 @@ class Replay:
     """the first one first; signals that differ from the same tick on in the order of computation"""
     notes: list[str] = field(default_factory=list)
     """what a difference may come from"""
+    kept: list[str] = field(default_factory=list)
+    """files of the folder that are, by the digests in its summary, as the run left them"""
+    damages: list[str] = field(default_factory=list)
+    """a line for each file that is not, and for a recording that was cut off"""
 
     @property
     def identical(self) -> bool:
         """Whether every bit came out as recorded."""
         return not self.differences
+
+    @property
+    def sound(self) -> bool:
+        """Whether, besides, nothing is missing and all files are as the run left them."""
+        return self.identical and not self.damages
 
 
 def replay(
@@ -82,15 +94,18 @@ def replay(
 ) -> Replay:
     """Replay the recording at ``path``; with a ``ControllerConfig``, as if that had been in command.
 
-    Raises ``RecordingError`` for one that can't be read or lacks rows, and ``ConfigError`` for a configuration that
-    this program doesn't know.
+    Raises ``RecordingError`` for one that can't be read, lacks rows or has none, and ``ConfigError`` for a
+    configuration that this program doesn't know.
     """
     recording = Recording.open(path)
+    if recording.ticks == 0:
+        raise RecordingError(f"{path}: holds no tick: its run never began, and there is nothing to replay")
     scenario = _scenario(recording, path.parent)
     if controller is not None:
         scenario = replace(scenario, controller=controller)
     found: dict[str, Difference] = {}
     result = Replay(notes=_notes(recording, scenario))
+    _look_at_files(recording, result)
     player = _Player(scenario)
     for recorded in _blocks(recording):
         replayed = player.play(recorded)
@@ -145,10 +160,7 @@ def _scenario(recording: Recording, folder: Path) -> Scenario:
 def _blocks(recording: Recording) -> Iterator[Rows]:
     """Rows with what the controller recorded. Raises ``RecordingError`` where ticks are missing."""
     expected = 0
-    for block in recording.blocks(_FIELDS):
-        rows = np.zeros(len(block["tick"]), ROW)
-        for name in _FIELDS:
-            rows[name] = block[name]
+    for rows in recording.rows(ROW.names or ()):  # the truth, too: what is read is checked
         missing = np.flatnonzero(rows["tick"] != expected + np.arange(len(rows)))
         if len(missing):
             at = int(missing[0])
@@ -158,6 +170,20 @@ def _blocks(recording: Recording) -> Iterator[Rows]:
             )
         expected += len(rows)
         yield rows
+
+
+def _look_at_files(recording: Recording, result: Replay) -> None:
+    folder = recording.path.parent
+    if not recording.whole:
+        result.damages.append(f"the recording was cut off: nobody closed it after its {recording.ticks} ticks")
+    try:
+        result.kept, lines = changed(folder / SUMMARY)
+        result.damages += lines
+    except FileNotFoundError:
+        result.notes.append(f"there is no {SUMMARY}, and so no digests to check the files of the folder against")
+    written = folder / CONFIG
+    if CONFIG not in result.kept and written.is_file() and read_toml(written) != recording.metadata["config"]:
+        result.damages.append(f"{CONFIG} is not the configuration in the recording")
 
 
 def _compare(name: str, recorded: Rows, replayed: Rows, found: dict[str, Difference]) -> None:

@@ -51,7 +51,7 @@ class Begun:
         learnt = self.learning.close(file, learner, digest) if self.learning is not None else None
         summary = summarise(self.scenario, self.lane, digest, rows, loop, learnt, interrupted=interrupted)
         if self.folder is not None:
-            self.folder.write_summary(summary.as_text())
+            self.folder.write_summary(summary.as_json())
         return summary
 
     def take(self, block: NDArray[np.void]) -> None:

@@ -15,6 +15,7 @@ from typing import Any
 from hil.lanes.lane import Lane
 from hil.recording.recording import Recording, RecordingError
 from hil.runs.scenario import LEARNT_FROM, Scenario, resolve, tables
+from hil.runs.seal import sealed
 from hil.runs.versions import versions
 from pkxyz_ctrl.config.files import ConfigError, digest, read_toml, write_toml
 
@@ -31,6 +32,7 @@ _OURS = {
     RECORDING, FRAMES, CONFIG, SUMMARY, PICTURE, RECORDING + ".journal", RECORDING + ".part", LEARNT, LEARNT_FROM,
     LEARNING_PICTURE, _UNFINISHED,
 }  # fmt: skip
+_SEALED = {RECORDING, FRAMES, CONFIG, LEARNT, LEARNT_FROM}
 _TABLE = re.compile(r"reference\.\d+\.csv")
 _EARLIER = ".earlier"
 """Folder inside, where an earlier run waits until the new one has recorded something."""
@@ -96,10 +98,11 @@ class RunFolder:
             raise ConfigError(f"{self.config}: {(error.strerror or str(error)).lower()}; give another --out") from None
         return resolved
 
-    def write_summary(self, text: str) -> None:
-        """Write ``Summary.as_text()``. Raises ``ConfigError``."""
+    def write_summary(self, summary: dict[str, Any]) -> None:
+        """Write ``Summary.as_json()`` with the digests of what is here now. Raises ``ConfigError``."""
         with self.in_one_line():
-            self.summary.write_text(text, encoding="utf-8")
+            names = {name for name in self._present() if name in _SEALED or _TABLE.fullmatch(name)}
+            self.summary.write_text(sealed(summary, self.path, names), encoding="utf-8")
 
     @contextmanager
     def in_one_line(self) -> Iterator[None]:

@@ -1,7 +1,6 @@
 """What is known of a run when it is over: who ran, figures, verdicts on its checks."""
 
 import dataclasses
-import json
 from collections.abc import Mapping
 from dataclasses import dataclass, field
 from typing import Any
@@ -98,10 +97,6 @@ class Summary:
             plain |= figures | {"learning": learnt | {"periods": periods, "steps": list(learnt["steps"])}}
         loop["faults"] = list(self.loop.faults)
         return plain | rows | loop | {"checks": [verdict.as_json() for verdict in self.checks]}
-
-    def as_text(self) -> str:
-        """The text of ``summary.json``."""
-        return json.dumps(self.as_json(), indent=2, allow_nan=False) + "\n"
 
 
 def summarise(

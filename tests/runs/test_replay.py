@@ -1,9 +1,13 @@
 """Replay: every input of a tick is in its row, so the same bits come out; and whatever was altered is named."""
 
+import contextlib
 import dataclasses
 import json
+import os
+import shutil
 
 import numpy as np
+import pyarrow.parquet as pq
 import pytest
 from command_line import pkxyz
 from hypothesis import HealthCheck, given, settings
@@ -19,7 +23,7 @@ from hil.runs.run import run_into
 from hil.runs.run_folder import RunFolder, metadata_of
 from hil.runs.scenario import load_scenario, resolve, restore
 from pkxyz_ctrl.config.controller import ControllerConfig
-from pkxyz_ctrl.config.files import load, names
+from pkxyz_ctrl.config.files import ConfigError, load, names
 from pkxyz_ctrl.loop.row import CONTROLLER_FIELDS, ROW, columns
 from pkxyz_ctrl.safety.modes import Event, Mode
 
@@ -155,7 +159,7 @@ def test_one_altered_gain_is_named_by_the_first_signal_that_it_moves(run, tmp_pa
     assert first.signal.startswith("demand_")
     assert rows["mode"][first.tick] in (Mode.ENABLED, Mode.TRACKING)
     assert abs(first.replayed - first.recorded) < 1e-6 * abs(first.recorded)
-    assert result.notes == ["the configuration is not the recorded one"]
+    assert result.notes[0] == "the configuration is not the recorded one"
     assert not any(d.tick < first.tick for d in result.differences)
     other = replay(folder / "recording.parquet", load("controllers", "open_loop", ControllerConfig))
     assert other.differences[0].signal.startswith("demand_")
@@ -169,6 +173,8 @@ def test_a_recording_that_was_cut_off_replays_as_far_as_it_goes(run, tmp_path):
     result = replay(tmp_path / "recording.parquet")
     assert result.identical
     assert result.ticks == 2048
+    assert not result.sound
+    assert result.damages == ["the recording was cut off: nobody closed it after its 2048 ticks"]
 
 
 def test_rows_that_are_missing_are_no_difference_but_an_error(run, tmp_path):
@@ -188,11 +194,110 @@ def test_a_table_is_kept_with_the_run_and_may_not_change(tmp_path):
         replay(folder.recording)
 
 
+@pytest.fixture(scope="module")
+def folder_of_a_run(tmp_path_factory):
+    """A short run over the bus, with a table: everything that a folder holds."""
+    folder = RunFolder(tmp_path_factory.mktemp("sealed") / "run")
+    run_into(folder, scenario_of("path", 0.1), Lane.LOCKSTEP)
+    return folder.path
+
+
+def test_a_run_that_nobody_touched_is_sound_and_names_what_it_checked(folder_of_a_run):
+    result = replay(folder_of_a_run / "recording.parquet")
+    assert result.sound
+    assert result.notes == []
+    assert {"recording.parquet", "frames.log", "config.toml"} < set(result.kept)
+    assert set(result.kept) | {"summary.json"} == {path.name for path in folder_of_a_run.iterdir()}
+
+
+@pytest.mark.parametrize("name", ["recording.parquet", "frames.log", "config.toml", "summary.json", "reference.4.csv"])
+def test_no_flipped_bit_in_any_file_of_a_run_is_taken_for_sound(folder_of_a_run, tmp_path, name):
+    """Truth, footer, checksums and digits alike: it is named or can't be read; no traceback, and no "identical"."""
+    rng = np.random.default_rng(7)
+    folder = tmp_path / "copy"
+    shutil.copytree(folder_of_a_run, folder)
+    whole = (folder / name).read_bytes()
+    outcomes = []
+    for at in rng.integers(0, len(whole), 25):
+        bent = bytearray(whole)
+        bent[at] ^= 1 << int(rng.integers(8))
+        (folder / name).write_bytes(bent)
+        try:
+            result = replay(folder / "recording.parquet")
+        except (RecordingError, ConfigError, OSError):
+            outcomes.append(2)
+            continue
+        assert not result.sound, at
+        assert any(name in line for line in result.damages)
+        outcomes.append(1)
+    assert 1 in outcomes or name == "reference.4.csv"  # of a table, not even the reference can be planned
+
+
+@pytest.mark.parametrize("share", [0.0, 0.3, 0.7, 0.999])
+@pytest.mark.parametrize("name", ["recording.parquet", "frames.log", "config.toml", "summary.json", "reference.4.csv"])
+def test_no_file_of_a_run_can_be_cut_unseen(folder_of_a_run, tmp_path, name, share):
+    folder = tmp_path / "copy"
+    shutil.copytree(folder_of_a_run, folder)
+    os.truncate(folder / name, int((folder / name).stat().st_size * share))
+    with contextlib.suppress(RecordingError, ConfigError, OSError):
+        assert not replay(folder / "recording.parquet").sound
+    (folder / name).unlink()
+    try:
+        result = replay(folder / "recording.parquet")
+    except (RecordingError, ConfigError):
+        return
+    assert not result.sound or (name == "summary.json" and "no digests to check" in result.notes[0])
+
+
+def test_a_tail_that_is_missing_is_no_whole_recording(folder_of_a_run, tmp_path):
+    """Cut by 30 per cent at a row, in sound Parquet: once that was "identical"."""
+    rows, metadata = rows_of(folder_of_a_run / "recording.parquet")
+    path = written(tmp_path / "sealed_anew", rows[:350], metadata)
+    shutil.copy(folder_of_a_run / "reference.4.csv", path.parent)
+    shutil.copy(folder_of_a_run / "summary.json", path.parent)
+    shutil.copy(folder_of_a_run / "config.toml", path.parent)
+    result = replay(path)
+    assert result.identical
+    assert result.damages == ["frames.log is missing", "recording.parquet is not as the run left it"]
+    table = pq.read_table(folder_of_a_run / "recording.parquet")
+    (path.parent / "summary.json").unlink()
+    pq.write_table(table[:350], path)
+    result = replay(path)
+    assert result.ticks == 350
+    assert result.damages == ["the recording was cut off: nobody closed it after its 350 ticks"]
+
+
+def test_no_tick_is_nothing_to_be_identical(run, tmp_path):
+    _, rows, metadata = run
+    with pytest.raises(RecordingError, match="holds no tick"):
+        replay(written(tmp_path / "empty", rows[:0], metadata))
+    done = pkxyz("replay", tmp_path / "empty", cwd=tmp_path)
+    assert (done.returncode, done.stdout) == (2, "")
+
+
+@pytest.mark.parametrize("column", ["voltage_1_v", "voltage_2_v", "voltage_3_v", "drive_2_count", "force_3_n"])
+@pytest.mark.parametrize("tick", [0, 1234, 2499])
+def test_not_one_bit_of_a_voltage_goes_unseen(run, tmp_path, column, tick):
+    """What went to the combs is what a replay is for: its lowest bit, in the first, some and the last tick."""
+    _, rows, metadata = run
+    name = next(name for name in ROW.names if column in columns(name))
+    altered = rows.copy()
+    values = altered[name][:, columns(name).index(column)].copy()
+    values.view(f"u{values.dtype.itemsize}")[tick] ^= 1
+    altered[name][:, columns(name).index(column)] = values
+    result = replay(written(tmp_path / "altered", altered, metadata))
+    assert [(d.signal, d.tick, d.ticks) for d in result.differences] == [(column, tick, 1)]
+    assert not result.sound
+
+
 def test_the_command(run, tmp_path):
     folder, rows, metadata = run
     call = CliRunner().invoke
     same = call(app, ["replay", str(folder)])
-    assert (same.exit_code, same.stdout) == (0, "2500 ticks replayed, identical in every bit\n")
+    assert same.exit_code == 0
+    assert same.stdout.splitlines() == [
+        "2500 ticks replayed, identical in every bit", "as the run left them: config.toml, recording.parquet"
+    ]  # fmt: skip
     altered = rows.copy()
     altered["voltage_v"][2000, 2] += 1e-9
     changed = written(tmp_path / "altered", altered, metadata).parent
