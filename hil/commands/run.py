@@ -27,6 +27,9 @@ Learn = Annotated[bool, typer.Option("--learn", help="Learn what errs alike in e
 Replay = Annotated[
     str | None, typer.Option(metavar="FILE", help="Correct by what a run has learnt (its learnt.json), as it is.")
 ]
+ReplaceEarlier = Annotated[
+    bool, typer.Option("--replace", help="An earlier run in --out goes once the new one records; else it is refused.")
+]
 Refresh = Annotated[
     str | None, typer.Option(metavar="FILE", help="Begin with what a run has learnt, and go on learning.")
 ]
@@ -43,6 +46,7 @@ def run(
     learn: Learn = False,
     replay: Replay = None,
     refresh: Refresh = None,
+    replace_earlier: ReplaceEarlier = False,
     as_json: Json = False,
 ) -> None:
     """Control an amplifier at rate; exit code 0 if the checks hold, 1 if not, 2 for bad input or a full disk, 128 +
@@ -71,7 +75,8 @@ def run(
     loaded = _lasting(loaded, duration_s)
     require_real_bus(loaded.bus)
     live = LiveStatus(round(loaded.config.duration_s / loaded.bus.period_s), loaded.bus.period_s)
-    folder = RunFolder(out if out is not None else next_free(Path("runs"), loaded.config.name, Lane.WALL))
+    path = out if out is not None else next_free(Path("runs"), loaded.config.name, Lane.WALL)
+    folder = RunFolder(path, replace=replace_earlier)
     try:
         ran = run_into(folder, loaded, _tell, _quiet if as_json else live)
         draw(folder, ran.summary, ran.lateness_us)

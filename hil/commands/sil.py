@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from hil.commands.run import Learn, Refresh, Replay, learning_of
+from hil.commands.run import Learn, Refresh, ReplaceEarlier, Replay, learning_of
 from hil.lanes.lane import Lane
 from hil.screen.choices import InProcessLane
 from hil.screen.figures import error_lines
@@ -38,6 +38,7 @@ def sil(
     learn: Learn = False,
     replay: Replay = None,
     refresh: Refresh = None,
+    replace_earlier: ReplaceEarlier = False,
     as_json: Annotated[bool, typer.Option("--json", help="Print the summary as JSON, and nothing else.")] = False,
 ) -> None:
     """Close the loop on a scenario; exit code 0 if its checks hold, 1 if not, 2 for bad input or a full disk, 130 if
@@ -62,7 +63,8 @@ def sil(
     from pkxyz_ctrl.loop.controller import StartUpError
 
     require_bus(loaded, lane)
-    folder = RunFolder(out if out is not None else next_free(Path("runs"), loaded.config.name, lane))
+    path = out if out is not None else next_free(Path("runs"), loaded.config.name, lane)
+    folder = RunFolder(path, replace=replace_earlier)
     try:
         with progress_bar(f"{loaded.config.name}, {lane} lane", quiet=as_json) as tell:
             summary = run_into(folder, loaded, lane, tell)

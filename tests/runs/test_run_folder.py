@@ -192,6 +192,21 @@ def test_a_second_process_is_told_and_the_first_is_not_disturbed(tmp_path):
     assert recording.ticks == 5500
 
 
+def test_the_command_asks_before_it_replaces(tmp_path):
+    words = ("sil", "raster", "--lane", "fast", "--out", "run")
+    assert pkxyz(*words, cwd=tmp_path).returncode == 0
+    before = content(tmp_path / "run")
+    refused = pkxyz(*words, cwd=tmp_path)
+    assert (refused.returncode, refused.stdout) == (2, "")
+    told = "pkxyz: --out: run: holds an earlier run; give another folder, or --replace to have it replaced\n"
+    assert refused.stderr == told
+    assert content(tmp_path / "run") == before
+    again = pkxyz("sil", "run/config.toml", "--lane", "fast", "--out", "run", "--replace", cwd=tmp_path)
+    assert again.returncode == 0
+    after = content(tmp_path / "run")
+    assert {after[path] == before[path] for path in before if path.name in (CONFIG, RECORDING)} == {True}
+
+
 def test_free_names_are_given_to_one_only(tmp_path):
     given = [next_free(tmp_path / "runs", "a[b]*", Lane.FAST) for _ in range(3)]
     assert [path.name for path in given] == [f"a[b]*-fast-{n}" for n in (1, 2, 3)]
