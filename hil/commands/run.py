@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
-from hil.screen.figures import error_lines
+from hil.screen.figures import error_lines, where_to_read
 from hil.screen.first_run import say_if_compiling
 from pkxyz_ctrl.config.files import ConfigError
 
@@ -207,6 +207,8 @@ def _show(summary: "Summary", folder: Path) -> None:
             print(f"check fails: {check.name} = {check.value}")
     for fault in loop.faults:
         print(f"fault: {fault}")
+    if (line := where_to_read(loop.faults)) is not None:
+        print(line)
     if summary.interrupted:
         print("ended from outside: what was recorded until then is kept")
     print(f"recording, frame log, config, summary and picture are in {folder}/")

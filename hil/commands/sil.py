@@ -10,7 +10,7 @@ import typer
 from hil.commands.run import Learn, Refresh, ReplaceEarlier, Replay, learning_of
 from hil.lanes.lane import Lane
 from hil.screen.choices import InProcessLane
-from hil.screen.figures import error_lines
+from hil.screen.figures import error_lines, where_to_read
 from hil.screen.first_run import say_if_compiling
 from hil.screen.progress import progress_bar
 from hil.screen.terminal import bad, faint, good, plain_table, say, screen
@@ -97,6 +97,8 @@ def _show(summary: "Summary", folder: Path) -> None:
         say(line)
     for fault in summary.loop.faults:
         say(bad("fault"), f": {fault}")
+    if (line := where_to_read(summary.loop.faults)) is not None:
+        say(faint(line))
     if summary.interrupted:
         say("interrupted: what was recorded until then is kept")
     say(f"recording, frame log, config, summary and picture are in {folder}/")

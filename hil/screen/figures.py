@@ -1,6 +1,7 @@
 """The figures that every command tells alike."""
 
-from collections.abc import Iterator
+import re
+from collections.abc import Iterable, Iterator
 from typing import TYPE_CHECKING
 
 if TYPE_CHECKING:
@@ -18,3 +19,11 @@ def error_lines(rows: "RowFigures", errors_are_of: str) -> Iterator[str]:
     ):
         if measured:
             yield f"{words}{by}, x / y / z: {' / '.join(f'{value:.2f}' for value in measured.values())} nm"
+
+
+def where_to_read(faults: Iterable[str]) -> str | None:
+    """A line that leads from the fault codes, which stand in brackets in these texts, to their causes and remedies."""
+    codes = dict.fromkeys(re.findall(r"\(([A-Z]+(?:_[A-Z0-9]+)*)\)", " ".join(faults)))
+    if not codes:
+        return None
+    return "usual causes, and what clears them: docs/do/troubleshooting.md" + ", ".join(f"#{c.lower()}" for c in codes)

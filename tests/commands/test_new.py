@@ -9,7 +9,7 @@ from command_line import pkxyz
 
 from hil.commands.new import _FOLDERS, Kind, _model, commented
 from hil.runs.metrics import RowFigures
-from hil.screen.figures import error_lines
+from hil.screen.figures import error_lines, where_to_read
 from pkxyz_ctrl.config.files import CONFIG_DIR, load, names
 
 SHIPPED = [(kind, name) for kind in Kind for name in names(_FOLDERS[kind])]
@@ -85,7 +85,7 @@ def test_errors_of_each_axis_are_shown_also_where_a_check_fails(tmp_path):
 
 
 def test_error_lines_say_whose_errors_they_are():
-    rows = RowFigures(10, 0, {"x": 1.0, "y": 2.5, "z": 0.126}, None, None, None)
+    rows = RowFigures(10, 0, {"x": 1.0, "y": 2.5, "z": 0.126}, None, None, None, None, None)
     assert list(error_lines(rows, "true position")) == ["rms error while scanning, x / y / z: 1.00 / 2.50 / 0.13 nm"]
     assert ", by the estimate, " in next(error_lines(rows, "estimate"))
 
@@ -99,3 +99,11 @@ def test_the_hint_of_a_monte_carlo_study_is_a_command_that_runs(tmp_path):
     alone = pkxyz(*shlex.split(hint[1]), cwd=tmp_path)
     assert alone.returncode == 0, alone.stderr
     assert (tmp_path / "mc" / "seed-1" / "report.png").is_file()
+
+
+def test_a_fault_leads_to_its_place_on_the_troubleshooting_page():
+    faults = ["at 0.5 s: Sense comb 2 repeats (SENSE_FROZEN_2): ...", "Drive comb 1 pulls (COMB_FORCE_1): ... (x2)"]
+    line = where_to_read(faults)
+    assert line is not None
+    assert line.endswith("docs/do/troubleshooting.md#sense_frozen_2, #comb_force_1")
+    assert where_to_read(["the node ended (in the middle)"]) is None
