@@ -207,8 +207,8 @@ def _show(summary: "Summary", folder: Path) -> None:
             print(f"check fails: {check.name} = {check.value}")
     for fault in loop.faults:
         print(f"fault: {fault}")
-    if (line := where_to_read(loop.faults)) is not None:
-        print(line)
+    if (where := where_to_read(loop.faults)) is not None:
+        print(where)
     if summary.interrupted:
         print("ended from outside: what was recorded until then is kept")
     print(f"recording, frame log, config, summary and picture are in {folder}/")

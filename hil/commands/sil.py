@@ -97,8 +97,8 @@ def _show(summary: "Summary", folder: Path) -> None:
         say(line)
     for fault in summary.loop.faults:
         say(bad("fault"), f": {fault}")
-    if (line := where_to_read(summary.loop.faults)) is not None:
-        say(faint(line))
+    if (where := where_to_read(summary.loop.faults)) is not None:
+        say(faint(where))
     if summary.interrupted:
         say("interrupted: what was recorded until then is kept")
     say(f"recording, frame log, config, summary and picture are in {folder}/")
