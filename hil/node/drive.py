@@ -68,7 +68,6 @@ class DriveReceiver:
 
     def demand_zero(self) -> None:
         """Let nothing pass until a frame with 0 V has."""
-        self.pending = None
         self._is_zero_due = True
 
     def miss(self) -> None:

@@ -138,11 +138,15 @@ class AmplifierDriver:
         """What takes the node out of operational, where its outputs are at 0 V without any SYNC: to be sent again and
         again while nobody may want a voltage, until a heartbeat of the node's own says that it has left (RELEASED).
 
-        Until then ours is not sent, so that a node that can't be told goes to 0 V by its consumer, too. ``start``
-        begins anew.
+        Until then ours is not sent, so that a node that can't be told goes to 0 V by its consumer, too; from then on it
+        comes from here, since a tick without a sense frame ends too late for it. ``start`` begins anew.
         """
         if self.state is DriverState.RELEASED:
-            return _NOTHING
+            heartbeat = self.heartbeat_due(t_us)
+            if heartbeat is None:
+                return _NOTHING
+            self.heartbeat_sent(t_us)
+            return (heartbeat,)
         self._fall_silent()
         self.state = DriverState.RELEASING
         return (self._nmt(NmtCommand.PRE_OPERATIONAL),)

@@ -154,6 +154,20 @@ def test_heartbeat_of_another_node_or_length_says_nothing():
     assert driver.node_events == 0
 
 
+@pytest.mark.parametrize("code", [0x0100, 0x1000, 0x2310, 0x8130, 0x8250, 0xFF10, 0xFF14, 0xFFFF])
+def test_every_code_from_0x0100_on_is_an_emergency(code):
+    driver = started()
+    driver.receive(frame(f"08a {code & 0xFF:02x} {code >> 8:02x} 01 00 00 00 00 00"), 10)
+    assert driver.node_events == NODE_EMERGENCY
+
+
+@pytest.mark.parametrize("code", [0x0000, 0x00FF])
+def test_a_code_below_0x0100_says_that_an_error_is_over(code):
+    driver = started()
+    driver.receive(frame(f"08a {code & 0xFF:02x} {code >> 8:02x} 00 00 00 00 00 00"), 10)
+    assert driver.node_events == 0
+
+
 def test_emergencies_are_kept_and_latched_until_acknowledged():
     driver = started()
     driver.receive(frame("08a 00 00 00 00 00 00 00 00"), 10)
@@ -208,11 +222,10 @@ def test_a_release_is_repeated_until_the_node_says_that_it_has_left_operational(
     assert driver.heartbeat_due(10**9) is None  # the node's consumer is to miss us
     driver.receive(heartbeat(PRE_OPERATIONAL), 600)
     assert driver.state is DriverState.RELEASED
-    assert driver.release(700) == ()
-    assert text((driver.heartbeat_due(700),)) == [OUR_HEARTBEAT]
-    driver.heartbeat_sent(700)
+    assert text(driver.release(700)) == [OUR_HEARTBEAT]
     assert driver.heartbeat_due(20_599) is None
-    assert driver.heartbeat_due(20_600) is not None
+    assert driver.release(20_599) == ()
+    assert text(driver.release(20_600)) == [OUR_HEARTBEAT]
     assert (driver.failure, driver.node_events) == ("", 0)  # all this is as it should be
 
 
@@ -221,7 +234,7 @@ def test_whatever_leaves_operational_ends_the_release_and_a_node_that_is_started
     driver = started()
     driver.release(0)
     driver.receive(heartbeat(left), 100)
-    assert driver.release(200) == ()
+    assert text(driver.release(200)) == [OUR_HEARTBEAT]
     driver.receive(heartbeat(OPERATIONAL), 300)  # somebody else did that
     assert text(driver.release(400)) == [PRE_OP]
     assert driver.heartbeat_due(10**9) is None

@@ -7,9 +7,10 @@ import control
 import numpy as np
 import pytest
 import scipy.linalg
-from loop_rig import MIDDLE, bus, controller, controller_with, law, stage
+from loop_rig import MIDDLE, bus, controller, controller_with, law, setup, stage
 
-from pkxyz_ctrl.config.files import ConfigError
+from pkxyz_ctrl.config.files import ConfigError, load
+from pkxyz_ctrl.config.stage import StageConfig
 from pkxyz_ctrl.core.linear3 import inverse3
 from pkxyz_ctrl.design.drive_limits import count_max, slew_counts
 from pkxyz_ctrl.design.law import amplifier_time_constant_s, design_law
@@ -243,6 +244,17 @@ def test_limits_in_counts_never_exceed_those_in_volts():
     for slew in (1e3, 1e5, 2.5e5):
         counts = slew_counts(controller_with(limits={"slew_max_v_per_s": slew}), bus())
         assert counts * (200 / 32767) <= slew * 200e-6 * (1 + 1e-9) < (counts + 1) * (200 / 32767)
+
+
+def test_a_stage_that_bears_less_than_the_controller_allows_sets_the_limit():
+    config = load("stages", "reconstructed", StageConfig)
+    weak = Stage(config.model_copy(update={"limits": config.limits.model_copy(update={"voltage_max_v": 150.0})}))
+    assert count_max(weak, controller(), bus()) * (200 / 32767) <= 150.0
+    assert count_max(weak, controller(), bus()) == count_max(
+        stage(), controller_with(limits={"voltage_max_v": 150.0}), bus()
+    )
+    run = dataclasses.replace(setup(), stage=weak.config)
+    assert run.gate.count_max == count_max(weak, controller(), bus())
 
 
 def test_limits_that_contradict_each_other_are_refused():

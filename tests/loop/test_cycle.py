@@ -131,6 +131,19 @@ def test_nobody_enables_before_homing():
         assert not row["drive_count"].any()
 
 
+@pytest.mark.parametrize("mode", [Mode.BOOT, Mode.PRE_OPERATIONAL, Mode.FAULT])
+def test_the_estimate_rests_where_no_node_is_expected(mode):
+    """Frames that are anything leave no trace: what ran away with them would outlive the clear."""
+    c = Cycle(law(autostart=False), mode=mode)
+    for k in range(200):
+        row = c.tick(AT_REST + np.array([9000, -4000, 15_000]) * (-1) ** k)
+    assert c.mode is mode
+    at_rest = Cycle(law(autostart=False), mode=mode)
+    resting = at_rest.tick(AT_REST + np.array([9000, -4000, 15_000]) * (-1) ** 199)
+    for field in ("estimate_m", "estimate_m_per_s", "disturbance_n"):
+        assert np.array_equal(row[field], resting[field]), field
+
+
 def test_a_missing_frame_is_bridged_by_the_prediction():
     """Up to four in a row: no innovation, the filter follows its own prediction, the loop stays closed."""
     c = enabled()

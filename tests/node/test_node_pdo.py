@@ -1,5 +1,7 @@
 """Process data of the amplifier node: what is applied when, what is sent when, and what is refused."""
 
+from collections.abc import Callable
+
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
@@ -307,6 +309,105 @@ def test_combs_are_released_in_time_when_no_sync_comes(timeout_ms: int) -> None:
         rig.run(100)
     assert rig.plant.driven == [(applied_us, (4, 5, 6)), (applied_us + 1000 * timeout_ms, ZERO)]
     assert emergencies(rig) == [MISSING]
+
+
+def released_by_silence(rig: Rig) -> None:
+    for _ in range(7):
+        rig.cycle()
+
+
+def released_by_a_step(rig: Rig) -> None:
+    rig.cycle((5000, 5, 5))
+    rig.cycle((5, 5, 5))
+
+
+def released_by_a_missed_sync(rig: Rig) -> None:
+    rig._sync += 1
+    rig.cycle((5, 5, 5))
+
+
+def released_by_a_sync_that_was_missed_while_nothing_waited(rig: Rig) -> None:
+    rig.cycle()
+    rig._sync += 1
+    rig.cycle()
+
+
+def released_by_time(rig: Rig) -> None:
+    rig.run(21_000)
+
+
+@pytest.mark.parametrize(
+    "release",
+    [
+        released_by_silence, released_by_a_step, released_by_a_missed_sync,
+        released_by_a_sync_that_was_missed_while_nothing_waited, released_by_time,
+    ],
+)  # fmt: skip
+def test_what_the_node_has_released_is_energised_by_nothing_but_0_v_first(release: Callable[[Rig], None]) -> None:
+    """A second frame in sequence is no longer late, and would be taken: one with 0 V is owed."""
+    rig = Rig()
+    rig.write(0x2011, 0, 100, 2)
+    rig.energise((5, 5, 5))
+    release(rig)
+    assert rig.node.outputs == ZERO
+    for _ in range(5):
+        rig.cycle((5, 5, 5))
+        assert rig.node.outputs == ZERO
+    rig.forget()
+    rig.cycle(ZERO)
+    rig.cycle((5, 5, 5))
+    rig.sync()
+    assert rig.node.outputs == (5, 5, 5)
+    assert LATE not in emergencies(rig)  # what was refused for want of 0 V makes the next one no later
+
+
+@pytest.mark.parametrize("again", [(128, 1), (129, 1)])
+def test_a_new_start_owes_nothing_and_takes_any_counter(again: tuple[int, int]) -> None:
+    rig = Rig()
+    rig.energise((5, 5, 5))
+    for _ in range(3):
+        rig.cycle()  # SYNCs without a frame: the next one would be late
+    released_by_silence(rig)  # and 0 V would be due
+    rig.nmt(again[0])
+    rig.run(10_000)
+    if again[0] == 128:
+        rig.drive(ZERO)  # not heard, and so no counter to follow
+    rig._counter = (rig._counter + 77) % 256
+    rig.forget()
+    rig.start()
+    if again[0] == 128:
+        rig.cycle(ZERO)
+    rig.cycle((6, 6, 6))
+    rig.sync()
+    rig.run(2000)
+    assert rig.node.outputs == (6, 6, 6)
+    assert emergencies(rig) in ([], [0])  # at most the end of what was before
+
+
+def test_a_frame_that_was_refused_for_want_of_0_v_makes_the_next_one_no_later() -> None:
+    rig = Rig()
+    rig.write(0x2011, 0, 100, 2)
+    rig.energise((5, 5, 5))
+    released_by_a_step(rig)
+    for _ in range(3):
+        rig.cycle((5, 5, 5))
+    rig.cycle(ZERO)
+    rig.run(2000)
+    assert emergencies(rig) == [STEP]
+
+
+def test_a_frame_before_the_first_sync_of_a_new_start_is_not_late_for_one_of_before() -> None:
+    rig = Rig()
+    rig.energise((5, 5, 5))
+    rig.cycle()
+    rig.cycle()  # a SYNC without a frame
+    rig.nmt(128)
+    rig.start()
+    rig.forget()
+    rig.drive((6, 6, 6))
+    rig.sync()
+    rig.run(2000)
+    assert (rig.node.outputs, emergencies(rig)) == ((6, 6, 6), [])
 
 
 def test_nothing_is_missed_at_zero_volts() -> None:

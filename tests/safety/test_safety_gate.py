@@ -1,5 +1,6 @@
 """The gate's limits: each boundary passes and one past it does not; what it remembers; and random traffic."""
 
+import dataclasses
 import struct
 from dataclasses import dataclass, field
 
@@ -9,6 +10,8 @@ from gate_frames import CONFIG, DRIVE_ID, WRITES, crc8h2f, drive, holding, nmt, 
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
+from hil.lanes.wall import wall_gate
+from hil.runs.scenario import load_scenario
 from pkxyz_ctrl.can.driver_config import DriverConfig
 from pkxyz_ctrl.can.frame import FD, REMOTE, Frame
 from pkxyz_ctrl.can.sdo import request
@@ -152,6 +155,25 @@ def test_after_a_reset_any_counter_may_come(command: int, counter: int) -> None:
     assert passes(gate, drive(0, 0, 0, counter), T)
     assert passes(gate, sync(), 2 * T)
     assert passes(gate, drive(1, 1, 1, counter + 1), 2 * T)
+
+
+def test_what_a_loop_allows_itself_between_two_voltages() -> None:
+    """In lockstep from a tick that waited for its frame in vain to one that had it at once; at rate the guard that the
+    clock of the ticks keeps. Never nothing: a program that babbles is held back by it, too.
+    """
+    for name in ("fd_5k", "unix_1k", "unix_2k", "socketcan_classic"):
+        setup = load_scenario("faults", bus=name).setup()
+        can, period_us = setup.bus.can, setup.bus.period_us
+        assert can is not None
+        spacing_us = setup.gate.spacing_min_us
+        assert spacing_us == min(period_us // 2, period_us - can.sense_deadline_us - can.compute_us)
+        assert spacing_us > 0
+        at_rate = wall_gate(setup.gate)
+        assert at_rate.spacing_min_us == period_us // 8
+        gate = holding((5, 5, 5), dataclasses.replace(CONFIG, period_us=period_us, spacing_min_us=period_us // 8))
+        assert not passes(gate, drive(6, 5, 5, 0), period_us // 8 - 1)
+        gate.clear()
+        assert passes(gate, drive(6, 5, 5, 0), period_us // 8)
 
 
 @pytest.mark.parametrize("syncs", range(1, 9))

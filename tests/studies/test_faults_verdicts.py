@@ -1,0 +1,107 @@
+"""The verdicts of the matrix are the limits themselves: what is a little beyond one of them is told."""
+
+import dataclasses
+from functools import cache
+
+import numpy as np
+import pytest
+
+from hil.node.amplifier import AmplifierNode
+from hil.studies.faults.matrix import CASES
+from hil.studies.faults.outcome import RISE_V, largest_rise_v, largest_step_v, run_case, setup_for
+from pkxyz_ctrl.can.driver import AmplifierDriver
+from pkxyz_ctrl.can.sense_input import SenseInput
+from pkxyz_ctrl.config.controller import ControllerConfig
+from pkxyz_ctrl.loop.controller import Controller
+
+
+@cache
+def scan():
+    return setup_for("lqg")
+
+
+def case(text):
+    return next(c for c in CASES if c.text == text)
+
+
+def applied_as_shipped(self, counts, t_us):
+    self._drive.pending, self._silent_syncs, self.outputs = None, 0, counts
+    self._plant.drive(counts)
+
+
+def steps(self, counts, t_us):
+    """25 V too much at comb 1, once."""
+    self.applied = getattr(self, "applied", 0) + 1
+    a, b, c = counts
+    applied_as_shipped(self, (a + 4096, b, c) if self.applied == 1050 else counts, t_us)
+
+
+def exceeds(self, counts, t_us):
+    a, b, c = counts
+    applied_as_shipped(self, (36_000, b, c) if a > 20_000 else counts, t_us)
+
+
+@pytest.mark.parametrize(
+    ("owner", "part", "defect", "fault", "words"),
+    [
+        (AmplifierNode, "_apply", steps, "sense.1:off", "a step of 25"),
+        (AmplifierNode, "_apply", exceeds, "sense.1:off", "beyond 200 V"),
+        (AmplifierDriver, "release", lambda self, t_us: (), "bus.sync:drop", "not within 0.4 ms"),
+        (SenseInput, "take", None, "bus.sense:drop", "instead of 5"),
+        (Controller, "_enter", None, "bus.sync:drop", "a voltage was commanded in a mode that allows none"),
+    ],
+)
+def test_what_is_a_little_beyond_a_bound_is_told(monkeypatch, owner, part, defect, fault, words):
+    if part == "take":
+        defect = forgiving(SenseInput.take)
+    if part == "_enter":
+        defect = commanding(Controller._enter)
+    monkeypatch.setattr(owner, part, defect)
+    problems = run_case("lqg", scan(), case(fault)).problems
+    assert any(words in problem for problem in problems), problems
+
+
+def forgiving(take):
+    """The first three ticks without a frame pass for ones with the last: the decision comes as much later."""
+    missing = []
+
+    def forgiven(self):
+        a, b, c, status = take(self)
+        if status & 1 and len(missing) < 3:
+            missing.append(status)
+            return a, b, c, 0
+        return a, b, c, status
+
+    return forgiven
+
+
+def commanding(enter):
+    def entered(self, mode):
+        enter(self, mode)
+        self.memory["row"]["drive_count"][0, 1] = 7
+
+    return entered
+
+
+def test_steps_and_rises_are_those_of_the_whole_run():
+    step, low = 20.0, 0.0
+    volts = np.array([0.0, 10.0, 30.0, 50.0, 49.0, 0.0, 0.0, 0.0])[:, np.newaxis]
+    assert largest_step_v(volts) == step
+    assert largest_step_v(volts[:4], volts[4]) == step
+    fall = np.array([100.0, 100.0, 40.0, 0.0, 0.0])[:, np.newaxis]  # looked at in the middle of a release
+    assert largest_step_v(fall) == low
+    assert largest_step_v(np.array([100.0, 100.0, 40.0, 40.0])[:, np.newaxis]) == 60.0
+    assert largest_step_v(np.array([100.0, np.nan, 40.0, 41.0])[:, np.newaxis]) == 1.0
+    late = np.array([50.0, 50.0, 0.0, 0.0, 0.0, 0.3])[:, np.newaxis]
+    assert largest_rise_v(late, np.array([False, True, True, True, True, True])) == 0.3
+    assert largest_rise_v(late, np.array([False, True, True, True, True, False])) == low
+
+
+def test_every_bound_of_the_matrix_follows_from_a_limit():
+    limits = scan().controller.limits
+    assert isinstance(scan().controller, ControllerConfig)
+    assert RISE_V == 0.1  # 16 counts
+    assert (limits.voltage_max_v, limits.slew_max_v_per_s * scan().bus.period_s) == (200.0, pytest.approx(20.0))
+    for each in CASES:
+        assert each.discharged_within_ms in (None, 21.0)  # two ticks, or the node's own 20 ms and the look after them
+        assert dataclasses.replace(scan(), faults=(each.fault,)).faults[0].at_s == 0.22
