@@ -9,7 +9,7 @@ import typer
 
 from hil.commands.run import Learn, Refresh, ReplaceEarlier, Replay, learning_of
 from hil.lanes.lane import Lane
-from hil.screen.choices import InProcessLane
+from hil.screen.choices import InProcessLane, require_simulated
 from hil.screen.figures import error_lines, where_to_read
 from hil.screen.first_run import say_if_compiling
 from hil.screen.progress import progress_bar
@@ -62,6 +62,7 @@ def sil(
     from pkxyz_ctrl.design.model.design_error import DesignError
     from pkxyz_ctrl.loop.controller import StartUpError
 
+    require_simulated(loaded.bus, "sil")
     require_bus(loaded, lane)
     path = out if out is not None else next_free(Path("runs"), loaded.config.name, lane)
     folder = RunFolder(path, replace=replace_earlier)

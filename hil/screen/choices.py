@@ -1,6 +1,12 @@
 """What several commands let one choose."""
 
 from enum import StrEnum
+from typing import TYPE_CHECKING
+
+from pkxyz_ctrl.config.files import ConfigError
+
+if TYPE_CHECKING:
+    from pkxyz_ctrl.config.bus import BusConfig
 
 
 class InProcessLane(StrEnum):
@@ -15,3 +21,13 @@ class Tones(StrEnum):
 
     MULTISINE = "multisine"
     STEPPED = "stepped"
+
+
+def require_simulated(bus: "BusConfig", command: str) -> None:
+    """Raise ``ConfigError`` for a bus with real sockets or adapters: ``command`` would simulate it without a word."""
+    if bus.can is not None and bus.can.interface != "pkxyz-sim":
+        raise ConfigError(
+            f"bus {bus.name!r} leads to other processes or devices (can.interface = {bus.can.interface!r}), and "
+            f"`pkxyz {command}` simulates: run on it with `pkxyz run --bus {bus.name}`, or simulate with --bus fd_5k, "
+            "classic_2k or local_20k"
+        )

@@ -1,10 +1,12 @@
 """What ``pkxyz run`` tells while it runs, and which bus it takes where the scenario's is simulated."""
 
 import io
+import sys
 
 import numpy as np
 import pytest
 
+from hil.cli import main
 from hil.lanes.ending import Ended
 from hil.screen.live_status import LiveStatus
 from hil.studies import fitting_bus
@@ -88,3 +90,18 @@ def test_where_none_fits_it_is_said_in_a_line_with_what_to_do(monkeypatch):
     assert "\n" not in str(caught.value)
     with pytest.raises(Ended):
         measured_with({500: 0}, monkeypatch, ended_by=2)
+
+
+@pytest.mark.parametrize("bus", ["unix_1k", "socketcan_fd"])
+@pytest.mark.parametrize("words", ["sil raster", "identify --plant harsh", "margins --measured"])
+def test_what_simulates_refuses_a_bus_that_leads_out_of_the_process(bus, words, tmp_path, capsys, monkeypatch):
+    """It would take its rate and scales, and simulate the rest without a word."""
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.setattr(sys, "argv", ["pkxyz", *words.split(), "--bus", bus])
+    with pytest.raises(SystemExit) as ended:
+        main()
+    assert ended.value.code == 2
+    (line,) = [words for words in capsys.readouterr().err.splitlines() if words.startswith("pkxyz: ")]
+    assert f"pkxyz run --bus {bus}" in line
+    assert "fd_5k" in line
+    assert list(tmp_path.iterdir()) == []

@@ -4,6 +4,7 @@ What the machine does in between is not known here, so nothing is asserted about
 where no tick was missed, times are those of the frames.
 """
 
+import dataclasses
 import json
 import os
 import re
@@ -21,9 +22,12 @@ import pytest
 from hil.bus.unix_bus import UnixBus
 from hil.commands import run as run_cli
 from hil.lanes import in_process as lanes
+from hil.lanes.ending import Ending
 from hil.lanes.lane import Lane
+from hil.lanes.wall import WallRig, wall_gate
 from hil.lanes.wall_plant import TRUTH
 from hil.recording.recording import Recording
+from hil.recording.wall_recorder import WallRecorder
 from hil.runs.scenario import load_scenario
 from pkxyz_ctrl.config.files import CONFIG_DIR, ConfigError
 from pkxyz_ctrl.safety.modes import Mode
@@ -366,3 +370,35 @@ def test_run_and_plant_meet_on_the_scenarios_bus_unless_it_is_simulated(bench, m
     assert "fd_5k, is simulated; meeting on unix_2k" in capsys.readouterr().err
     with pytest.raises(ConfigError, match="is simulated"):  # asked for by name, it is refused
         run_cli.run("raster", bus="fd_5k")
+
+
+class Stopped:
+    """A clock that stands still where nobody waits for it."""
+
+    def __init__(self, now_us):
+        self.now_us = now_us
+        self.spend = None
+
+    def wait_until(self, t_us):
+        self.now_us = max(self.now_us, t_us)
+
+
+def test_ticks_keep_as_far_apart_as_the_gate_asks(tmp_path):
+    """A tick that ends less than a guard before the next one is to begin gives it up: the gate would stop its drive
+    frame, which may be no nearer to the one before than that.
+    """
+    setup = load_scenario("raster", bus="unix_2k").setup()
+    can_config = setup.bus.can.model_copy(update={"channel": f"{tmp_path}/bus"})
+    setup = dataclasses.replace(setup, bus=setup.bus.model_copy(update={"can": can_config}))
+    guard_us = wall_gate(setup.gate).spacing_min_us
+    assert guard_us == 500 // 8
+    recorder = WallRecorder(tmp_path / "rows.parquet", tmp_path / "frames.log", {}, "bus")
+    try:
+        rig = WallRig(setup, recorder, Ending())
+        for end_us, begins_us in ((500 - guard_us, 500), (500 - guard_us + 1, 1000), (499, 1000)):
+            rig.ticks._clock = rig.clock = Stopped(end_us)
+            rig.ticks.wait_until(500)
+            assert rig.ticks._clock.now_us == begins_us
+        rig.close()
+    finally:
+        recorder.close()

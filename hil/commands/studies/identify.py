@@ -7,13 +7,13 @@ from typing import TYPE_CHECKING, Annotated, Any
 import typer
 
 from hil.lanes.lane import Lane
-from hil.screen.choices import InProcessLane, Tones
+from hil.screen.choices import InProcessLane, Tones, require_simulated
 from hil.screen.errors import one_line_errors
 from hil.screen.first_run import say_if_compiling
 from hil.screen.outputs import folder_to_write, writing
 from hil.screen.progress import progress_bar
 from hil.screen.terminal import bad, plain_table, print_whole, say
-from pkxyz_ctrl.config.files import ConfigError, find
+from pkxyz_ctrl.config.files import ConfigError, find, load
 
 if TYPE_CHECKING:
     from hil.studies.identify.identification import Identification
@@ -65,12 +65,14 @@ def identify(
     from hil.api.identify import identify as identified
     from hil.studies.identify import identification
     from hil.studies.identify.outside_scale import outside_scale, read_points
+    from pkxyz_ctrl.config.bus import BusConfig
     from pkxyz_ctrl.stage import Stage
 
     if out is not None:
         folder_to_write(out)
         if (out / STAGE).exists() and (out / STAGE).samefile(find("stages", stage)):
             raise ConfigError(f"--out: {out}: its {STAGE} is the --stage that is identified; give another folder")
+    require_simulated(load("buses", bus, BusConfig), "identify")
     say_if_compiling(quiet=as_json)
     outside = None if reference is None else outside_scale(Stage.load(stage), *read_points(reference))
     with one_line_errors(), progress_bar("exciting the loop", quiet=as_json) as tell:

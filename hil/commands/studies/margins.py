@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 import typer
 
 from hil.lanes.lane import Lane
-from hil.screen.choices import InProcessLane, Tones
+from hil.screen.choices import InProcessLane, Tones, require_simulated
 from hil.screen.errors import one_line_errors
 from hil.screen.first_run import say_if_compiling
 from hil.screen.outputs import folder_to_write, writing
@@ -57,6 +57,7 @@ def margins(
     from hil.studies.margins import loop as loops
     from hil.studies.margins.loop import agreement, over_changed_plants
     from hil.studies.operating_point import operating_strokes
+    from pkxyz_ctrl.config.bus import BusConfig
     from pkxyz_ctrl.design.margins.tolerances import Tolerances
     from pkxyz_ctrl.stage import Stage
 
@@ -65,6 +66,7 @@ def margins(
     if out is not None:
         folder_to_write(out)
     if measured:
+        require_simulated(load("buses", bus, BusConfig), "margins --measured")
         say_if_compiling(quiet=as_json)
     with one_line_errors():
         law = design(controller, stage=stage, bus=bus)
