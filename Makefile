@@ -5,12 +5,13 @@
 # make mutate change one thing at a time in gate, modes, monitors, comb law and codec: does a test notice? SECONDS=1200
 # make prove  every state that shipped controller and node can reach under any law with faults: EXPLORED="two one"
 # make fuzz   hostile frames and broken documents: FRAMES=1000000 DOCUMENTS=10000
+# make kills  SIGKILL at random moments of runs: every recording opens, none is silently short. KILLS=300
 # make docs   draw every figure of docs/ and fill in the generated tables
 # make docs-site  build the documentation into site/: open site/index.html
 PYTHON ?= python3
 BIN := .venv/bin
 
-.PHONY: sil test test-socketcan bench docs docs-site wheel clean mutate fuzz prove
+.PHONY: sil test test-socketcan bench docs docs-site wheel clean mutate fuzz kills prove
 
 sil: .venv/.ready
 	$(BIN)/pkxyz sil
@@ -38,6 +39,10 @@ FRAMES ?= 1000000
 DOCUMENTS ?= 10000
 fuzz: .venv/.ready
 	$(BIN)/python tests/fuzz/fuzz.py --frames $(FRAMES) --documents $(DOCUMENTS)
+
+KILLS ?= 300
+kills: .venv/.ready
+	$(BIN)/python tests/recording/kills.py $(KILLS)
 
 docs: .venv/.ready
 	$(BIN)/python docs/build.py
