@@ -38,7 +38,7 @@ def errors_nm(stage: str) -> tuple[Array, Array]:
 def main() -> None:
     """Identify, run twice, draw."""
     bus, controller = load("buses", "fd_5k", BusConfig), load("controllers", "lqg", ControllerConfig)
-    found = identify(bare_setup("reconstructed", "harsh", controller, bus, 1), np.full(3, 12.5e-6), "fast")
+    found = identify(bare_setup("reconstructed", "harsh", controller, bus, 1), np.full(3, 12.5e-6), Lane.FAST)
     with TemporaryDirectory() as folder:
         path = Path(folder) / "stage.toml"
         write_calibrated_stage(find("stages", "reconstructed"), found, "figure", path)
