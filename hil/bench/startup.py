@@ -15,6 +15,17 @@ from hil.runs.run_folder import PICTURE
 
 REPEATS = 3
 _COMMAND = "from hil.cli import main; main()"
+_TWICE = """
+import contextlib, io, sys, time
+from hil.cli import main
+words = sys.argv
+for n in range(2):
+    sys.argv = ["pkxyz", "sil", "--out", f"{words[1]}-{n}", "--json"]
+    before_s = time.process_time() if n else 0.0
+    with contextlib.redirect_stdout(io.StringIO()), contextlib.suppress(SystemExit):
+        main()
+    print(time.process_time() - before_s)
+"""
 _LINE = re.compile(r"^import time:\s+(\d+) \|\s+\d+ \|\s+([\w.]+)$", re.MULTILINE)
 _SHOWN = 8
 
@@ -31,6 +42,8 @@ def sil() -> list[Figure]:
             after = os.times()
             cpu_s.append(after.children_user + after.children_system - before.children_user - before.children_system)
         by_package = _import_seconds(_run(Path(folder) / "imports", "-X", "importtime"))
+        ratios = [first / again for first, again in (_twice(Path(folder) / f"twice-{k}") for k in range(REPEATS))]
+        helped_s = [_help() for _ in range(REPEATS)]
     most = ", ".join(f"{package} {s:.2f}" for package, s in by_package.most_common(_SHOWN))
     return [
         Figure("sil.wall", min(wall_s), "s", 5.0, "at most", statistics.median(wall_s),
@@ -38,6 +51,10 @@ def sil() -> list[Figure]:
         Figure("sil.cpu", min(cpu_s), "s", None, None, statistics.median(cpu_s), "processor time of the same"),
         Figure("sil.imports", by_package.total(), "s", None, None, None,
                f"imports, in one more run; by package: {most}"),
+        Figure("sil.over_run", min(ratios), "x", 1.8, "at most", statistics.median(ratios),
+               "processor time of the command over that of the same command once more in the same process"),
+        Figure("sil.help", min(helped_s), "s", 0.3, "at most", statistics.median(helped_s),
+               f"`pkxyz --help`, new process; the clock on the wall, {REPEATS} runs"),
     ]  # fmt: skip
 
 
@@ -48,6 +65,21 @@ def _run(folder: Path, *flags: str) -> str:
     if not (folder / PICTURE).is_file():
         raise RuntimeError(f"pkxyz sil left no picture (exit code {done.returncode}): {done.stderr[-2000:]}")
     return done.stderr
+
+
+def _twice(folder: Path) -> tuple[float, float]:
+    """Processor seconds of the command in a new process, and of the same command once more in that process."""
+    command = [sys.executable, "-c", _TWICE, str(folder)]
+    done = subprocess.run(command, capture_output=True, text=True, check=True)
+    first_s, again_s = map(float, done.stdout.split())
+    return first_s, again_s
+
+
+def _help() -> float:
+    """Seconds of the clock on the wall until the list of commands has been printed."""
+    begin_s = time.perf_counter()
+    subprocess.run([sys.executable, "-c", _COMMAND, "--help"], capture_output=True, check=True)
+    return time.perf_counter() - begin_s
 
 
 def _import_seconds(report: str) -> Counter[str]:

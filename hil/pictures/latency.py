@@ -1,15 +1,18 @@
 """How late a loop was: histograms by whole microseconds."""
 
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 import numpy as np
 from matplotlib.axes import Axes
 
 from hil.pictures.style import dress, legend, save, sheet
-from hil.studies.latency import Latency
+
+if TYPE_CHECKING:
+    from hil.studies.latency import Latency
 
 
-def draw_latency(measured: Latency, path: Path) -> None:
+def draw_latency(measured: "Latency", path: Path) -> None:
     """Wake-ups and cycles of ``pkxyz latency``, and cyclictest's beside them if it was measured."""
     histograms = {"wake-up of the loop": measured.lateness_us, "cycle": measured.cycle_us}
     if measured.cyclictest_us is not None:

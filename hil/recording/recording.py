@@ -174,9 +174,9 @@ class Recording:
         self._require(names)
         for batch in self._groups(names):
             yield {
-                field: np.stack([batch.column(name).to_numpy() for name in columns(field)], axis=1)
+                field: np.stack([_numbers(batch.column(name)) for name in columns(field)], axis=1)
                 if len(columns(field)) > 1
-                else batch.column(field).to_numpy()
+                else _numbers(batch.column(field))
                 for field in fields
             }
 
@@ -215,7 +215,7 @@ class Recording:
             table = self._table if self._file is None else self._file.read(columns=list(names))
         except (OSError, pa.ArrowException) as error:
             raise self._damaged(error) from None
-        return [table.column(name).to_numpy() for name in names]
+        return [_numbers(table.column(name)) for name in names]
 
 
 def _groups_of(rows: JournalReader, schema: pa.Schema) -> Iterator[list[pa.RecordBatch]]:
@@ -246,12 +246,24 @@ def _metadata(schema: pa.Schema, path: Path) -> tuple[dict[str, Any], dict[str, 
 
 
 def _batch(block: NDArray[np.void], schema: pa.Schema) -> pa.RecordBatch:
-    arrays = []
+    parts: list[NDArray[Any]] = []
     for field in ROW.names or ():
         values = block[field]
-        parts = [values] if values.ndim == 1 else values.T
-        arrays += [pa.array(np.ascontiguousarray(part)) for part in parts]
-    return pa.record_batch(arrays, schema=schema)
+        parts.extend([values] if values.ndim == 1 else values.T)
+    # pa.array and to_numpy load pandas where it is installed, to ask after series: that takes longer than a run
+    buffers = [pa.py_buffer(np.ascontiguousarray(part)) for part in parts]
+    columns = zip(schema.types, buffers, strict=True)
+    return pa.record_batch([pa.Array.from_buffers(t, len(block), [None, b]) for t, b in columns], schema=schema)
+
+
+def _numbers(column: pa.Array | pa.ChunkedArray) -> NDArray[Any]:
+    """The numbers of a column, read-only. Raises ``pa.ArrowInvalid`` where some are missing."""
+    if column.null_count:
+        raise pa.ArrowInvalid("a column has gaps")
+    kind = np.dtype(column.type.to_pandas_dtype())
+    chunks = column.chunks if isinstance(column, pa.ChunkedArray) else [column]
+    parts = [np.frombuffer(c.buffers()[1], kind, len(c), c.offset * kind.itemsize) for c in chunks if len(c)]
+    return parts[0] if len(parts) == 1 else np.concatenate(parts) if parts else np.empty(0, kind)
 
 
 def _reason(error: Exception) -> str:

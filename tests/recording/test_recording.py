@@ -264,3 +264,12 @@ def test_ten_minutes_at_5_khz_stay_below_500_mb(tmp_path):
     path = tmp_path / "long.parquet"
     assert peak_mb(path, 3_000_000) < 500
     assert Recording.open(path).ticks > 2_990_000
+
+
+def test_a_recording_is_written_and_read_without_pandas(tmp_path):
+    """Where it is installed, pyarrow would load it to ask after series, and that takes longer than a run."""
+    code = "import sys\nfrom hil.cli import main\ntry: main()\nfinally: print('pandas' in sys.modules, file=sys.stderr)"
+    words = ["sil", "steps", "--lane", "fast", "--out", str(tmp_path / "run"), "--json"]
+    done = subprocess.run([sys.executable, "-c", code, *words], capture_output=True, text=True, check=False)
+    assert done.returncode == 0, done.stderr
+    assert done.stderr.splitlines()[-1] == "False"
