@@ -3,6 +3,7 @@
 Plant n is drawn by seed n, which also seeds its noise, so any of them runs again alone and gives the same bits.
 """
 
+import dataclasses
 import json
 import math
 from collections.abc import Callable, Iterator, Mapping, Sequence
@@ -52,7 +53,12 @@ class Study:
 
 
 def changed_plant(plant: PlantConfig, change: Perturbation) -> PlantConfig:
-    """The software plant with the perturbation of the linear one, in place of its own errors of these kinds."""
+    """The software plant with the perturbation of the linear one, in place of its own errors of these kinds.
+
+    A delay is the sense chain's; nothing can be seen before it happens, so one below 0 is none. Of parasitic modes the
+    first is simulated, one way, on a plant without ``flexible_modes`` of its own; the others count in Ms alone. A sense
+    chain whose noise passes its filter keeps that filter.
+    """
     data = plant.model_dump()
     chains = (change.stiffness,) * 3
     data["stiffness_mismatch"] |= {"on": True, "leaf": chains, "crank_hinge": chains, "link_hinge": chains}
@@ -60,6 +66,14 @@ def changed_plant(plant: PlantConfig, change: Perturbation) -> PlantConfig:
     data["comb_mismatch"] |= {"on": True, "relative": change.comb_gain}
     if change.quality_factor is not None:
         data["damping"] |= {"on": True, "quality_factor": change.quality_factor}
+    if change.delay_s > 0.0:
+        own_s = plant.sense_delay.delay_s if plant.sense_delay.on else 0.0
+        data["sense_delay"] |= {"on": True, "delay_s": own_s + change.delay_s}
+    data["amplifier_bandwidth"]["corner_hz"] *= 1.0 + change.amplifier_bandwidth
+    if change.sense_bandwidth_hz is not None and plant.sense_noise.sampled == "per_sample":
+        data["sense_bandwidth"] |= {"on": True, "corner_hz": change.sense_bandwidth_hz}
+    if change.parasitic and not plant.flexible_modes.on:
+        data["parasitic"] |= {"on": True} | dataclasses.asdict(change.parasitic[0])
     return PlantConfig.model_validate(data)
 
 

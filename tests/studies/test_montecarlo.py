@@ -13,7 +13,8 @@ from hil.runs.scenario import load_scenario
 from hil.studies.montecarlo import Result, Results, Study, changed_plant, run_one, run_study, summary, worst
 from pkxyz_ctrl.config.files import ConfigError, load
 from pkxyz_ctrl.design.margins.tolerances import Tolerances
-from pkxyz_ctrl.design.model.loop_plant import Perturbation
+from pkxyz_ctrl.design.model.loop_plant import ParasiticMode, Perturbation
+from sim.config import PlantConfig
 
 
 def a_study(controller="lqg"):
@@ -33,7 +34,32 @@ def test_the_drawn_plant_has_what_was_drawn_and_otherwise_what_it_had():
     assert (plant.damping.on, plant.damping.quality_factor) == (True, 50.0)
     assert plant.comb_mismatch.relative == (0.01, -0.02, 0.03)
     assert plant.sense_noise == setup().plant.sense_noise
-    assert changed_plant(setup().plant, Perturbation()).damping == setup().plant.damping
+    assert changed_plant(setup().plant, Perturbation()) == PlantConfig.model_validate(
+        setup().plant.model_dump() | {n: getattr(changed_plant(setup().plant, Perturbation()), n) for n in KINDS}
+    )
+
+
+KINDS = ("stiffness_mismatch", "mass_error", "comb_mismatch")
+"""Switched on by any perturbation, if only by 0."""
+
+
+def test_electronics_and_modes_that_were_drawn_are_simulated():
+    """Delay and poles, and the first parasitic mode; a delay below 0 is none, and lab keeps its own chain and modes."""
+    modes = (ParasiticMode(2500.0, 30.0, 3e-4), ParasiticMode(4500.0, 60.0, 1e-4))
+    change = Perturbation(delay_s=40e-6, amplifier_bandwidth=-0.2, sense_bandwidth_hz=20e3, parasitic=modes)
+    plant = changed_plant(setup("mild").plant, change)
+    assert (plant.sense_delay.on, plant.sense_delay.delay_s) == (True, pytest.approx(41e-6))  # 1 us is mild's own
+    assert plant.amplifier_bandwidth.corner_hz == pytest.approx(0.8 * 28e3)
+    assert (plant.sense_bandwidth.on, plant.sense_bandwidth.corner_hz) == (True, 20e3)
+    found = plant.parasitic
+    assert (found.on, found.frequency_hz, found.quality_factor, found.compliance_share) == (True, 2500.0, 30.0, 3e-4)
+    early = changed_plant(setup().plant, Perturbation(delay_s=-40e-6))
+    assert early.sense_delay == setup().plant.sense_delay
+    lab = changed_plant(setup("lab").plant, change)
+    assert not lab.parasitic.on
+    assert lab.flexible_modes == setup("lab").plant.flexible_modes
+    assert lab.sense_bandwidth == setup("lab").plant.sense_bandwidth
+    assert lab.sense_delay.delay_s == pytest.approx(40e-6)
 
 
 def test_a_study_goes_on_where_it_was_and_every_plant_runs_again_to_the_bit(tmp_path):
