@@ -384,6 +384,27 @@ def test_hold_stops_on_the_path_and_track_goes_on_along_it():
     # velocity and acceleration are those of the positions
     by_differences = (rows[2:, :3] - rows[:-2, :3]) / 400e-6
     assert np.abs(by_differences - rows[1:-1, 3:6]).max() < 0.01 * np.abs(rows[:, 3:6]).max()
+    twice = (rows[2:, :3] - 2.0 * rows[1:-1, :3] + rows[:-2, :3]) / 200e-6**2
+    off = np.abs(twice - rows[1:-1, 6:9]).max(axis=1) / np.abs(rows[:, 6:9]).max()
+    bends = np.array([0, ramp_ticks, ramp_ticks + 15, 2 * ramp_ticks + 15])  # where the ramp begins or ends at once
+    away = np.abs(np.arange(1, len(rows) - 1)[:, None] - bends).min(axis=1) > 2
+    assert off[away].max() < 0.01
+    assert off.max() < 0.12
+
+
+def test_each_hold_stands_where_the_path_was_then():
+    """Neither at rest nor at the hold before: the set-point of a hold is the last that the path asked for."""
+    c = tracking(swing(range(600)))
+    stood = []
+    for _ in range(2):
+        asked(c, 60, Event.TRACK)
+        slowing = asked(c, 21, Event.HOLD)
+        standing = asked(c, 30)
+        assert c.mode is Mode.ENABLED
+        assert standing[0, :3] == pytest.approx(slowing[-1, :3], abs=1e-12)
+        assert (standing == standing[0]).all()
+        stood.append(phases(standing[:1])[0])
+    assert (stood[1] - stood[0]) % SWING_TICKS == pytest.approx(60, abs=1e-6)
 
 
 @pytest.mark.parametrize("after", [1, 7, 13, 19])
