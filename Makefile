@@ -4,6 +4,7 @@
 # make bench  measure what the docs promise and print it
 # make mutate change one thing at a time in gate, modes, monitors, comb law and codec: does a test notice? SECONDS=1200
 # make prove  every state that shipped controller and node can reach under any law with faults: EXPLORED="two one"
+# make coverage  branches and conditions (MC/DC) of safety, codec, driver and the node's drive path that the tests meet
 # make fuzz   hostile frames and broken documents: FRAMES=1000000 DOCUMENTS=10000
 # make kills  SIGKILL at random moments of runs: every recording opens, none is silently short. KILLS=300
 # make docs   draw every figure of docs/ and fill in the generated tables
@@ -11,7 +12,7 @@
 PYTHON ?= python3
 BIN := .venv/bin
 
-.PHONY: sil test test-socketcan bench docs docs-site wheel clean mutate fuzz kills prove
+.PHONY: sil test test-socketcan bench docs docs-site wheel clean mutate fuzz kills prove coverage
 
 sil: .venv/.ready
 	$(BIN)/pkxyz sil
@@ -34,6 +35,9 @@ mutate: .venv/.ready
 
 prove: .venv/.ready
 	$(BIN)/python tests/proof/explore.py $(EXPLORED)
+
+coverage: .venv/.ready
+	$(BIN)/python tests/proof/mcdc.py
 
 FRAMES ?= 1000000
 DOCUMENTS ?= 10000

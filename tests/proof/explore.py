@@ -20,7 +20,7 @@ from scipy.sparse.csgraph import breadth_first_order, connected_components  # no
 from story import as_text, from_text, tell  # noqa: E402
 from world import CONFIGURATIONS, Configuration, Option, ViolationError, World, learnt  # noqa: E402
 
-IN_CI = ("two", "well", "one", "a cut and a loss", "slow drive time-out", "whole dialogue")
+IN_CI = ("slow drive time-out", "one", "whole dialogue", "well")
 RUNNING, STARTING, ENDED = 1, 2, 4
 
 
@@ -170,7 +170,6 @@ def report(name: str, seconds: float, show: bool = False) -> tuple[str, dict[str
     figures = {
         "states": found.states,
         "transitions": found.transitions,
-        "seconds": round(found.seconds),
         "complete": found.is_complete,
         "ticks_to_0_v": found.longest,
         "ticks_apart": found.longest_apart,

@@ -67,7 +67,9 @@ class Decision:
 
     def _matters(self, place: int) -> bool:
         return any(
-            one[1] and not other[1] and self._differ(one[0], other[0], place) for one in self.rows for other in self.rows
+            one[1] and not other[1] and self._differ(one[0], other[0], place)
+            for one in self.rows
+            for other in self.rows
         )
 
     @staticmethod
