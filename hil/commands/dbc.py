@@ -6,6 +6,7 @@ from typing import TYPE_CHECKING, Annotated
 import typer
 
 from pkxyz_ctrl.config.files import CONFIG_DIR, ConfigError
+from pkxyz_ctrl.config.refused import reason
 
 if TYPE_CHECKING:
     from pkxyz_ctrl.config.bus import BusConfig
@@ -31,7 +32,7 @@ def dbc(
     try:
         out.write_text(text, encoding="utf-8", newline="\n")
     except OSError as error:
-        raise ConfigError(f"--out: {out}: {(error.strerror or str(error)).lower()}; give another file") from None
+        raise ConfigError(f"--out: {out}: {reason(error)}; give another file") from None
 
 
 def dbc_of(bus: "BusConfig") -> str:
@@ -57,6 +58,6 @@ def _refuse_foreign(path: Path) -> None:
     try:
         begins = path.open(encoding="utf-8", errors="replace").readline()
     except OSError as error:
-        raise ConfigError(f"--out: {path}: {(error.strerror or str(error)).lower()}; give another file") from None
+        raise ConfigError(f"--out: {path}: {reason(error)}; give another file") from None
     if not begins.startswith(f'VERSION "{GENERATED}'):
         raise ConfigError(f"--out: {path}: was not written by `pkxyz dbc`; give another file, or remove it")

@@ -10,6 +10,7 @@ import typer
 from hil.screen.figures import error_lines, where_to_read
 from hil.screen.first_run import say_if_compiling
 from pkxyz_ctrl.config.files import ConfigError
+from pkxyz_ctrl.config.refused import reason
 
 if TYPE_CHECKING:
     from hil.runs.summary import Summary
@@ -138,7 +139,7 @@ def plant(
     except OSError as error:
         if truth is None:
             raise
-        raise ConfigError(f"--truth: {truth}: {(error.strerror or str(error)).lower()}") from None
+        raise ConfigError(f"--truth: {truth}: {reason(error)}") from None
 
 
 def learning_of(learn: bool, replay: str | None, refresh: str | None) -> dict[str, str] | None:

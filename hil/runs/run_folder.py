@@ -18,6 +18,7 @@ from hil.runs.scenario import LEARNT_FROM, Scenario, resolve, tables
 from hil.runs.seal import sealed
 from hil.runs.versions import versions
 from pkxyz_ctrl.config.files import ConfigError, digest, read_toml, write_toml
+from pkxyz_ctrl.config.refused import reason
 
 RECORDING, FRAMES, CONFIG, SUMMARY, PICTURE = (
     "recording.parquet",
@@ -61,9 +62,7 @@ class RunFolder:
             path.mkdir(parents=True, exist_ok=True)
             self._look()
         except OSError as error:
-            raise ConfigError(
-                f"--out: {path}: {(error.strerror or str(error)).lower()}; give a folder that can be written"
-            ) from None
+            raise ConfigError(f"--out: {path}: {reason(error)}; give a folder that can be written") from None
         if not os.access(path, os.W_OK):
             raise ConfigError(f"--out: {path}: permission denied; give a folder that can be written")
 
@@ -95,7 +94,7 @@ class RunFolder:
             write_toml(resolved, self.path / _UNFINISHED)
             (self.path / _UNFINISHED).replace(self.config)
         except OSError as error:
-            raise ConfigError(f"{self.config}: {(error.strerror or str(error)).lower()}; give another --out") from None
+            raise ConfigError(f"{self.config}: {reason(error)}; give another --out") from None
         return resolved
 
     def write_summary(self, summary: dict[str, Any]) -> None:
@@ -110,11 +109,10 @@ class RunFolder:
         try:
             yield
         except OSError as error:
-            reason = (error.strerror or str(error)).lower()
             where = self.path / Path(error.filename).name if isinstance(error.filename, str) else self.path
             raise ConfigError(
-                f"{where}: cannot be written: {reason}; what was recorded before is kept there and opens as ever; make "
-                "room, or give another --out"
+                f"{where}: cannot be written: {reason(error)}; what was recorded before is kept there and opens as "
+                "ever; make room, or give another --out"
             ) from None
 
     def _look(self) -> None:
@@ -141,7 +139,7 @@ class RunFolder:
         try:
             held = os.open(self.path, os.O_RDONLY)
         except OSError as error:
-            raise ConfigError(f"--out: {self.path}: {(error.strerror or str(error)).lower()}") from None
+            raise ConfigError(f"--out: {self.path}: {reason(error)}") from None
         try:
             fcntl.flock(held, fcntl.LOCK_EX | fcntl.LOCK_NB)
         except OSError as error:
@@ -210,7 +208,7 @@ def next_free(runs: Path, scenario: str, lane: Lane) -> Path:
         except FileExistsError:  # another process was quicker
             continue
         except OSError as error:
-            raise ConfigError(f"--out: {runs}: {(error.strerror or str(error)).lower()}; give a folder") from None
+            raise ConfigError(f"--out: {runs}: {reason(error)}; give a folder") from None
         return runs / f"{stem}{n}"
     raise AssertionError("numbers have no end")
 

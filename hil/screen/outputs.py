@@ -7,6 +7,7 @@ from contextlib import contextmanager
 from pathlib import Path
 
 from pkxyz_ctrl.config.files import ConfigError
+from pkxyz_ctrl.config.refused import reason
 
 _ELSEWHERE = "give another place to write"
 _REMEDIES = {
@@ -28,7 +29,7 @@ def what_to_do(error: OSError) -> str | None:
     if error.errno not in _REMEDIES:
         return None
     where = f"{error.filename}: " if error.filename else ""
-    return f"{where}{(error.strerror or str(error)).lower()}; {_REMEDIES[error.errno]}; what was written before is kept"
+    return f"{where}{reason(error)}; {_REMEDIES[error.errno]}; what was written before is kept"
 
 
 def folder_to_write(path: Path) -> Path:
@@ -36,7 +37,7 @@ def folder_to_write(path: Path) -> Path:
     try:
         path.mkdir(parents=True, exist_ok=True)
     except OSError as error:
-        raise ConfigError(f"--out: {path}: {(error.strerror or str(error)).lower()}; give another folder") from None
+        raise ConfigError(f"--out: {path}: {reason(error)}; give another folder") from None
     if not os.access(path, os.W_OK):
         raise ConfigError(f"--out: {path}: permission denied; give another folder")
     return path
@@ -62,4 +63,4 @@ def writing(folder: Path) -> Iterator[None]:
     try:
         yield
     except OSError as error:
-        raise ConfigError(f"--out: {folder}: {(error.strerror or str(error)).lower()}; give another folder") from None
+        raise ConfigError(f"--out: {folder}: {reason(error)}; give another folder") from None

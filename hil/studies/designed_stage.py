@@ -5,6 +5,7 @@ from pathlib import Path
 import tomlkit
 
 from pkxyz_ctrl.config.files import ConfigError, plain
+from pkxyz_ctrl.config.refused import reason
 from pkxyz_ctrl.mechanics.selection import Requirements, Selection
 
 HEAD = "Dimensions selected by `pkxyz design` from requirements: the point of the feasible region"
@@ -38,7 +39,7 @@ def write_stage_file(selection: Selection, need: Requirements, path: Path) -> No
     try:
         path.write_text(tomlkit.dumps(document), encoding="utf-8")
     except OSError as error:
-        raise ConfigError(f"{path}: cannot be written: {error.strerror}; give another with --out") from None
+        raise ConfigError(f"{path}: cannot be written: {reason(error)}; give another with --out") from None
 
 
 def _provenance(section: str, key: str, need: Requirements) -> str:

@@ -27,6 +27,7 @@ from pkxyz_ctrl.can import cob_id
 from pkxyz_ctrl.can.codec import ProcessCodec
 from pkxyz_ctrl.can.frame import Frame
 from pkxyz_ctrl.config.files import ConfigError
+from pkxyz_ctrl.config.refused import reason
 from pkxyz_ctrl.io.clocks import TickClock, WallClock, percentile_us
 from pkxyz_ctrl.io.realtime import FIFO_PRIORITY, go_real_time, leave_real_time, settle_memory
 from pkxyz_ctrl.loop import cycle as cycling
@@ -193,7 +194,7 @@ def _start_cyclictest(path: str | None, period_us: int, seconds: float) -> "subp
     try:
         return subprocess.Popen(words, stdout=subprocess.PIPE, stderr=subprocess.DEVNULL, text=True)
     except OSError as error:
-        raise ConfigError(f"--cyclictest: {Path(path)}: {(error.strerror or str(error)).lower()}") from None
+        raise ConfigError(f"--cyclictest: {Path(path)}: {reason(error)}") from None
 
 
 def read_cyclictest(text: str) -> list[int] | None:

@@ -21,6 +21,7 @@ from hil.studies.margins.loop import Loop
 from hil.studies.spread.workers import as_done, given, hands
 from pkxyz_ctrl.config import files as config
 from pkxyz_ctrl.config.files import ConfigError
+from pkxyz_ctrl.config.refused import reason
 from pkxyz_ctrl.design.margins.tolerances import Tolerances
 from pkxyz_ctrl.design.model.loop_plant import Perturbation
 from pkxyz_ctrl.stage import Stage
@@ -141,7 +142,7 @@ class Results:
                 raise
             raise ConfigError(f"{path}: is not a file of results: {error}; give another --out") from None
         except OSError as error:
-            raise ConfigError(f"{path}: {(error.strerror or str(error)).lower()}; give another --out") from None
+            raise ConfigError(f"{path}: {reason(error)}; give another --out") from None
 
     def add(self, result: Result) -> None:
         """Keep a result, at once."""

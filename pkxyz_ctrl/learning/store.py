@@ -9,6 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from pkxyz_ctrl.config.files import ConfigError, read_bounded
+from pkxyz_ctrl.config.refused import reason
 from pkxyz_ctrl.learning.config import LearningError
 from pkxyz_ctrl.learning.timetable import Timetable
 from pkxyz_ctrl.trajectory import Trajectory
@@ -70,7 +71,7 @@ def save(stored: Stored, path: Path) -> None:
     try:
         path.write_text(json.dumps(data, indent=1, allow_nan=False) + "\n", encoding="utf-8")
     except OSError as error:
-        raise LearningError(f"{path}: cannot be written: {error.strerror or error}") from None
+        raise LearningError(f"{path}: cannot be written: {reason(error)}") from None
 
 
 def load(path: Path) -> Stored:

@@ -11,6 +11,7 @@ from tomlkit.items import Table
 from hil.studies.identify.identification import KNOWN, Identification, provenance
 from pkxyz_ctrl.config.calibration import Calibration, MeasuredBy
 from pkxyz_ctrl.config.files import ConfigError, plain
+from pkxyz_ctrl.config.refused import reason
 
 SUFFIX = "_calibrated"
 
@@ -63,7 +64,7 @@ def write_calibrated_stage(source: Path, found: Identification, run: str, path: 
     try:
         path.write_text(tomlkit.dumps(document), encoding="utf-8")
     except OSError as error:
-        raise ConfigError(f"{path}: cannot be written: {error.strerror}; give another folder with --out") from None
+        raise ConfigError(f"{path}: cannot be written: {reason(error)}; give another folder with --out") from None
 
 
 def _source(error: float | list[float], origin: dict[str, Any]) -> str:

@@ -18,6 +18,7 @@ from pkxyz_ctrl.config import files as config
 from pkxyz_ctrl.config.bus import BusConfig
 from pkxyz_ctrl.config.controller import ControllerConfig
 from pkxyz_ctrl.config.files import ConfigError, FrozenModel
+from pkxyz_ctrl.config.refused import reason
 from pkxyz_ctrl.design.hold_noise import rounding_force_n
 from pkxyz_ctrl.design.law import design_law
 from pkxyz_ctrl.design.laws.estimator_gain import measurement_noise
@@ -164,7 +165,7 @@ def write_taps(search: TapsSearch, found: FoundTaps, path: Path) -> None:
     try:
         path.write_text(tomlkit.dumps(document), encoding="utf-8")
     except OSError as error:
-        raise ConfigError(f"{path}: {(error.strerror or str(error)).lower()}; give another --out") from None
+        raise ConfigError(f"{path}: {reason(error)}; give another --out") from None
 
 
 def _array(taps: tuple[float, ...]) -> Any:

@@ -17,6 +17,7 @@ import tomlkit
 from hil.studies.spread.workers import as_done, given, hands
 from hil.studies.tune.search import Problem, Worth, evaluate, put
 from pkxyz_ctrl.config.files import ConfigError
+from pkxyz_ctrl.config.refused import reason
 
 _DIGITS = 4
 """Significant digits of a tried number: what is tried is what the file will say."""
@@ -176,7 +177,7 @@ def write_controller(problem: Problem, found: Best, path: Path) -> None:
     try:
         path.write_text(head + tomlkit.dumps(document), encoding="utf-8")
     except OSError as error:
-        raise ConfigError(f"{path}: {(error.strerror or str(error)).lower()}; give another --out") from None
+        raise ConfigError(f"{path}: {reason(error)}; give another --out") from None
 
 
 def importances(study: optuna.Study) -> dict[str, float]:
