@@ -13,6 +13,7 @@ from hil.pictures.style import (
     GREEN,
     INK,
     MUTED,
+    PINK,
     REFERENCE,
     SKY,
     TINY_PT,
@@ -37,10 +38,10 @@ from pkxyz_ctrl.stage import Stage
 
 MIDDLE = np.full(3, 12.5e-6)
 COLOURS = {
-    "lqg": SKY, "lqg_wide": BLUE, "hinf": GREEN, "pi_notch": "#e6b58f", "pi_notch_robust": VERMILION,
+    "youla": PINK, "lqg": SKY, "lqg_wide": BLUE, "hinf": GREEN, "pi_notch": "#e6b58f", "pi_notch_robust": VERMILION,
     "irc": REFERENCE, "irc_robust": MUTED, "robust": INK,
 }  # fmt: skip
-SHOWN = ("lqg", "lqg_wide", "hinf", "pi_notch_robust", "irc_robust", "robust")
+SHOWN = ("youla", "lqg", "lqg_wide", "hinf", "pi_notch_robust", "irc_robust", "robust")
 DRAWN = range(1, 201)
 BEGIN, END = "<!-- table: begin -->\n", "<!-- table: end -->"
 

@@ -17,7 +17,7 @@ from pkxyz_ctrl.config.files import ConfigError
 
 Rows = NDArray[np.void]
 
-DEFAULT = ("lqg", "lqg_wide", "robust", "hinf", "pi_notch", "irc", "mpc", "open_loop")
+DEFAULT = ("youla", "lqg", "lqg_wide", "robust", "hinf", "pi_notch", "irc", "mpc", "open_loop")
 """What is compared if nobody says what."""
 
 

@@ -282,7 +282,7 @@ def file(tmp_path_factory):
 @cache
 def scan_errors_nm(stage_file, plant):
     """(n, 3) true position less reference on the raster."""
-    scenario = load_scenario(f"raster_{plant}", stage=stage_file)
+    scenario = load_scenario(f"raster_{plant}", stage=stage_file, controller="lqg")
     (window,) = [s.scan_us for s in scenario.trajectory.segments if s.scan_us]
     rows, result = rows_of(scenario.setup(), "fast")
     assert not result.faults
@@ -358,7 +358,7 @@ def test_what_the_combs_leave_unexplained_is_what_the_plant_has_and_the_model_ha
 
 def mean_unexplained_n(stage_file):
     """(3,) over the scan of the harsh plant."""
-    setup = load_scenario("raster_harsh", stage=stage_file).setup()
+    setup = load_scenario("raster_harsh", stage=stage_file, controller="lqg").setup()
     rows, _ = rows_of(setup, "fast")
     scan = rows[(rows["reference_tick"] >= 0) & (np.abs(rows["reference_m"][:, 2] - 19.25e-6) < 1e-6)]
     pulls = Stage(setup.stage).pulls(scan["reference_m"])
@@ -430,7 +430,20 @@ def test_the_command_writes_a_stage_that_runs_at_once(tmp_path):
     assert "to run with it: pkxyz sil --stage" in done.output
     path = out / "stage.toml"
     ran = runner.invoke(
-        app, ["sil", "raster_mild", "--lane", "fast", "--stage", str(path), "--out", str(tmp_path / "run"), "--json"]
+        app,
+        [
+            "sil",
+            "raster_mild",
+            "--controller",
+            "lqg",
+            "--lane",
+            "fast",
+            "--stage",
+            str(path),
+            "--out",
+            str(tmp_path / "run"),
+            "--json",
+        ],
     )
     assert ran.exit_code == 0, ran.output
     found = np.array(list(json.loads(ran.stdout)["rms_error_nm"].values()))

@@ -118,8 +118,8 @@ class Cycle:
 
 @cache
 def setup(plant: str = "nominal", bus_name: str = "fd_5k", seed: int = 1) -> Setup:
-    """The default scenario on another plant, bus or seed; ``duration_s`` may be replaced."""
-    return load_scenario("raster", plant=plant, bus=bus_name, seed=seed).setup()
+    """The default scenario under lqg, on another plant, bus or seed; ``duration_s`` may be replaced."""
+    return load_scenario("raster", controller="lqg", plant=plant, bus=bus_name, seed=seed).setup()
 
 
 def shortened(original: Setup, ticks: int) -> Setup:

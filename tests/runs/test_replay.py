@@ -59,9 +59,9 @@ def written(folder, rows, metadata):
 
 @pytest.fixture(scope="module")
 def run(tmp_path_factory):
-    """The folder of 0.5 s of the default scenario in the fast lane, its rows and metadata."""
+    """The folder of 0.5 s of the default scenario under lqg in the fast lane, its rows and metadata."""
     folder = RunFolder(tmp_path_factory.mktemp("replay") / "run")
-    run_into(folder, scenario_of("raster"), Lane.FAST)
+    run_into(folder, scenario_of("raster", controller="lqg"), Lane.FAST)
     return folder.path, *rows_of(folder.recording)
 
 

@@ -41,7 +41,7 @@ def test_resolved_holds_every_file_and_its_digest_names_the_content():
     resolved = resolve(default_scenario())
     assert resolved["stage"]["geometry"]["crank_length_m"] == 500e-6
     assert resolved["bus"]["period_us"] == 200
-    assert resolved["controller"]["law"] == "lqg"
+    assert resolved["controller"]["law"] == "youla"
     assert resolved["plant"]["name"] == "nominal"
     content = {key: value for key, value in resolved.items() if key != "digest"}
     assert resolved["digest"] == digest(content)

@@ -94,7 +94,7 @@ def lacking_n(rows):
     return np.einsum("nki,nk->ni", back, closed["disturbance_n"])
 
 
-LAWS = ["lqg", "lqg_wide", "pi_notch", "irc", "hinf", "mpc", "robust"]
+LAWS = ["youla", "lqg", "lqg_wide", "pi_notch", "irc", "hinf", "mpc", "robust"]
 
 
 @pytest.mark.parametrize("motion", [corner_to_corner, circles])
