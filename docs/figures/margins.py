@@ -2,6 +2,7 @@
 over the changed and the drawn plants.
 """
 
+import math
 from pathlib import Path
 
 import numpy as np
@@ -56,7 +57,8 @@ def table(all_loops: dict[str, Loop]) -> str:
     """Markdown: a line for each law."""
     tolerances = load("tolerances", "wide", Tolerances)
     lines = [
-        "| law | Ms | disk margin | \\|S\\| < -3 dB to (Hz) | gain margin, x | hold noise (nm) | largest \\|K S\\| / k "
+        "| law | Ms | disk margin | \\|S\\| < -3 dB to (Hz) | gain margin, x (dB) | hold noise (nm) "
+        "| largest \\|K S\\| / k "
         "| slowest pole (ms) | 135 changed plants: worst Ms | 200 drawn plants: 95 % of Ms, unstable |",
         f"|{' --- |' * 10}",
     ]
@@ -71,7 +73,8 @@ def table(all_loops: dict[str, Loop]) -> str:
         most = np.percentile(drawn, 95, method="higher")
         lines.append(
             f"| `{name}` | {found.mimo.peak_s:.2f} | {found.mimo.disk_margin:.2f} | {found.mimo.bandwidth_hz:.0f} "
-            f"| {found.axes[0].gain_margin:.2f} | {noise:.2f} | {effort(loop):.1f} | {slowest_ms:.1f} "
+            f"| {20.0 * math.log10(found.axes[0].gain_margin):.1f} | {noise:.2f} | {effort(loop):.1f} "
+            f"| {slowest_ms:.1f} "
             f"| {_ms(worst)} | {_ms(most)}, {lost} |"
         )
     return "\n".join(lines) + "\n"
