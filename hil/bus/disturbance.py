@@ -8,17 +8,17 @@ from hil.bus.frame_time import frame_bit_counts
 from pkxyz_ctrl.can.frame import Frame
 
 
-class Outcome(NamedTuple):
+class FrameFate(NamedTuple):
     """What a fault makes of a frame: an error frame, or deliveries as (delay_us, frame) in the receivers."""
 
     corrupt: bool = False
     deliveries: tuple[tuple[int, Frame], ...] = ()
 
 
-CORRUPTED = Outcome(corrupt=True)
-DROPPED = Outcome()
+CORRUPTED = FrameFate(corrupt=True)
+DROPPED = FrameFate()
 
-FaultTap = Callable[[Frame, str, int], Outcome | None]
+FaultTap = Callable[[Frame, str, int], FrameFate | None]
 """Called with frame, sender's name and t_us as each frame ends; None leaves it alone."""
 
 
@@ -50,7 +50,7 @@ class Disturbance:
         self._doomed.append((predicate, count))
         self._rearm()
 
-    def judge(self, frame: Frame, sender: str, t_us: int) -> Outcome | None:
+    def judge(self, frame: Frame, sender: str, t_us: int) -> FrameFate | None:
         """What becomes of the frame; None: nothing happens to it."""
         for i, (predicate, count) in enumerate(self._doomed):
             if predicate(frame):

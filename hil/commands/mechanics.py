@@ -215,8 +215,8 @@ def design(
     picture: Annotated[Path | None, typer.Option(help="PNG of the feasible region.")] = None,
     as_json: AsJson = False,
 ) -> None:
-    """Dimensions from requirements (the paper's section IV), written as a stage file that `pkxyz sil --stage`
-    runs.
+    """Dimensions from requirements (the paper's section IV),
+    written as a stage file that `pkxyz sil --stage` runs.
     """
     from hil.studies.designed_stage import require_replaceable, write_stage_file
     from pkxyz_ctrl.config.stage import StageConfig

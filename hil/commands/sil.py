@@ -41,8 +41,8 @@ def sil(
     replace_earlier: ReplaceEarlier = False,
     as_json: Annotated[bool, typer.Option("--json", help="Print the summary as JSON, and nothing else.")] = False,
 ) -> None:
-    """Close the loop on a scenario; exit code 0 if its checks hold, 1 if not, 2 for bad input or a full disk, 130 if
-    interrupted.
+    """Close the loop on a scenario; exit code 0 if its checks hold, 1 if not,
+    2 for bad input or a full disk, 130 if interrupted.
     """
     lane = Lane(in_process.value)
     find("scenarios", scenario)  # a typo is said before anything is compiled

@@ -4,7 +4,7 @@ import random
 from collections.abc import Callable, Sequence
 
 from hil.bus.clock import Lockstep
-from hil.bus.disturbance import CORRUPTED, DROPPED, Outcome
+from hil.bus.disturbance import CORRUPTED, DROPPED, FrameFate
 from hil.bus.endpoint import Endpoint
 from hil.bus.wire import Wire
 from hil.faults.fault import Fault
@@ -12,7 +12,7 @@ from hil.node.amplifier import AmplifierNode
 from pkxyz_ctrl.can.driver_config import DriverConfig
 from pkxyz_ctrl.can.frame import Frame
 
-Rule = Callable[[Frame, str, int], Outcome | None]
+Rule = Callable[[Frame, str, int], FrameFate | None]
 
 _SYNC_ID = 0x080
 _IDENTITY = (0x1018, 2)
@@ -116,7 +116,7 @@ class WireFaults:
 
     # -- what becomes of a frame ------------------------------------------------------------------------------------
 
-    def _judge(self, frame: Frame, sender: str, t_us: int) -> Outcome | None:
+    def _judge(self, frame: Frame, sender: str, t_us: int) -> FrameFate | None:
         for rule in self._rules.values():
             outcome = rule(frame, sender, t_us)
             if outcome is not None:
@@ -130,11 +130,11 @@ class WireFaults:
         if fault.kind == "reorder":
             return _Swapping(concerns)
         dice = self._random
-        acts: dict[str, Callable[[Frame], Outcome]] = {
+        acts: dict[str, Callable[[Frame], FrameFate]] = {
             "drop": lambda frame: DROPPED,
-            "duplicate": lambda frame: Outcome(deliveries=((0, frame), (0, frame))),
-            "corrupt": lambda frame: Outcome(deliveries=((0, self._with_a_bit_flipped(frame)),)),
-            "delay": lambda frame: Outcome(deliveries=((round(fault["delay_us"]), frame),)),
+            "duplicate": lambda frame: FrameFate(deliveries=((0, frame), (0, frame))),
+            "corrupt": lambda frame: FrameFate(deliveries=((0, self._with_a_bit_flipped(frame)),)),
+            "delay": lambda frame: FrameFate(deliveries=((round(fault["delay_us"]), frame),)),
             "error_frames": lambda frame: CORRUPTED,
         }
         act = acts[fault.kind]
@@ -165,11 +165,11 @@ class _Swapping:
         self._concerns = concerns
         self._held: dict[int, Frame] = {}  # by identifier
 
-    def __call__(self, frame: Frame, sender: str, t_us: int) -> Outcome | None:
+    def __call__(self, frame: Frame, sender: str, t_us: int) -> FrameFate | None:
         if not self._concerns(frame):
             return None
         held = self._held.pop(frame.can_id, None)
         if held is None:
             self._held[frame.can_id] = frame
             return DROPPED
-        return Outcome(deliveries=((0, frame), (0, held)))
+        return FrameFate(deliveries=((0, frame), (0, held)))

@@ -26,8 +26,8 @@ Array = NDArray[np.float64]
 
 
 def draw_design_space(stages: dict[str, Stage], out: Path) -> None:
-    """Fig. 4: L2 against alpha_0 with one constraint for each comb force (Eq. 24 at full stroke); above it the comb
-    lifts.
+    """Fig. 4: L2 against alpha_0 with one constraint for each comb force (Eq. 24 at full stroke);
+    above it the comb lifts.
     """
     first = next(iter(stages.values()))
     springs, hinge = folded_spring_stiffness(first.config.flexures), link_hinge_stiffness(first.config.flexures)
@@ -134,8 +134,8 @@ def _arrow(plot: Axes, start: Array, end: Array, colour: str) -> None:
 
 
 def draw_linearisation(study: LinearisationStudy, name: str, out: Path) -> None:
-    """What constant and relinearised Jacobians cost: distribution over the workspace, and growth with height on the
-    axis.
+    """What constant and relinearised Jacobians cost: distribution over the workspace,
+    and growth with height on the axis.
     """
     kinds = (
         ("one Jacobian, at rest", study.at_rest_m, "-"),

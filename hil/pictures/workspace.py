@@ -36,8 +36,8 @@ _LIMIT = "white"
 
 
 def draw_workspace(stage: Stage, voltage_max_v: float, out: Path) -> None:
-    """Fig. 7: the workspace with its six bounding faces, and sections at several heights with the voltage needed
-    there.
+    """Fig. 7: the workspace with its six bounding faces,
+    and sections at several heights with the voltage needed there.
     """
     title = f"Workspace of the {stage.config.name} stage, and the voltage that holds it"
     figure = sheet(12.6, 6.0, title, free=True)
@@ -154,8 +154,8 @@ def edge_path(stage: Stage, points: int = 60) -> tuple[Array, Array]:
 
 
 def draw_edge_path(stage: Stage, out: Path) -> None:
-    """Appendix B: the path along the edges, as a path; the tilt on it came from finite elements, a rigid model has
-    none.
+    """Appendix B: the path along the edges, as a path; the tilt on it came from finite elements,
+    a rigid model has none.
     """
     strokes, positions = edge_path(stage)
     figure = sheet(

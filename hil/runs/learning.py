@@ -21,8 +21,8 @@ class Learning:
         self.errors = PeriodErrors(scenario.trajectory, scenario.bus.period_us, self._config)
 
     def close(self, file: Path | None, learner: Learner | None, digest: str) -> Learnt:
-        """Store what was learnt in ``file``, if anything was. ``learner``: None if the run did not get so far. Raises
-        ``LearningError``.
+        """Store what was learnt in ``file``, if anything was. ``learner``:
+        None if the run did not get so far. Raises ``LearningError``.
         """
         found = self.errors.figures()
         steps = tuple(vars(step) for step in learner.steps) if learner is not None else ()

@@ -17,8 +17,8 @@ _FILES, _SEAL = "files", "seal"
 
 
 def sealed(summary: dict[str, Any], folder: Path, names: Iterable[str]) -> str:
-    """The text of ``summary.json``: with the SHA-256 of each named file that is there, and of all this. Raises
-    ``OSError``.
+    """The text of ``summary.json``: with the SHA-256 of each named file that is there,
+    and of all this. Raises ``OSError``.
     """
     present = {name: _sha256(folder / name) for name in sorted(names) if (folder / name).is_file()}
     content = summary | {_FILES: present}

@@ -21,8 +21,8 @@ def require_replaceable(path: Path) -> None:
 
 
 def write_stage_file(selection: Selection, need: Requirements, path: Path) -> None:
-    """Write ``selection`` so that ``Stage.load(path)`` gives the same device. Raises ``ConfigError`` if it can't be
-    written.
+    """Write ``selection`` so that ``Stage.load(path)`` gives the same device. Raises
+    ``ConfigError`` if it can't be written.
     """
     data = plain(selection.config)
     document = tomlkit.document()

@@ -157,8 +157,8 @@ class CanPort:
         return 0
 
     def discard_unsent(self) -> None:
-        """Empty the transmit queue of interfaces that can. The kernel's sockets can't, which python-can tells by
-        NotImplementedError.
+        """Empty the transmit queue of interfaces that can. The kernel's sockets can't,
+        which python-can tells by NotImplementedError.
         """
         with suppress(can.CanError, OSError, NotImplementedError):
             self._bus.flush_tx_buffer()

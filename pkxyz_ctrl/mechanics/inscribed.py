@@ -23,8 +23,8 @@ Array = NDArray[np.float64]
 
 @dataclass(frozen=True)
 class InscribedCube:
-    """A cube inside the workspace: centre (3,) in m relative to rest, side in m, edge directions as columns (3,
-    3).
+    """A cube inside the workspace: centre (3,) in m relative to rest, side in m,
+    edge directions as columns (3, 3).
     """
 
     centre_m: Array
@@ -78,8 +78,8 @@ def inscribed_cube(stage: Stage, aligned: bool = False) -> InscribedCube:
 
 
 def standing_cube_m(stage: Stage) -> float:
-    """Side in m of the largest cube that stands on its corner with the mechanism's own symmetry; 0 where none is
-    found.
+    """Side in m of the largest cube that stands on its corner with the mechanism's own symmetry;
+    0 where none is found.
 
     A hundred times faster than ``inscribed_cube``; at most 0.1 % above what fits, as it watches the lower limit on
     a grid.
@@ -88,8 +88,8 @@ def standing_cube_m(stage: Stage) -> float:
 
 
 def _standing(stage: Stage) -> tuple[float, float]:
-    """Side and height above mid-stroke in m: least stroke at the lower limit, greatest at the upper; (0, 0) if
-    none.
+    """Side and height above mid-stroke in m: least stroke at the lower limit,
+    greatest at the upper; (0, 0) if none.
     """
     low, high = stroke_box(stage)
     span = high - low

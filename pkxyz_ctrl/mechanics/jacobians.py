@@ -1,5 +1,5 @@
-"""The three Jacobians of the paper (Eq. 9 to 12): strokes, crank angles and link elevation against the platform's
-position.
+"""The three Jacobians of the paper (Eq. 9 to 12): strokes,
+crank angles and link elevation against the platform's position.
 
 The paper writes them J_1^-1, J_2^-1 and J_3^-1, and calls J_1 what maps strokes to positions. Here each is named
 by what it gives per metre of platform. Nominal is Eq. 12, at rest; exact is at any position, from the derivative

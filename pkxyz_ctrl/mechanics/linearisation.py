@@ -59,8 +59,8 @@ def linearisation_study(stage: Stage, points: int = 9, move_m: float = 1e-6) -> 
 
 
 def constant_jacobian_position_m(stage: Stage, strokes_m: Array, about_strokes_m: Array) -> Array:
-    """x_0 + J(x_0)^-1 (q - q_0) (..., 3) in m for strokes (..., 3), x_0 being the position of ``about_strokes_m``
-    (3,).
+    """x_0 + J(x_0)^-1 (q - q_0) (..., 3) in m for strokes (..., 3),
+    x_0 being the position of ``about_strokes_m`` (3,).
     """
     about = stage.forward_kinematics(about_strokes_m)
     inverse = np.linalg.inv(stage.jacobian(about))

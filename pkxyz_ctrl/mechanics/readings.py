@@ -93,16 +93,16 @@ def pull_in_by_balance_um(stage: Stage) -> float:
 
 
 def lifting_quarter_n_per_m(stage: Stage) -> float:
-    """Eq. 24 in units of one folded spring of four, as Eq. 34 takes K_1 for the axial and K_l1 for the lateral
-    stiffness.
+    """Eq. 24 in units of one folded spring of four, as Eq. 34 takes K_1 for the
+    axial and K_l1 for the lateral stiffness.
     """
     hinge = flexures.link_hinge_stiffness(stage.config.flexures)
     return lifting_stiffness_n_per_m(spring_n_per_m(stage), hinge, link_m(stage), elevation_rad(stage), 1) / 4
 
 
 def eq_8_moved_um(stage: Stage, literal: bool) -> float:
-    """lambda_1 at rest with the origin 100 um before A0, Y_A0 inside the root as printed or outside: lambda_0 is
-    right.
+    """lambda_1 at rest with the origin 100 um before A0, Y_A0 inside the root as printed or outside:
+    lambda_0 is right.
     """
     g, y_a0 = stage.config.geometry, 100e-6
     head = y_a0 + g.base_radius_m - g.projection_rest_m
@@ -178,8 +178,8 @@ def mode_strokes(stage: Stage, axis: int) -> np.ndarray:
 
 
 def delta_printed_um() -> float:
-    """The root of the printed polynomial at lambda = 0, with c_0's lost factor, that is nearest to the true r -
-    L1.
+    """The root of the printed polynomial at lambda = 0, with c_0's lost factor,
+    that is nearest to the true r - L1.
     """
     printed = dict(APPENDIX_COEFFICIENTS) | {0: -2 * APPENDIX_COEFFICIENTS[0]}
     roots: np.ndarray = np.polynomial.Polynomial([printed[power] for power in range(7)]).roots().astype(complex)

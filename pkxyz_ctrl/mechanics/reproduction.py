@@ -37,8 +37,8 @@ class Entry:
     """The same from one design; None where the lumped model has no such thing."""
     why: str
     corrected: Callable[[Stage], tuple[float, float]] | None = None
-    """Another reading of the text: (what it then prints, what is computed); should be equal if the reading is
-    right.
+    """Another reading of the text: (what it then prints, what is computed);
+    should be equal if the reading is right.
     """
 
 

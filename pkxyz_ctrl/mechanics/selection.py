@@ -158,8 +158,8 @@ def margins(need: Requirements, template: StageConfig, crank_m: float, projectio
 
 
 def linear_standing_cube_m(slope: float, stroke_m: float) -> float:
-    """Side in m of the largest cube standing on its corner in the linear workspace, ``slope`` = tan(alpha) at
-    mid-stroke.
+    """Side in m of the largest cube standing on its corner in the linear workspace,
+    ``slope`` = tan(alpha) at mid-stroke.
 
     With edges sqrt(2/3) e_j + sqrt(1/3) z, side sum_j |[e_i, slope] . edge_j| = stroke. Largest, stroke /
     sqrt(1.5), at slope 1/sqrt(2), where the workspace itself is a cube.

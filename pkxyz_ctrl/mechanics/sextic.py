@@ -35,8 +35,8 @@ def rest_slider_m(geometry: GeometryConfig) -> float:
 
 
 def closure_polynomial(geometry: GeometryConfig, strokes_m: ArrayLike) -> Array:
-    """Coefficients (7,), lowest power first, of the depressed sextic in tau for strokes (3,) in m relative to
-    rest.
+    """Coefficients (7,), lowest power first, of the depressed sextic in tau
+    for strokes (3,) in m relative to rest.
     """
     deviation = _deviations(geometry, strokes_m)
     a, b, c = deviation
@@ -45,8 +45,8 @@ def closure_polynomial(geometry: GeometryConfig, strokes_m: ArrayLike) -> Array:
 
 
 def link_projections_m(geometry: GeometryConfig, strokes_m: ArrayLike) -> NDArray[np.complex128]:
-    """All six roots delta (6,) in m for strokes (3,): assembly modes of the loop, most of them complex or out of
-    reach.
+    """All six roots delta (6,) in m for strokes (3,): assembly modes of the loop,
+    most of them complex or out of reach.
     """
     strokes = _three(strokes_m)
     tau = Polynomial(closure_polynomial(geometry, strokes)).roots().astype(complex)

@@ -40,8 +40,8 @@ def out_of_plane_stiffness_n_per_m(
     elevation_rad: float,
     out_of_plane_chains: int = 1,
 ) -> float:
-    """K_zz = 4 c K_3 sec^2(alpha) / L2^2 + 12 K_1 tan^2(alpha) (Eq. 19 and 20; both print sec^2[alpha]^2 and
-    tan^2[alpha]^2).
+    """K_zz = 4 c K_3 sec^2(alpha) / L2^2 + 12 K_1 tan^2(alpha) (Eq. 19 and 20;
+    both print sec^2[alpha]^2 and tan^2[alpha]^2).
     """
     require_positive(link_m=link_m, elevation_rad=elevation_rad)
     pivots = 4 * out_of_plane_chains * link_hinge_n_m_per_rad / (link_m * math.cos(elevation_rad)) ** 2
@@ -72,8 +72,8 @@ def assembled_stiffness_n_per_m(config: StageConfig, out_of_plane_chains: int | 
 
 
 def lift_ratio(elevation_rad: float) -> float:
-    """d lambda / dz = tan(alpha_0) (Eq. 21): what each slider moves for a unit of height when all three move
-    alike.
+    """d lambda / dz = tan(alpha_0) (Eq. 21): what each slider moves for a unit
+    of height when all three move alike.
     """
     return math.tan(elevation_rad)
 
@@ -85,8 +85,8 @@ def lifting_stiffness_n_per_m(
     elevation_rad: float,
     out_of_plane_chains: int = 1,
 ) -> float:
-    """F_lambda / d lambda in N/m (Eq. 24): what each comb works against when all three lift: K_zz / (3
-    tan^2(alpha)).
+    """F_lambda / d lambda in N/m (Eq. 24): what each comb works against when all three lift:
+    K_zz / (3 tan^2(alpha)).
     """
     vertical = out_of_plane_stiffness_n_per_m(
         spring_n_per_m, link_hinge_n_m_per_rad, link_m, elevation_rad, out_of_plane_chains

@@ -1,5 +1,5 @@
-"""What the platform reaches: the image of the box of strokes, and the part of it that voltages below a limit can
-hold.
+"""What the platform reaches: the image of the box of strokes,
+and the part of it that voltages below a limit can hold.
 
 Volumes are integrals of det(dx/dq) over strokes (dx/dq is the inverse of ``Stage.jacobian``), taken along rays
 from the stroke nearest to rest: the box is cut into one pyramid for each face, and on every ray the held part is a
@@ -47,8 +47,8 @@ class Workspace:
 
 
 def stroke_box(stage: Stage) -> tuple[float, float]:
-    """The stroke limits (low, high) in m of all three sliders; a ``GeometryError`` if the links do not close on its
-    corners.
+    """The stroke limits (low, high) in m of all three sliders;
+    a ``GeometryError`` if the links do not close on its corners.
     """
     limits = stage.config.limits
     low, high = limits.stroke_min_m, limits.stroke_max_m

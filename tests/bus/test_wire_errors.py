@@ -5,7 +5,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from hil.bus.clock import Lockstep
-from hil.bus.disturbance import CORRUPTED, DROPPED, Outcome
+from hil.bus.disturbance import CORRUPTED, DROPPED, FrameFate
 from hil.bus.endpoint import ErrorState
 from hil.bus.fault_confinement import ERROR_ACK, ERROR_BUS, ERROR_BUS_OFF, ERROR_PROTOCOL, ERROR_RESTARTED
 from hil.bus.frame_time import frame_duration_ns
@@ -216,17 +216,17 @@ def test_unplugging_in_the_middle_of_a_frame_cuts_it_off() -> None:
     [
         (None, [(0, FRAME)]),
         (DROPPED, []),
-        (Outcome(deliveries=((0, FRAME), (0, FRAME))), [(0, FRAME), (0, FRAME)]),
-        (Outcome(deliveries=((70, FRAME),)), [(70, FRAME)]),
-        (Outcome(deliveries=((0, FRAME._replace(data=b"garbage!")),)), [(0, FRAME._replace(data=b"garbage!"))]),
+        (FrameFate(deliveries=((0, FRAME), (0, FRAME))), [(0, FRAME), (0, FRAME)]),
+        (FrameFate(deliveries=((70, FRAME),)), [(70, FRAME)]),
+        (FrameFate(deliveries=((0, FRAME._replace(data=b"garbage!")),)), [(0, FRAME._replace(data=b"garbage!"))]),
         (CORRUPTED, []),
     ],
 )
-def test_a_fault_tap_decides_what_receivers_get(outcome: Outcome | None, expected: list[tuple[int, Frame]]) -> None:
+def test_a_fault_tap_decides_what_receivers_get(outcome: FrameFate | None, expected: list[tuple[int, Frame]]) -> None:
     clock, wire, (a, b) = two()
     asked = []
 
-    def tap(frame: Frame, sender: str, t_us: int) -> Outcome | None:
+    def tap(frame: Frame, sender: str, t_us: int) -> FrameFate | None:
         asked.append((frame, sender, t_us))
         return outcome
 

@@ -181,8 +181,8 @@ def write_controller(problem: Problem, found: Best, path: Path) -> None:
 
 
 def importances(study: optuna.Study) -> dict[str, float]:
-    """How much each number matters among the trials that keep every goal (PED-ANOVA); empty where fewer than four
-    do.
+    """How much each number matters among the trials that keep every goal (PED-ANOVA);
+    empty where fewer than four do.
     """
     if len(finished(study)) < 4:
         return {}

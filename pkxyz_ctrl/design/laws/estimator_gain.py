@@ -1,5 +1,5 @@
-"""The Kalman filter's constant gain: filterpy discretises the noise and runs the filter, scipy solves the Riccati
-equation.
+"""The Kalman filter's constant gain: filterpy discretises the noise and runs the filter,
+scipy solves the Riccati equation.
 
 The two must agree, or there is no controller: a gain that only one of them believes in is an error in the model.
 """
@@ -32,8 +32,8 @@ def process_noise(model: LinearStage, config: EstimatorConfig, period_s: float) 
 
 
 def sense_noise(stage: Stage, bus: BusConfig) -> Array:
-    """Standard deviation (3,) in m of one sample of each stroke: white noise up to half the sampling rate, and
-    quantisation.
+    """Standard deviation (3,) in m of one sample of each stroke:
+    white noise up to half the sampling rate, and quantisation.
     """
     sigma_f = stage.config.sense.noise_density_f_per_rthz * math.sqrt(0.5 / bus.period_s)
     step_f = bus.analog.sense_farad_per_count

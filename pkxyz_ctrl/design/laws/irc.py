@@ -27,8 +27,8 @@ Array = NDArray[np.float64]
 
 
 def irc(plant: LoopPlant, config: Irc | None = None) -> DiscreteLaw:
-    """The law for a plant, damping first, then tracking to the gain margin. Raises ``LawError`` where either can't be
-    had.
+    """The law for a plant, damping first, then tracking to the gain margin. Raises
+    ``LawError`` where either can't be had.
     """
     config = config or Irc()
     if not config.feedthrough > 1.0:
