@@ -121,10 +121,10 @@ def test_a_run_leaves_its_folder_and_exit_code_0_and_the_next_one_gets_the_next_
 
 
 @pytest.mark.slow
-def test_checks_that_do_not_hold_are_exit_code_1_in_a_folder_that_may_be_used_again(tmp_path):
+def test_checks_that_do_not_hold_are_exit_code_1_in_a_folder_that_may_be_replaced(tmp_path):
     path = changed(tmp_path, ("rms_error_nm = { max = 5.0 }", "rms_error_nm = { min = 0.001, max = 0.01 }"))
     for seed in ("1", "2"):
-        done = pkxyz("sil", path, "--lane", "fast", "--out", "mine", "--seed", seed, cwd=tmp_path)
+        done = pkxyz("sil", path, "--lane", "fast", "--out", "mine", "--replace", "--seed", seed, cwd=tmp_path)
         assert done.returncode == 1, done.stderr
         assert "fails" in done.stdout
     summary, _ = read_run(tmp_path / "mine")
