@@ -225,7 +225,7 @@ def test_trajectories_agree_with_lockstep_within_the_noise(bench, changes):
 
 def test_killed_controller_leaves_0_v_in_the_time_of_its_drive_frames_and_then_no_node_in_operational(bench, changes):
     changes("pre-operational", False)
-    words = ("on_quick.toml", "--bus", "quick.toml", "--out", "killed", "--seconds", "60")
+    words = ("on_quick.toml", "--bus", "quick.toml", "--out", "killed", "--replace", "--seconds", "60")
     with UnixBus(f"{bench}/bus") as observer, driving(bench, observer, *words) as run:
         os.kill(run.pid, signal.SIGKILL)
         killed_s = time.time()
@@ -268,7 +268,7 @@ def next_with(bus, can_id):
 def test_a_stopped_controller_goes_on_and_sigterm_ends_it_at_0_v(bench, changes):
     """Asleep for 40 ms: missed ticks are skipped whole and counted, and with its monitor off the run goes on."""
     changes("pre-operational", False)
-    words = ("on_slow.toml", "--bus", "slow.toml", "--out", "ended", "--seconds", "60")
+    words = ("on_slow.toml", "--bus", "slow.toml", "--out", "ended", "--replace", "--seconds", "60")
     with UnixBus(f"{bench}/bus") as observer, driving(bench, observer, *words) as run:
         os.kill(run.pid, signal.SIGSTOP)
         time.sleep(0.04)
@@ -298,7 +298,7 @@ def test_a_stopped_controller_goes_on_and_sigterm_ends_it_at_0_v(bench, changes)
 
 def test_ctrl_c_ends_at_0_v(bench, changes):
     changes("pre-operational", False)
-    words = ("on_slow.toml", "--bus", "slow.toml", "--out", "interrupted", "--seconds", "60", "--json")
+    words = ("on_slow.toml", "--bus", "slow.toml", "--out", "interrupted", "--replace", "--seconds", "60", "--json")
     with UnixBus(f"{bench}/bus") as observer, driving(bench, observer, *words) as run:
         run.send_signal(signal.SIGINT)
         out, err = run.communicate(timeout=60)
@@ -322,7 +322,7 @@ def test_a_full_disk_ends_at_0_v_with_one_line_and_what_was_written_opens(bench,
 
     Every file of the run may hold 1.2 MB, which the journal exceeds after some thousand ticks.
     """
-    words = ("on_slow.toml", "--bus", "slow.toml", "--out", "full", "--seconds", "60")
+    words = ("on_slow.toml", "--bus", "slow.toml", "--out", "full", "--replace", "--seconds", "60")
     limit = "import resource; resource.setrlimit(resource.RLIMIT_FSIZE, (1_200_000, 1_200_000))"
     script = f"import sys; {limit}; from hil.cli import main; sys.argv[0] = 'pkxyz'; main()"
     for _ in range(3):  # a machine that stands still may put it in fault before it has driven anything

@@ -237,7 +237,7 @@ def driving(bench, plant, *words):
 
 def test_start_up_and_scan(bench, plant):
     """The stage follows; on the wire stands what the bus file says; the recording replays bit for bit."""
-    with driving(bench, plant, "--out", "scan", "--json") as (run, _, seen):
+    with driving(bench, plant, "--out", "scan", "--replace", "--json") as (run, _, seen):
         code, out, err = run.wait()
     assert code == 0, err
     summary = json.loads(out)
@@ -269,7 +269,7 @@ def test_start_up_and_scan(bench, plant):
 
 
 def test_killed_controller_leaves_0_v_within_the_heartbeat_time(bench, plant):
-    with driving(bench, plant, "--out", "killed", "--seconds", "60") as (run, looking, _):
+    with driving(bench, plant, "--out", "killed", "--replace", "--seconds", "60") as (run, looking, _):
         run.signal(signal.SIGKILL)
         while (frame := next_frame(looking))[0] != EMCY:
             pass
@@ -284,7 +284,7 @@ def test_killed_controller_leaves_0_v_within_the_heartbeat_time(bench, plant):
 
 def test_a_node_that_falls_silent_is_a_fault(bench, plant):
     """The plant's process is stopped: our monitors find out, say why, and only 0 V goes out from then on."""
-    with driving(bench, plant, "--out", "silent", "--seconds", "60", "--json") as (run, looking, _):
+    with driving(bench, plant, "--out", "silent", "--replace", "--seconds", "60", "--json") as (run, looking, _):
         plant.signal(signal.SIGSTOP)
         assert drive_frames(looking, run, driven=False)
         run.signal(signal.SIGTERM)
@@ -303,7 +303,7 @@ def test_a_node_that_falls_silent_is_a_fault(bench, plant):
 
 def test_someone_else_who_sends_damaged_sense_frames_is_a_fault(bench, plant):
     """Frames with the node's identifier and a wrong CRC, from a third socket."""
-    with driving(bench, plant, "--out", "damaged", "--seconds", "60", "--json") as (run, looking, _):
+    with driving(bench, plant, "--out", "damaged", "--replace", "--seconds", "60", "--json") as (run, looking, _):
         for n in range(20):
             while next_frame(looking)[0] != SYNC:
                 pass
@@ -327,7 +327,7 @@ def test_someone_else_who_sends_damaged_sense_frames_is_a_fault(bench, plant):
 
 
 def test_sigterm_ends_at_0_v_by_the_controller(bench, plant):
-    with driving(bench, plant, "--out", "ended", "--seconds", "60") as (run, _, _):
+    with driving(bench, plant, "--out", "ended", "--replace", "--seconds", "60") as (run, _, _):
         run.signal(signal.SIGTERM)
         code, _, err = run.wait()
     assert code == 128 + signal.SIGTERM, err
