@@ -110,6 +110,14 @@ def test_the_modes_that_a_law_acts_on() -> None:
     assert stage.quality_factor == 20
 
 
+def test_the_first_screen_and_the_first_output_are_those_of_the_default_law() -> None:
+    nominal, mild, alone = rms_nm("raster"), rms_nm("raster_mild"), rms_nm("raster_mild", "open_loop")
+    text = page("README.md")
+    assert f"to {max(nominal):.0f} nm rms, and to {math.ceil(max(mild)):.0f} nm on a stage" in text
+    assert f"where feed-forward alone is {max(alone) / 1e3:.1f} um off" in text
+    assert f"rms_error_nm {max(nominal):.4g} ≤ 5 holds" in page("docs/learn/index.md")
+
+
 def test_measured_figures_of_the_readme_are_those_of_the_benchmarks() -> None:
     results = json.loads((ROOT / "benchmarks" / "results.json").read_text(encoding="utf-8"))["figures"]
     value = {f["name"]: f["value"] for f in results}
