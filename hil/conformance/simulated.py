@@ -9,13 +9,13 @@ from hil.conformance.talker import SAMPLE_CYCLES, Talker
 from hil.lanes.lockstep import WirePort
 from hil.node.amplifier import AmplifierNode
 from hil.node.sense import Plant
+from hil.node.wired import EDS, wired_node
 from hil.plant.on_bus import PlantOnBus
 from pkxyz_ctrl.config.bus import BusConfig
-from pkxyz_ctrl.config.files import CONFIG_DIR, ConfigError, load
+from pkxyz_ctrl.config.files import ConfigError, load
 from sim.config import Device, PlantConfig
 from sim.plant import Plant as SimulatedPlant
 
-EDS = CONFIG_DIR / "comb_amplifier.eds"
 _SEED = 1
 
 
@@ -50,10 +50,7 @@ def simulated_talker(
     clock = Lockstep()
     wire = Wire(clock, can.nominal_bitrate_bit_per_s, can.data_bitrate_bit_per_s, _SEED)
     amplifier = wire.attach("amplifier")
-    node = node_type(
-        can.driver.node_id, clock, amplifier.send, plant or simulated_plant(bus), EDS,
-        turnaround_us=can.turnaround_us, fd=can.driver.fd, protection=can.driver.protection,
-    )  # fmt: skip
+    node = wired_node(can, clock, amplifier.send, plant or simulated_plant(bus), node_type)
     amplifier.on_frame = node.on_frame
     port = WirePort(wire.attach("tester"))
     node.power_on()

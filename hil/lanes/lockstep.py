@@ -21,13 +21,13 @@ from hil.faults.clock import ControllerKilledError
 from hil.faults.injection import Injection, plant_of
 from hil.lanes.blocks import Blocks
 from hil.lanes.setup import Setup
-from hil.node.amplifier import AmplifierNode
+from hil.node.wired import wired_node
 from hil.plant.on_bus import EXCHANGE
 from hil.plant.truth import TRUTH_BYTES
 from pkxyz_ctrl.can.cob_id import SYNC
 from pkxyz_ctrl.can.frame import Frame
 from pkxyz_ctrl.config.bus import CanConfig
-from pkxyz_ctrl.config.files import CONFIG_DIR, ConfigError
+from pkxyz_ctrl.config.files import ConfigError
 from pkxyz_ctrl.loop.controller import Controller
 from pkxyz_ctrl.loop.reference import REFERENCE
 from pkxyz_ctrl.loop.row import ROW
@@ -92,10 +92,7 @@ class LockstepRig:
         self.wire = Wire(self.clock, can.nominal_bitrate_bit_per_s, can.data_bitrate_bit_per_s, setup.seed)
         self.plant = plant_of(setup.new_plant(), setup.faults, setup.bus, setup.seed)
         amplifier = self.wire.attach("amplifier")
-        self.node = AmplifierNode(
-            can.driver.node_id, self.clock, amplifier.send, self.plant, CONFIG_DIR / "comb_amplifier.eds",
-            turnaround_us=can.turnaround_us, fd=can.driver.fd, protection=can.driver.protection,
-        )  # fmt: skip
+        self.node = wired_node(can, self.clock, amplifier.send, self.plant)
         amplifier.on_frame = self.node.on_frame
         latency_us = (setup.bus.delay_periods - 1) * setup.bus.period_us
         self._endpoint = self.wire.attach("controller")

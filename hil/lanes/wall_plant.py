@@ -14,11 +14,11 @@ import numpy as np
 
 from hil.bus.clock import Lockstep
 from hil.lanes.setup import Setup
-from hil.node.amplifier import AmplifierNode, NmtState
+from hil.node.amplifier import NmtState
+from hil.node.wired import wired_node
 from hil.plant.on_bus import PlantOnBus
 from hil.plant.truth import TRUTH_BYTES
 from pkxyz_ctrl.config.bus import CanConfig
-from pkxyz_ctrl.config.files import CONFIG_DIR
 from pkxyz_ctrl.io.can_port import CanPort
 from pkxyz_ctrl.io.clocks import WallClock
 from pkxyz_ctrl.loop.row import TRUTH_FIELDS
@@ -68,10 +68,7 @@ class WallPlant:
         self.clock = Lockstep()
         self.plant = PlantOnBus(setup.new_plant()) if truth is None else WitnessedPlant(setup.new_plant(), truth)
         self._port = CanPort(bus, self.wall)
-        self.node = AmplifierNode(
-            can_config.driver.node_id, self.clock, self._port.send, self.plant, CONFIG_DIR / "comb_amplifier.eds",
-            turnaround_us=can_config.turnaround_us, fd=can_config.driver.fd, protection=can_config.driver.protection,
-        )  # fmt: skip
+        self.node = wired_node(can_config, self.clock, self._port.send, self.plant)
         self._on_change = on_change
         self._shown = (NmtState.INITIALISING, False)
 

@@ -63,7 +63,7 @@ HOUSE: Mapping[str, Room] = MappingProxyType({
     )),
     # the harness: what the controller meets
     "hil.bus": Room(("pkxyz_ctrl.can", "pkxyz_ctrl.compiled", "pkxyz_ctrl.io")),
-    "hil.node": Room(("pkxyz_ctrl.can",)),
+    "hil.node": Room(("pkxyz_ctrl.can", "pkxyz_ctrl.config")),
     "hil.plant": Room(("sim.motion", "sim.structure", "sim", "pkxyz_ctrl.compiled", "pkxyz_ctrl.loop", "pkxyz_ctrl")),
     "hil.recording": Room(("pkxyz_ctrl.can", "pkxyz_ctrl.loop", "hil.bus")),
     "hil.faults": Room((
