@@ -14,11 +14,16 @@ _SCALE_VOLTS = (0.0, 1.0, 5.0)
 _OTHER: Counts = (TEST_COUNTS[1], TEST_COUNTS[2], TEST_COUNTS[0])
 
 
-def _energised(talker: Talker) -> None:
-    """Operational with the test counts at the outputs; only with permission."""
+def _energised(talker: Talker, configure: Callable[[], object] = lambda: None) -> None:
+    """Operational with the test counts at the outputs; only with permission. ``configure`` is called before that: a
+    node may hold what is safe fixed while operational.
+    """
     if not talker.allow_voltage:
         raise NotTestedError("takes counts other than 0: only with --allow-voltage")
     talker.operational()
+    talker.nmt(NmtCommand.PRE_OPERATIONAL)
+    configure()
+    talker.nmt(NmtCommand.START)
     talker.cycles(10, TEST_COUNTS)
     talker.cycle()
     if (outputs := talker.outputs()) != TEST_COUNTS:
@@ -108,9 +113,11 @@ def _leaving(talker: Talker) -> str:
 
 
 def _error_value(talker: Talker) -> str:
-    _energised(talker)
-    talker.write(0x6444, 1, _OTHER[0], 4)
-    talker.write(0x6443, 2, 0, 1)
+    def configure() -> None:
+        talker.write(0x6444, 1, _OTHER[0], 4)
+        talker.write(0x6443, 2, 0, 1)
+
+    _energised(talker, configure)
     talker.nmt(NmtCommand.PRE_OPERATIONAL)
     outputs, expected = talker.outputs(), (_OTHER[0], TEST_COUNTS[1], 0)
     talker.reset()

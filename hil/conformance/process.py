@@ -8,6 +8,7 @@ from hil.conformance.deviation import DeviationError, NotTestedError, deviate_if
 from hil.conformance.talker import SETTLE_US, ZERO, Talker
 from hil.conformance.verdict import OUR_CONTRACT, Check
 from pkxyz_ctrl.can import cob_id
+from pkxyz_ctrl.can.cob_id import NmtCommand
 from pkxyz_ctrl.can.codec import Counts
 from pkxyz_ctrl.can.emergency import code_text
 
@@ -128,9 +129,11 @@ def _sync_counter(talker: Talker) -> str:
 def _every_third(talker: Talker) -> str:
     talker.operational()
     on, off = talker.sense_id | cob_id.COB_ID_NO_RTR, talker.sense_id | cob_id.COB_ID_NO_RTR | cob_id.COB_ID_INVALID
+    talker.nmt(NmtCommand.PRE_OPERATIONAL)  # a node may hold its PDOs fixed while operational
     talker.write(0x1801, 1, off, 4)
     written = talker.write(0x1801, 2, 3, 1)
     talker.write(0x1801, 1, on, 4)
+    talker.nmt(NmtCommand.START)
     if not written.ok:
         raise DeviationError(f"0x1801:02 = 3: {written.text}")
     mark = talker.mark()
@@ -144,7 +147,9 @@ def _every_third(talker: Talker) -> str:
 
 def _switched_off(talker: Talker) -> str:
     talker.operational()
+    talker.nmt(NmtCommand.PRE_OPERATIONAL)
     talker.write(0x1801, 1, talker.sense_id | cob_id.COB_ID_NO_RTR | cob_id.COB_ID_INVALID, 4)
+    talker.nmt(NmtCommand.START)
     mark = talker.mark()
     talker.cycles(10)
     talker.run(2000)

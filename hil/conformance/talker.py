@@ -167,12 +167,14 @@ class Talker:
         self.send(cob_id.NMT, bytes((command, self.node_id)))
         boot = self.first(self.heartbeat_id, self.driver.boot_timeout_us)
         self.run(SETTLE_US)
+        self.nmt(
+            NmtCommand.PRE_OPERATIONAL
+        )  # a node may start by itself (CiA 302-2, object 1F80h), and hold what is safe fixed
         return boot
 
     def operational(self) -> None:
         """From reset to operational as our driver does it. What it could not write, the line on configuration tells."""
         self.reset()
-        self.nmt(NmtCommand.PRE_OPERATIONAL)  # a node may start by itself (CiA 302-2, object 1F80h)
         unhurried = self.driver.model_copy(update={"drive_timeout_ms": OUR_TIMEOUT_MAX_MS})  # SDO reads come in between
         for step in configuration_steps(unhurried):
             if step.write and step.value is not None:

@@ -61,7 +61,15 @@ KINDS: Final[dict[str, dict[str, Kind]]] = {
             "another device in its place: it starts with another product code",
             {"product_code": Parameter(0x99, 0, 0xFFFFFFFF, "object 0x1018:2")},
         ),
-        "wrong_configuration": Kind("another master tells it by SDO to answer every second SYNC only"),
+        "wrong_configuration": Kind(
+            "another master writes one of its objects by SDO: at first, that it answer every second SYNC only",
+            {
+                "index": Parameter(0x1801, 0, 0xFFFF, "of the object"),
+                "subindex": Parameter(2, 0, 255, "of the object"),
+                "value": Parameter(2, 0, 0xFFFFFFFF, "that is written"),
+                "bytes": Parameter(1, 1, 4, "how many it has"),
+            },
+        ),
     },
     "bus": {
         "drop": Kind("frames are not delivered, and nobody notices", {"probability": _SHARE}),
@@ -71,6 +79,10 @@ KINDS: Final[dict[str, dict[str, Kind]]] = {
         "delay": Kind("frames are delivered late", {"delay_us": Parameter(250, 1, 1e6, "how late")}),
         "error_frames": Kind(
             "frames are destroyed by error frames and repeated, until their sender is bus-off", {"probability": _SHARE}
+        ),
+        "forged": Kind(
+            "another node sends the very next frame of a kind, counter and CRC right; of no kind: NMT stop",
+            {"interval_s": Parameter(0.0005, 0.0001, 10.0, "between")},
         ),
         "babbling": Kind("another node sends without a pause", {"identifier": Parameter(1, 0, 0x7FF, "of its frames")}),
     },

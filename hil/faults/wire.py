@@ -1,6 +1,7 @@
 """Faults of the bus and of the node, on the simulated wire: what becomes of a frame, and who else is there."""
 
 import random
+import struct
 from collections.abc import Callable, Sequence
 
 from hil.bus.clock import Lockstep
@@ -8,6 +9,7 @@ from hil.bus.disturbance import CORRUPTED, DROPPED, FrameFate
 from hil.bus.endpoint import Endpoint
 from hil.bus.wire import Wire
 from hil.faults.fault import Fault
+from hil.faults.forged import Forger
 from hil.node.amplifier import AmplifierNode
 from pkxyz_ctrl.can.driver_config import DriverConfig
 from pkxyz_ctrl.can.frame import Frame
@@ -16,7 +18,7 @@ Rule = Callable[[Frame, str, int], FrameFate | None]
 
 _SYNC_ID = 0x080
 _IDENTITY = (0x1018, 2)
-_SENSE_TRANSMISSION_EVERY_SECOND = bytes((0x2F, 0x01, 0x18, 2, 2, 0, 0, 0))  # SDO download of 0x1801:2 = 2
+_DOWNLOAD = struct.Struct("<BHBI")  # SDO, expedited
 
 
 class WireFaults:
@@ -33,6 +35,7 @@ class WireFaults:
         self._random = random.Random(seed)
         self._rules: dict[int, Rule] = {}  # those that are on, by the identity of the fault
         self._guests: dict[int, Endpoint] = {}
+        self._forgers: dict[int, Forger] = {}
         self._product_code = node.od[_IDENTITY]
         self._ids = {
             "sense": 0x280 + driver.node_id,
@@ -70,7 +73,12 @@ class WireFaults:
                     self._node.power_on()
             case "wrong_configuration":
                 guest = self._plug_in(fault)
-                guest.send(self._frame(0x600 + self._driver.node_id, _SENSE_TRANSMISSION_EVERY_SECOND))
+                guest.send(self._frame(0x600 + self._driver.node_id, _download(fault)))
+            case "forged":
+                self._forgers[id(fault)] = Forger(
+                    f"guest {self._faults.index(fault)}", fault.part, round(fault["interval_s"] * 1e6),
+                    self._driver, self._clock, self._wire,
+                )  # fmt: skip
             case "babbling":
                 self._babble(fault)
             case _:
@@ -85,6 +93,9 @@ class WireFaults:
                 self._install_identity(self._product_code)
                 self._node.power_on()
         self._rules.pop(id(fault), None)
+        forger = self._forgers.pop(id(fault), None)
+        if forger is not None:
+            forger.leave()
         guest = self._guests.pop(id(fault), None)
         if guest is not None:
             guest.detach()
@@ -156,6 +167,12 @@ class WireFaults:
         flipped = bytearray(frame.data)
         flipped[bit // 8] ^= 1 << bit % 8
         return frame._replace(data=bytes(flipped))
+
+
+def _download(fault: Fault) -> bytes:
+    """The SDO request that writes what the fault says."""
+    command = 0x23 | 4 - round(fault["bytes"]) << 2
+    return _DOWNLOAD.pack(command, round(fault["index"]), round(fault["subindex"]), round(fault["value"]))
 
 
 class _Swapping:

@@ -97,6 +97,7 @@ class AmplifierNode:
             refresh=self._refresh,
             changed=self._configure,
             may_drive=lambda: not protection and self.state is NmtState.OPERATIONAL and not self._holds,
+            is_operational=lambda: self.state is NmtState.OPERATIONAL,
         )
         self._sdo = SdoServer(objects)
 

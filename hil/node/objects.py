@@ -5,12 +5,18 @@ from collections.abc import Callable
 from hil.node.object_dictionary import Abort, Entry, ObjectDictionary, SdoAbortError
 from hil.node.pdo import PdoParameters, check_can_id
 
+_FIXED_WHILE_OPERATIONAL = frozenset(
+    (0x1005, 0x1014, 0x1015, 0x1016, 0x1019, 0x1029, 0x2010, 0x2011, 0x2012, 0x6443, 0x6444)
+)
+"""What keeps the combs safe and the controller informed; with them the parameters of both PDOs."""
+
 
 class NodeObjects:
     """Stands between the SDO server and the dictionary.
 
     ``refresh(index)`` is called before a value is touched, ``changed(index)`` after one was written; ``may_drive()``
-    tells whether a drive count other than 0 may be set by SDO.
+    tells whether a drive count other than 0 may be set by SDO, ``is_operational()`` whether what the combs' safety
+    rests on is fixed: then nobody, whoever it is on the bus, changes it.
     """
 
     def __init__(
@@ -21,12 +27,14 @@ class NodeObjects:
         refresh: Callable[[int], None],
         changed: Callable[[int], None],
         may_drive: Callable[[], bool],
+        is_operational: Callable[[], bool],
     ) -> None:
         self._od = od
         self._pdos = {index: pdo for pdo in pdos for index in (pdo.communication, pdo.mapping)}
         self._refresh = refresh
         self._changed = changed
         self._may_drive = may_drive
+        self._is_operational = is_operational
 
     def read(self, index: int, subindex: int) -> bytes:
         entry = self._od.entry(index, subindex)
@@ -63,6 +71,8 @@ class NodeObjects:
 
     def _check(self, entry: Entry, value: int) -> None:
         index, subindex = entry.index, entry.subindex
+        if (index in _FIXED_WHILE_OPERATIONAL or index in self._pdos) and self._is_operational():
+            raise SdoAbortError(Abort.DEVICE_STATE)
         if index in self._pdos:
             self._pdos[index].check(index, subindex, value)
         elif index == 0x1003 and value != 0:

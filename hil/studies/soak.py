@@ -32,7 +32,7 @@ CLEAR_S = 0.02
 _GAP_S = (0.15, 0.7)  # between the beginnings of faults: some hit a scan, some a start-up, some a homing
 _LASTS_S = (0.0005, 0.06)
 _QUIET_S = 0.05  # at the end, so that the last one is not cut off
-_DEADLY = ("controller:killed",)  # would end the run
+_LEFT_OUT = ("controller:killed", "bus.drive:forged")  # would end the run; has a voltage of its own
 _ROWS_EACH = 300_000  # of one recording: a minute at 5 kHz
 
 
@@ -80,9 +80,9 @@ class Soaked:
 
 
 def random_faults(duration_s: float, seed: int) -> tuple[Fault, ...]:
-    """Faults from power-on to shortly before the end: every kind of the matrix but the end of the controller."""
+    """Faults from power-on to shortly before the end: every kind of the matrix but two."""
     dice = random.Random(seed)
-    texts = [case.text for case in CASES if case.text not in _DEADLY]
+    texts = [case.text for case in CASES if case.text not in _LEFT_OUT]
     faults = []
     at_s = 0.1
     while at_s < duration_s - _QUIET_S - _LASTS_S[1]:

@@ -21,6 +21,7 @@ NODE_HEARTBEAT_LOST = 1
 NODE_NOT_OPERATIONAL = 2
 NODE_REBOOTED = 4
 NODE_EMERGENCY = 8
+FOREIGN_FRAME = 16
 
 Frames = tuple[Frame, ...]
 
@@ -50,7 +51,8 @@ class AmplifierDriver:
 
     ``state`` and ``failure`` (a sentence: what was expected, what came, what to do) tell how the connection fares.
     ``node_events`` (NODE_... bits) are latched: EMERGENCY until ``acknowledge``, the others until ``start``, because a
-    node that was silent, left the operational state or restarted has to be configured again. ``emergencies`` holds
+    node that was silent, left the operational state or restarted has to be configured again, and so has one to which
+    somebody else spoke in our name (FOREIGN_FRAME; ``foreign`` tells the first such frame). ``emergencies`` holds
     the last 64. ``sense`` holds this tick's sense values. ``count_step_max``: the node's own limit of a step at a SYNC,
     in drive counts. All times are integer microseconds of the caller's one clock and never run backwards.
     """
@@ -62,6 +64,7 @@ class AmplifierDriver:
         self.failure = ""
         self.node_events = 0
         self.node_state: int | None = None  # as its last heartbeat said
+        self.foreign = ""
         self.emergencies: deque[Emergency] = deque(maxlen=_EMERGENCIES_KEPT)
         self._sense_id = cob_id.SENSE_BASE + config.node_id
         self._drive_id = cob_id.DRIVE_BASE + config.node_id
@@ -72,6 +75,13 @@ class AmplifierDriver:
         self.sense = SenseInput(ProcessCodec(self._sense_id, config.protection))
         self._receive_sense = self.sense.receive
         self._encode_drive = ProcessCodec(self._drive_id, config.protection).encode
+        self._ours = {
+            cob_id.NMT: "an NMT command",
+            cob_id.SYNC: "a SYNC",
+            self._drive_id: "a drive PDO",
+            self._sdo_request_id: "an SDO request",
+            cob_id.HEARTBEAT_BASE + config.controller_node_id: "a controller's heartbeat",
+        }
         self._flags = FD_FAST if config.fd else 0
         self._sync_frames = tuple(
             self._frame(cob_id.SYNC, bytes((count,))) for count in range(1, cob_id.SYNC_COUNTER_OVERFLOW + 1)
@@ -98,6 +108,7 @@ class AmplifierDriver:
         self.failure = ""
         self.node_events = 0
         self.node_state = None
+        self.foreign = ""
         self.emergencies.clear()
         self.sense.reset()
         self._sync_index = 0
@@ -180,6 +191,8 @@ class AmplifierDriver:
                 return self._advance(self._dialogue.receive(data, t_us), t_us)
         elif received_id == self._emergency_id:
             self._on_emergency(data, t_us)
+        elif received_id in self._ours:
+            self._on_foreign(received_id, data)
         return _NOTHING
 
     def drive(self, counts: Counts, t_us: int) -> Frame:
@@ -274,6 +287,21 @@ class AmplifierDriver:
             self.emergencies.append(emergency)
             if not emergency.is_reset:
                 self.node_events |= NODE_EMERGENCY
+
+    def _on_foreign(self, received_id: int, data: bytes) -> None:
+        """A frame that only we may send, and that we did not, since a controller does not receive its own.
+
+        What comes before the node is configured, a predecessor's last heartbeat perhaps, the configuration undoes.
+        """
+        if self.state not in (DriverState.CONFIGURING, DriverState.STARTING, DriverState.OPERATIONAL):
+            return
+        if received_id == cob_id.NMT and data[1:] not in (b"\0", bytes((self.config.node_id,))):
+            return  # to another node
+        self.node_events |= FOREIGN_FRAME
+        self.foreign = self.foreign or (
+            f"0x{received_id:03X} [{data.hex(' ')}], {self._ours[received_id]} that this controller did not send: "
+            "look for a second controller, a master or a tool on the bus, or receive_own_messages in its options"
+        )
 
     def _node_lost(self, t_us: int) -> None:
         silent_ms = (t_us - self._node_deadline_us + self._node_timeout_us) / 1000

@@ -230,7 +230,7 @@ class Controller:
             row = self.memory["row"][0]
             reason = explain(int(row["trips"]))
             emergencies = "".join(f"\n{e.told_at(self._begun_us)}." for e in self.driver.emergencies)
-            detail = f" [{self.driver.failure}]" if self.driver.failure else ""
+            detail = "".join(f" [{words}]" for words in (self.driver.failure, self.driver.foreign) if words)
             self.faults.append(f"at {row['t_us'] * 1e-6:.4f} s: {reason}{detail}{emergencies}{self._others.complaint}")
 
 

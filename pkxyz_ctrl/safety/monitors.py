@@ -42,6 +42,7 @@ class NodeEvent(IntFlag):
     NOT_OPERATIONAL = 2
     REBOOTED = 4
     EMERGENCY = 8
+    FOREIGN_FRAME = 16
 
 
 # A count of 0 trips at once (a limit that was never filled in is a fault), a negative one switches that monitor off.
@@ -150,7 +151,9 @@ _SLEW = int(Trip.SLEW)
 _OVERRUN = int(Trip.OVERRUN)
 _SOLVER = int(Trip.SOLVER)
 _NOT_FINITE = int(Trip.NOT_FINITE)
-# NodeEvent's four bits are Trip's four bits from HEARTBEAT_LOST on, in the same order.
+_FOREIGN_FRAME = int(Trip.FOREIGN_FRAME)
+_FOREIGN_EVENT = int(NodeEvent.FOREIGN_FRAME)
+# NodeEvent's first four bits are Trip's four bits from HEARTBEAT_LOST on, in the same order.
 _NODE_EVENTS = int(NodeEvent.HEARTBEAT_LOST | NodeEvent.NOT_OPERATIONAL | NodeEvent.REBOOTED | NodeEvent.EMERGENCY)
 _NODE_SHIFT = int(Trip.HEARTBEAT_LOST).bit_length() - 1
 
@@ -344,6 +347,8 @@ def check(limits: np.void, memory: np.void, obs: np.void) -> int:
         clear_memory(memory)
         return trips
     trips |= (int(obs["node_events"]) & _NODE_EVENTS) << _NODE_SHIFT
+    if obs["node_events"] & _FOREIGN_EVENT != 0:
+        trips |= _FOREIGN_FRAME
     leak = limits["overrun_leak_ticks"]
     memory["overrun_level"] = _bucket(memory["overrun_level"], obs["overrun"], leak)
     trips |= _filled(memory["overrun_level"], limits["overrun_count"], leak, _OVERRUN)

@@ -80,6 +80,9 @@ def _own_or_off(value: int, context: WriteContext) -> bool:
     return bool(value & _COB_ID_OFF) or value & _COB_ID_MASK in own
 
 
+_DRIVE_FIELDS: Final = (0x64110110, 0x64110210, 0x64110310, 0x20000108, 0x20000208)
+"""All that a PDO may write: three counts, alive counter, CRC. Never 0x6444, 0x2010 or 0x1016."""
+
 WRITE_RULES: Final = (
     WriteRule(0x1005, 0x1005, 0, 0, 4, "identifier of SYNC", "0x080, the node not its producer", _is(0x80)),
     WriteRule(0x1016, 0x1016, 1, 1, 4, "consumer of our heartbeat", "our node id, 1 ms to the limit", _our_heartbeat),
@@ -88,8 +91,8 @@ WRITE_RULES: Final = (
     WriteRule(0x1029, 0x1029, 1, 1, 1, "behaviour on communication error", "0 or 2, never 'carry on'", _is(0, 2)),
     WriteRule(0x1400, 0x15FF, 1, 1, 4, "identifier of a receive PDO", "0x1401: the drive PDO's; or off", _drive_or_off),
     WriteRule(0x1401, 0x1401, 2, 2, 1, "drive PDO: transmission type", "1, applied on every SYNC", _is(1)),
-    WriteRule(0x1600, 0x17FF, 0, 0, 1, "receive mapping: number of entries", "any", _anything),
-    WriteRule(0x1600, 0x17FF, 1, 64, 4, "receive mapping: entry", "any", _anything),
+    WriteRule(0x1600, 0x17FF, 0, 0, 1, "receive mapping: number of entries", "0 to 5", _is(*range(6))),
+    WriteRule(0x1600, 0x17FF, 1, 64, 4, "receive mapping: entry", "0x6411, 0x2000, none", _is(0, *_DRIVE_FIELDS)),
     WriteRule(0x1800, 0x19FF, 1, 1, 4, "identifier of a transmit PDO", "the node's own four; or off", _own_or_off),
     WriteRule(0x1800, 0x19FF, 2, 2, 1, "transmit PDO: transmission type", "any", _anything),
     WriteRule(0x1800, 0x19FF, 3, 3, 2, "transmit PDO: inhibit time", "any", _anything),

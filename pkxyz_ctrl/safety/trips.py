@@ -38,6 +38,7 @@ class Trip(IntFlag):
     COMB_FORCE_1 = 1 << 27
     COMB_FORCE_2 = 1 << 28
     COMB_FORCE_3 = 1 << 29
+    FOREIGN_FRAME = 1 << 30
 
 
 # What happened, in terms of the instrument; then what to look at, most likely first.
@@ -162,6 +163,10 @@ EXPLANATIONS: Final[dict[Trip, tuple[str, str]]] = {
     Trip.COMB_FORCE_3: (
         "drive comb 3 pulls with a force that is not that of its voltage",
         "check amplifier channel 3 (stuck, dead, limited, slow), then sense comb 3 (slow), then look for a push",
+    ),
+    Trip.FOREIGN_FRAME: (
+        "somebody else on the bus sends what only this controller may send",
+        "look for a second controller, a master or a tool that is connected, and take it off the bus",
     ),
 }
 

@@ -13,6 +13,7 @@ from scripted_node import (
     PRE_OP,
     PRE_OPERATIONAL,
     STOPPED,
+    ObedientServer,
     frame,
     heartbeat,
     started,
@@ -21,6 +22,7 @@ from scripted_node import (
 
 from pkxyz_ctrl.can.codec import CountsOutOfRangeError, ProcessCodec
 from pkxyz_ctrl.can.driver import (
+    FOREIGN_FRAME,
     NODE_EMERGENCY,
     NODE_HEARTBEAT_LOST,
     NODE_NOT_OPERATIONAL,
@@ -209,6 +211,48 @@ frames = st.builds(
 )
 
 
+# -- somebody else in our name -----------------------------------------------------------------------------------------
+
+OURS = ["080 01", "30a 00 00 00 00 00 00 00 00", "60a 40 00 10 00 00 00 00 00", "77f 05", "000 80 0a", "000 02 00"]
+
+
+@pytest.mark.parametrize("sent", OURS)
+def test_a_frame_that_only_we_may_send_is_noticed_and_named(sent):
+    driver = started()
+    assert driver.receive(frame(sent), 100) == ()
+    assert driver.node_events == FOREIGN_FRAME
+    assert driver.foreign.startswith(f"0x{sent[:3].upper()} [{sent[4:]}]")
+    driver.receive(frame("080 02"), 200)
+    assert driver.foreign.startswith(f"0x{sent[:3].upper()}")  # the first
+    driver.acknowledge()
+    assert driver.node_events == FOREIGN_FRAME  # until everything has been configured again
+    driver.start(300)
+    assert (driver.node_events, driver.foreign) == (0, "")
+
+
+@pytest.mark.parametrize("sent", ["000 80 0b", "000 01 01", "77e 05", "30b 00 00", "60b 40", "081 01", "180", "7ff 00"])
+def test_frames_of_others_in_their_own_name_are_none_of_our_business(sent):
+    driver = started()
+    driver.receive(frame(sent), 100)
+    assert (driver.node_events, driver.foreign) == (0, "")
+
+
+@pytest.mark.parametrize("sent", OURS)
+def test_before_the_node_is_configured_others_may_have_spoken_and_from_then_on_not(sent):
+    driver = AmplifierDriver(DriverConfig())
+    driver.start(0)
+    driver.receive(frame(sent), 10)
+    asked = driver.receive(heartbeat(BOOT_UP), 100)
+    driver.receive(frame(sent), 110)
+    assert driver.state is DriverState.IDENTIFYING
+    assert driver.node_events == 0
+    server = ObedientServer()
+    while driver.state is DriverState.IDENTIFYING:
+        asked = driver.receive(server.answer(asked[0]), 120)
+    driver.receive(frame(sent), 130)
+    assert driver.node_events == FOREIGN_FRAME
+
+
 # -- release ----------------------------------------------------------------------------------------------------------
 
 
@@ -268,7 +312,7 @@ def test_no_frame_whatsoever_upsets_the_driver(traffic, from_operational):
         assert 0 <= status < 32
         assert (driver.state is DriverState.FAILED) == (driver.failure != "")
     if from_operational and driver.state is DriverState.OPERATIONAL:
-        assert driver.node_events & ~NODE_EMERGENCY == 0
+        assert driver.node_events & ~(NODE_EMERGENCY | FOREIGN_FRAME) == 0
 
 
 @pytest.mark.parametrize(

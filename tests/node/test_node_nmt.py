@@ -322,9 +322,9 @@ def test_restart_of_the_controller_is_a_loss() -> None:
 
 def test_rewriting_the_consumer_time_ends_the_watch() -> None:
     rig = watched()
-    rig.energise()
     rig.give(CONTROLLER, b"\x05")
-    rig.write(0x1016, 1, 127 << 16 | 10, 4)
+    assert rig.write(0x1016, 1, 127 << 16 | 10, 4) == 0
+    rig.energise()
     rig.run(1_000_000)
     assert rig.node.outputs == (100, 200, 300)
     rig.give(CONTROLLER, b"\x05")

@@ -610,6 +610,8 @@ def test_a_pdo_out_of_use_is_deaf_and_dumb() -> None:
     rig.cycle((1, 2, 3))
     rig.cycle((1, 2, 3))
     assert (rig.plant.driven, rig.sent) == ([], [])
+    rig.nmt(128)
     assert rig.write(0x1801, 1, 0x4000028A, 4) == 0
+    rig.start()
     rig.cycle()
     assert len(rig.of(SENSE)) == 1

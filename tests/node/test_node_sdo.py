@@ -92,6 +92,31 @@ PDO_OFF_VALUES = {
 }
 
 
+FIXED = {
+    0x1005, 0x1014, 0x1015, 0x1016, 0x1019, 0x1029, 0x1401, 0x1601, 0x1801, 0x1A01, 0x2010, 0x2011, 0x2012,
+    0x6443, 0x6444,
+}  # fmt: skip
+
+
+def test_what_safety_rests_on_is_fixed_while_operational() -> None:
+    """200 V stayed after a clean exit, and after a kill: 0x6444, 0x1016, 0x2010, 0x1029 and 0x1005 could be written at
+    rate, by anybody.
+    """
+    writable = [v for v in VARIABLES if v.access_type not in ("ro", "const")]
+    refused = set()
+    rig = Rig()
+    rig.energise()
+    for variable in writable:
+        rig.cycle((100, 200, 300))
+        value = int(rig.read(variable.index, variable.subindex))
+        if rig.write(variable.index, variable.subindex, value, len(variable) // 8) == 0x08000022:
+            refused.add(variable.index)
+    assert refused == FIXED
+    assert rig.node.outputs == (100, 200, 300)
+    rig.nmt(128)
+    assert rig.write(0x2010, 0, 9, 1) == rig.write(0x6444, 1, 5, 4) == rig.write(0x1016, 1, 0x7F0020, 4) == 0
+
+
 def test_every_writable_object_takes_a_value_and_keeps_it() -> None:
     writable = {(v.index, v.subindex) for v in VARIABLES if v.access_type not in ("ro", "const")}
     assert writable == set(NEW_VALUES) | set(PDO_OFF_VALUES)

@@ -95,7 +95,7 @@ TROUBLE = st.fixed_dictionaries(
         "status": st.integers(0, 31),
         "event": st.sampled_from([int(e) for e in Event]),
         "trips": st.sampled_from([0, 1 << 22, 1 << 23]),
-        "node_events": st.sampled_from([0, 0, 0, 1, 8]),
+        "node_events": st.sampled_from([0, 0, 0, 1, 8, 16]),
         "overrun": st.integers(0, 12),
         "jump_m": st.floats(-3e-6, 3e-6),
     },

@@ -296,6 +296,7 @@ def test_node_events_trip_at_once(event: NodeEvent) -> None:
         NodeEvent.NOT_OPERATIONAL: Trip.NODE_NOT_OPERATIONAL,
         NodeEvent.REBOOTED: Trip.NODE_REBOOTED,
         NodeEvent.EMERGENCY: Trip.NODE_EMERGENCY,
+        NodeEvent.FOREIGN_FRAME: Trip.FOREIGN_FRAME,
     }
     for mode in Mode:
         assert Bench(mode).tick({"node_events": event}) == (expected[event] if NODE_EXPECTED[mode] else 0)
@@ -316,7 +317,7 @@ ALL_BAD: Changes = {
     "saturated": 1,
     "solver_ok": 0,
     "overrun": 5,
-    "node_events": 15,
+    "node_events": 31,
 }
 
 
@@ -327,7 +328,7 @@ def test_what_is_watched_in_which_mode(mode: Mode) -> None:
     for _ in range(300):
         trips |= bench.tick(ALL_BAD)
     frames = Trip.SENSE_SEQUENCE | 0b111 * Trip.SENSE_RANGE_1 | 0b111 * Trip.SENSE_FROZEN_1 | Trip.OVERRUN
-    frames |= 0b1111 * Trip.HEARTBEAT_LOST
+    frames |= 0b1111 * Trip.HEARTBEAT_LOST | Trip.FOREIGN_FRAME
     loop = 0b111 * Trip.INNOVATION_X | Trip.SATURATION | Trip.SLEW | Trip.SOLVER | 0b111 * Trip.COMB_FORCE_1
     assert trips == (frames if NODE_EXPECTED[mode] else 0) | (loop if LOOP_CLOSED[mode] else 0)
 

@@ -45,6 +45,7 @@ TRIPS = [
     "COMB_FORCE_1",
     "COMB_FORCE_2",
     "COMB_FORCE_3",
+    "FOREIGN_FRAME",
 ]
 
 
@@ -60,7 +61,7 @@ def test_bits_of_what_was_wrong_with_a_frame_and_a_node() -> None:
     assert {name: bit.value for name, bit in SenseStatus.__members__.items()} == {
         n: 1 << k for k, n in enumerate(sense)
     }
-    node = ["HEARTBEAT_LOST", "NOT_OPERATIONAL", "REBOOTED", "EMERGENCY"]
+    node = ["HEARTBEAT_LOST", "NOT_OPERATIONAL", "REBOOTED", "EMERGENCY", "FOREIGN_FRAME"]
     assert {name: bit.value for name, bit in NodeEvent.__members__.items()} == {n: 1 << k for k, n in enumerate(node)}
 
 
@@ -75,8 +76,8 @@ WRITES = (
     (0x1029, 0x1029, 1, 1, 1, 2, (1, 3)),
     (0x1400, 0x15FF, 1, 1, 4, OFF, (0x20A, 0x40A)),
     (0x1401, 0x1401, 2, 2, 1, 1, (0, 2, 255)),
-    (0x1600, 0x17FF, 0, 0, 1, 5, ()),
-    (0x1600, 0x17FF, 1, 64, 4, 0x64110110, ()),
+    (0x1600, 0x17FF, 0, 0, 1, 5, (6, 255)),
+    (0x1600, 0x17FF, 1, 64, 4, 0x64110110, (0x64440120, 0x20100008, 0x10160120, 0x64110410, 0x64110108)),
     (0x1800, 0x19FF, 1, 1, 4, 0x28A, (0x28B, 0x30A, 0x0A)),
     (0x1800, 0x19FF, 2, 2, 1, 1, ()),
     (0x1800, 0x19FF, 3, 3, 2, 0, ()),
@@ -137,6 +138,10 @@ def test_values_with_more_than_one_permitted() -> None:
     assert not refused(0x1016, 1, 4, 127 << 16 | 1)
     assert not refused(0x2011, 0, 2, 1)
     assert not refused(0x2012, 0, 2, 1)
+    for entry in (0, 0x64110210, 0x64110310, 0x20000108, 0x20000208):
+        assert not refused(0x1601, 1, 4, entry)
+    for number in range(6):
+        assert not refused(0x1601, 0, 1, number)
     for cob_id in (0x30A, 0x4000030A, OFF | 0x30A, OFF):
         assert not refused(0x1401, 1, 4, cob_id)
     for index in (0x1400, 0x1402):
@@ -145,7 +150,7 @@ def test_values_with_more_than_one_permitted() -> None:
         assert not refused(0x1801, 1, 4, cob_id)
 
 
-@pytest.mark.parametrize(("index", "subindex", "size"), [(0x1601, 0, 1), (0x1801, 3, 2)])
+@pytest.mark.parametrize(("index", "subindex", "size"), [(0x1A01, 0, 1), (0x1801, 3, 2)])
 def test_nothing_may_stand_behind_the_value(index: int, subindex: int, size: int) -> None:
     """Of objects that may hold anything: whatever is refused, is so for the bytes behind."""
     for bit in range(32):

@@ -35,6 +35,8 @@ class Case(NamedTuple):
     """where 0 V can't be sent: how soon the node goes there by itself; None: by the controller, within two ticks"""
     may_go_on: bool = False
     """not noticing it is as good, since it does no harm"""
+    forged_v: float = 0.0
+    """what somebody else may make of 0 V for a tick or two, until the node has been taken out of operational again"""
     lasts_s: float | None = LASTS_S
     """None: to the end"""
     reasons_if_lasting: Trip = Trip(0)
@@ -80,6 +82,7 @@ _ASKED = (
 _HARDLY_ASKED = "this scan asks too little of comb 1; noticed once the feedback asks for more, or as the fault ends"
 _FOLLOWS_SLOWLY = "37 ticks, calculated likewise: 0.06 V a tick against the 0.2 V that are asked"
 _HEARTBEAT = "50 ms after the last heartbeat, and the tick that tells; by then 250 counted PDOs have come either way"
+_WHICH = "which of two is right nobody can tell, since counter and CRC of both are; four in short order are a fault"
 _CHANNEL_2 = Trip.COMB_FORCE_2 | Trip.COMB_MISFIT_2
 _CHANNEL_1 = Trip.COMB_FORCE_1 | Trip.COMB_MISFIT_1
 _NODE = Trip.HEARTBEAT_LOST | Trip.NODE_EMERGENCY | Trip.NODE_NOT_OPERATIONAL
@@ -110,7 +113,8 @@ CASES: Final[tuple[Case, ...]] = (
     Case("node:reset", _STALE | Trip.NODE_REBOOTED),
     Case("node:reboot_loop", _STALE | Trip.NODE_REBOOTED),
     Case("node:wrong_identity", _STALE | Trip.NODE_REBOOTED),
-    Case("node:wrong_configuration", _STALE | Trip.SENSE_SEQUENCE),
+    Case("node:wrong_configuration", Trip.FOREIGN_FRAME, 1),
+    Case("node:wrong_configuration,index=4101,subindex=0,value=144,bytes=4", Trip.FOREIGN_FRAME, 1),  # SYNC: 0x1005
     Case("bus:drop", _STALE, discharged_within_ms=NODE_MS),
     Case("bus.sense:drop", _STALE),
     Case("bus.drive:drop", Trip.NODE_EMERGENCY),
@@ -127,6 +131,11 @@ CASES: Final[tuple[Case, ...]] = (
         "bus.sense:error_frames", _STALE | Trip.NODE_EMERGENCY, discharged_within_ms=NODE_MS
     ),  # drive frames wait, too
     Case("bus:error_frames", _STALE, discharged_within_ms=NODE_MS),
+    Case("bus:forged", Trip.FOREIGN_FRAME, 1),
+    Case("bus.sync:forged", Trip.FOREIGN_FRAME | Trip.NODE_EMERGENCY, 2),
+    Case("bus.drive:forged", Trip.FOREIGN_FRAME | Trip.NODE_EMERGENCY, 2, forged_v=8.0),
+    Case("bus.heartbeat:forged", Trip.FOREIGN_FRAME, 1),
+    Case("bus.sense:forged", Trip.SENSE_SEQUENCE | _STALE | Trip.NODE_EMERGENCY, 15, _WHICH),
     Case("bus:babbling", _STALE, discharged_within_ms=NODE_MS),
     Case(
         "controller:late_tick,late_us=30",

@@ -149,7 +149,7 @@ def _problems(
     step_v = limits.slew_max_v_per_s * setup.bus.period_s
     if outcome.slew_max_v > step_v * (1 + 1e-3):
         problems.append(f"a step of {outcome.slew_max_v:.1f} V in a tick, beyond {step_v:g} V")
-    if outcome.rise_max_v > RISE_V:
+    if outcome.rise_max_v > RISE_V + case.forged_v:
         problems.append(f"a comb rose by {outcome.rise_max_v:.1f} V after the decision")
     allowed_ms = _allowed_ms(case, setup)
     if released and (outcome.zero_ms is None or outcome.zero_ms > allowed_ms + 1e-9):
@@ -210,8 +210,9 @@ def _problems_of_releases(
         later = edges[edges >= begin]
         end = int(later[0]) + 1 if len(later) else len(voltage)
         due = begin + round(_allowed_ms(case, setup) * 1e3 / setup.bus.period_us)
-        if due < end and (voltage[due:end] >= DISCHARGED_V).any():
-            at = due + int(np.flatnonzero((voltage[due:end] >= DISCHARGED_V).any(axis=1))[-1])
+        beyond = (voltage[due:end] >= DISCHARGED_V + case.forged_v).any(axis=1)
+        if beyond.any():
+            at = due + int(np.flatnonzero(beyond)[-1])
             problems.append(f"{voltage[at].max():.1f} V at tick {at}, {at - begin} after the release at {begin}")
     return problems
 
