@@ -28,6 +28,8 @@ import numpy as np
 import pyarrow.parquet  # noqa: F401
 import pytest
 
+import hil.commands.check_amplifier
+import hil.commands.run  # noqa: F401  a command is loaded when it is called, which in the guest takes a while
 from hil.cli import main
 from hil.lanes.wall_plant import TRUTH
 from hil.pictures.wall import draw_wall  # noqa: F401
