@@ -126,7 +126,8 @@ class RunFolder:
             )
         if present - {_UNFINISHED} and CONFIG not in present and not self._earlier.is_dir():
             raise ConfigError(f"--out: {self.path}: holds parts of a run without its {CONFIG}; give a new folder")
-        if (CONFIG in present or self._earlier.is_dir()) and not self._replace:
+        holds = self._earlier.is_dir() or (CONFIG in present and not self._is_empty(present))
+        if holds and not self._replace:
             raise ConfigError(
                 f"--out: {self.path}: holds an earlier run; give another folder, or --replace to have it replaced"
             )
@@ -181,6 +182,13 @@ class RunFolder:
             return Recording.open(self.recording).ticks > 0
         except RecordingError:
             return False
+
+    def _is_empty(self, present: set[str]) -> bool:
+        """Whether the run here never recorded a tick; one that can't be read may have."""
+        try:
+            return Recording.open(self.recording).ticks == 0
+        except RecordingError:
+            return not present & {RECORDING, RECORDING + ".journal"}
 
     def _where_it_is(self, table: Path) -> Path:
         """A table of the run that is being replaced by its own configuration has been set aside with it."""

@@ -85,6 +85,17 @@ def test_a_run_that_never_begins_leaves_the_earlier_one(earlier, tmp_path):
     assert not (folder / EARLIER).exists()
 
 
+def test_a_run_that_never_recorded_anything_is_none_to_keep(tmp_path):
+    """No amplifier answered: the same command again is not refused. What can't be read may be a run, and is kept."""
+    folder = RunFolder(tmp_path / "run")
+    with folder.taken():
+        folder.write_config(scenario_of())
+    run_into(RunFolder(folder.path), scenario_of(), Lane.FAST)
+    os.truncate(folder.recording, 1000)
+    with pytest.raises(ConfigError, match="holds an earlier run"):
+        RunFolder(folder.path)
+
+
 def dying_at(step, work):
     """Do ``work`` in a child that is gone before its ``step``-th change of the folder; whether it got so far."""
     child = os.fork()
