@@ -25,7 +25,7 @@ Array = NDArray[np.float64]
 
 def errors_nm(stage: str) -> tuple[Array, Array]:
     """Times (n,) of the reference in ms, and true position less reference (n, 3), while scanning."""
-    scenario = load_scenario("raster_harsh", stage=stage)
+    scenario = load_scenario("raster_harsh", stage=stage, controller="lqg")
     blocks: list[NDArray[np.void]] = []
     lanes.run(scenario.setup(), Lane.FAST, on_block=lambda block: blocks.append(block.copy()))
     rows = np.concatenate(blocks)

@@ -45,7 +45,7 @@ def error_nm(rows: NDArray[np.void], axis: int) -> NDArray[np.float64]:
 
 def draw_errors(figure: Figure) -> None:
     """Error in x on two lines of the mild plant, whole and without its parts."""
-    scenario = load_scenario("raster_mild")
+    scenario = load_scenario("raster_mild", controller="lqg")
     setup = scenario.setup()
     whole = rows_of(setup)
     axes = figure.add_subplot(1, 2, 1)
@@ -64,7 +64,7 @@ def draw_errors(figure: Figure) -> None:
 
 def draw_quantisation(figure: Figure) -> None:
     """Spectrum of the voltage's rounding error while holding, with and without noise shaping."""
-    setup = load_scenario("raster").setup()
+    setup = load_scenario("raster", controller="lqg").setup()
     axes = figure.add_subplot(1, 2, 2)
     gain = setup.law["tick"]["drive"]["force_gain_n_per_v2"][0]
     for name, colour in (("no noise shaping", VERMILION), ("noise shaping", BLUE)):
