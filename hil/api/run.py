@@ -96,9 +96,8 @@ def run(
         summary, rows = run_in_memory(loaded, Lane(lane), on_progress)
         return Run(summary.as_json(), rows, None)
     folder = RunFolder(Path(out))
-    summary = run_into(folder, loaded, Lane(lane), on_progress)
-    draw(folder, summary)
-    return Run(summary.as_json(), _rows_of(folder.recording), folder.path)
+    draw(folder, run_into(folder, loaded, Lane(lane), on_progress))
+    return open_run(folder.path)
 
 
 def open_run(folder: str | Path) -> Run:

@@ -17,7 +17,7 @@ from pkxyz_ctrl.loop.period import period_on
 from pkxyz_ctrl.loop.reference import REFERENCE, standing_still
 from pkxyz_ctrl.loop.row import ROW
 from pkxyz_ctrl.safety.gate import GateConfig, TransmitGate
-from pkxyz_ctrl.safety.modes import Event, Mode, next_mode
+from pkxyz_ctrl.safety.modes import NODE_EXPECTED, Event, Mode, next_mode
 from pkxyz_ctrl.safety.trips import Trip, explain
 
 Send = Callable[[Frame], object]
@@ -149,7 +149,7 @@ class Controller:
             self._event = int(Event.CLEAR) if self.mode == Mode.FAULT else self._event
         c1, c2, c3, status = self._sense.take()
         if status & 1:
-            self.missing_sense += 1
+            self.missing_sense += int(NODE_EXPECTED[self.mode])  # a node that we took out of operation owes none
         else:
             self._others.forget(self._begun_us)
         if self._blocked:

@@ -7,7 +7,7 @@ from hil.runs.metrics import RowFigures
 from hil.runs.scenario import load_scenario
 from hil.runs.summary import LoopFigures, summarise
 
-ROWS = RowFigures(1000, 0, None, None, None, None)
+ROWS = RowFigures(1000, 0, None, None, None, None, None, None)
 TEXT = """
 name = "plain"
 duration_s = 0.1
