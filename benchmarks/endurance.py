@@ -121,7 +121,7 @@ def scenario_of(folder: Path, minutes: float, bus: str) -> Scenario:
     text = (CONFIG_DIR / "buses" / f"{bus}.toml").read_text(encoding="utf-8")
     assert 'channel = "pkxyz"' in text
     text = text.replace('channel = "pkxyz"', f'channel = "{folder}/bus"')
-    patience = "controller_heartbeat_timeout_ms = 900\nnode_heartbeat_timeout_ms = 900\n"
+    patience = "controller_heartbeat_timeout_ms = 900\nnode_heartbeat_timeout_ms = 900\ndrive_timeout_ms = 900\n"
     (folder / "bus.toml").write_text(text + patience, encoding="utf-8")
     words = SCENARIO.format(
         duration_s=duration_s, bus="bus.toml", frequency_hz=CIRCLE_HZ, turns=float(int((duration_s - 2.0) * CIRCLE_HZ))

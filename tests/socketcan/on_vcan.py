@@ -90,6 +90,7 @@ def bench(request):
     for key, value in (("period", PERIOD_US), ("sense_deadline", 8000), ("heartbeat_deadline", 9900)):
         bus = replaced(rf"^{key}_us = \d+", f"{key}_us = {value}", bus)
     timeouts = f"controller_heartbeat_timeout_ms = {TIMEOUT_US // 1000}\nnode_heartbeat_timeout_ms = 2500\n"
+    timeouts += f"drive_timeout_ms = {TIMEOUT_US // 1000}\n"
     timeouts += "boot_timeout_us = 20_000_000\nstart_timeout_us = 5_000_000\nsdo_timeout_us = 5_000_000\n"
     (folder / "bus.toml").write_text(bus + timeouts)
     (folder / "slow_scan.toml").write_text(SCENARIO)
