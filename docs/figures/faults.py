@@ -13,7 +13,6 @@ import sys
 from pathlib import Path
 
 from hil.commands.studies.faults import run_matrix
-from hil.faults.catalogue import KINDS, PARTS
 from hil.pictures.faults import draw
 from hil.studies.faults.matrix import CASES
 from hil.studies.faults.outcome import Outcome
@@ -23,33 +22,18 @@ HERE = Path(__file__).parent
 PAGE = HERE.parent / "lookup" / "faults.md"
 
 
-def kinds() -> str:
-    """The catalogue as a table."""
-    rows = ["| target | kind | what it does | parameters |", "| --- | --- | --- | --- |"]
-    for family, its in KINDS.items():
-        target = f"{family}.{'/'.join(PARTS[family])}" if family in ("sense", "amplifier") else family
-        if family == "bus":
-            target = f"bus, bus.{'/'.join(PARTS[family])}"
-        for name, kind in its.items():
-            parameters = ", ".join(
-                f"{key} = {p.default:g} ({p.low:g} to {p.high:g}; {p.meaning})" for key, p in kind.parameters.items()
-            )
-            rows.append(f"| {target} | {name} | {kind.meaning} | {parameters} |")
-    return "\n".join(rows)
-
-
 def matrix(outcomes: list[Outcome]) -> str:
     """What came of each fault under the default law."""
     rows = [
-        "| fault | ticks | latched | 0 V after, ms | peak V | V in a tick | off by, um | |",
-        "| --- | --- | --- | --- | --- | --- | --- | --- |",
+        "| fault | ticks | latched | 0 V after, ms | off by, um | |",
+        "| --- | --- | --- | --- | --- | --- |",
     ]
     for outcome, case in zip(outcomes, CASES, strict=True):
         ticks = "-" if outcome.ticks is None else str(outcome.ticks)
         zero = "-" if outcome.zero_ms is None else f"{outcome.zero_ms:.1f}"
         rows.append(
-            f"| {outcome.case} | {ticks} | {', '.join(outcome.reason)} | {zero} | {outcome.voltage_max_v:.0f} "
-            f"| {outcome.slew_max_v:.1f} | {outcome.excursion_um:.2f} | {'; '.join(outcome.problems) or case.note} |"
+            f"| {outcome.case} | {ticks} | {', '.join(outcome.reason)} | {zero} "
+            f"| {outcome.excursion_um:.2f} | {'; '.join(outcome.problems) or case.note} |"
         )
     return "\n".join(rows)
 
@@ -78,8 +62,7 @@ def main() -> None:
     found, refused = run_matrix(laws, list(CASES), 0, quiet=False)
     print("not run:", refused)
     draw(found, CASES, HERE / "faults.png")
-    page = filled_in(PAGE.read_text(encoding="utf-8"), "kinds", kinds())
-    page = filled_in(page, "matrix", matrix([o for o in found if o.law == "lqg"]))
+    page = filled_in(PAGE.read_text(encoding="utf-8"), "matrix", matrix([o for o in found if o.law == "lqg"]))
     if len(sys.argv) > 1:
         page = filled_in(page, "soak", soaked(Path(sys.argv[1])))
         shutil.copy(Path(sys.argv[1]).with_name("soak.png"), HERE / "soak.png")

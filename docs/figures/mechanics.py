@@ -1,8 +1,8 @@
-"""Writes the figures of docs/understand/mechanics.md, and its generated tables.
+"""Writes the figures of docs/understand/mechanics.md, and its generated table.
 
     python docs/figures/mechanics.py
 
-A table stands between ``<!-- generated: NAME -->`` and ``<!-- end -->``.
+It stands between ``<!-- generated: splitting -->`` and ``<!-- end -->``.
 """
 
 import re
@@ -21,26 +21,11 @@ from pkxyz_ctrl.config.files import load
 from pkxyz_ctrl.config.stage import StageConfig
 from pkxyz_ctrl.mechanics.linearisation import linearisation_study
 from pkxyz_ctrl.mechanics.modes import modes
-from pkxyz_ctrl.mechanics.published import entries
-from pkxyz_ctrl.mechanics.reproduction import reproduction_table
 from pkxyz_ctrl.mechanics.selection import Requirements, select
 from pkxyz_ctrl.stage import Stage
 
 HERE = Path(__file__).parent
 PAGE = HERE.parent / "understand" / "mechanics.md"
-
-
-def numbers_table() -> str:
-    """The paper's numbers as a Markdown table."""
-    lines = [
-        "| where | number | unit | published | printed design | reconstructed | verdict | why |",
-        "|---|---|---|---|---|---|---|---|",
-    ]
-    for row in reproduction_table(entries(), Stage.load("printed"), Stage.load("reconstructed")):
-        figures = ["" if v is None else f"{v:.6g}" for v in (row.printed, row.reconstructed)]
-        cells = [row.where, row.quantity, row.unit, row.published_text, *figures, str(row.verdict), row.why]
-        lines.append("| " + " | ".join(cell.replace("|", "\\|") for cell in cells) + " |")
-    return "\n".join(lines)
 
 
 def splitting_table() -> str:
@@ -57,11 +42,9 @@ def splitting_table() -> str:
 
 
 def filled_in(page: str) -> str:
-    """The page with the current tables."""
-    for name, table in (("numbers", numbers_table()), ("splitting", splitting_table())):
-        pattern = re.compile(rf"(<!-- generated: {name} -->\n).*?(<!-- end -->)", re.DOTALL)
-        page = pattern.sub(lambda m, table=table: f"{m[1]}{table}\n{m[2]}", page)
-    return page
+    """The page with the current table."""
+    pattern = re.compile(r"(<!-- generated: splitting -->\n).*?(<!-- end -->)", re.DOTALL)
+    return pattern.sub(lambda m: f"{m[1]}{splitting_table()}\n{m[2]}", page)
 
 
 def main() -> None:

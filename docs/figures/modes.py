@@ -9,9 +9,7 @@ import re
 from pathlib import Path
 
 from pkxyz_ctrl.safety.gate import PERMITTED, FrameKind
-from pkxyz_ctrl.safety.modes import EVENT_MEANING, MODE_FACTS, TRANSITIONS, Event, Mode
-from pkxyz_ctrl.safety.sdo_rules import WRITE_RULES
-from pkxyz_ctrl.safety.trips import EXPLANATIONS
+from pkxyz_ctrl.safety.modes import MODE_FACTS, TRANSITIONS, Mode
 
 PAGE = Path(__file__).parents[1] / "understand" / "safety.md"
 
@@ -50,44 +48,12 @@ def modes() -> str:
     )
 
 
-def transitions() -> str:
-    rows = [
-        [f"{event.name}", EVENT_MEANING[event]]
-        + [TRANSITIONS[mode, event].name if (mode, event) in TRANSITIONS else "" for mode in Mode]
-        for event in Event
-    ]
-    return _table(["event", "meaning", *(mode.name for mode in Mode)], rows)
-
-
-def trips() -> str:
-    return _table(
-        ["trip", "what a person reads", "what to check"],
-        [[str(trip.name), happened, remedy] for trip, (happened, remedy) in EXPLANATIONS.items()],
-    )
-
-
 def gate() -> str:
     rows = [[mode.name, *(_yes(kind in kinds) for kind in FrameKind)] for mode, kinds in PERMITTED.items()]
     return _table(["mode", *(str(kind.name) for kind in FrameKind)], rows)
 
 
-def writes() -> str:
-    rows = []
-    for rule in WRITE_RULES:
-        index = f"0x{rule.first:04X}" + (f" to 0x{rule.last:04X}" if rule.last > rule.first else "")
-        subindex = f"{rule.sub_first}" + (f" to {rule.sub_last}" if rule.sub_last > rule.sub_first else "")
-        rows.append([index, subindex, str(rule.size), rule.what, rule.permitted])
-    return _table(["object", "sub-index", "bytes", "what", "permitted values"], rows)
-
-
-PARTS = {
-    "diagram": diagram,
-    "modes": modes,
-    "transitions": transitions,
-    "trips": trips,
-    "gate": gate,
-    "writes": writes,
-}
+PARTS = {"diagram": diagram, "modes": modes, "gate": gate}
 
 
 def filled_in(page: str) -> str:

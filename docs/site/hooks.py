@@ -14,9 +14,9 @@ HERE = Path(__file__).parent
 ROOT = HERE.parents[1]
 sys.path[:0] = [str(HERE), str(ROOT)]
 
-import fault_codes  # noqa: E402
 import generated_pages  # noqa: E402
 import mermaidx  # noqa: E402
+import reference_tables  # noqa: E402
 from mkdocs.structure.files import File, Files  # noqa: E402
 
 _MERMAID = re.compile(r"^```mermaid\n(.*?)^```$", re.DOTALL | re.MULTILINE)
@@ -54,9 +54,7 @@ def on_page_markdown(markdown: str, page: Any, config: Any, files: Files) -> str
         dark, words, light = match.groups()
         return f"![{words}]({light}#only-light)\n![{words}]({dark}#only-dark)"
 
-    markdown = markdown.replace("<!-- built: trips -->", fault_codes.trips_table())
-    markdown = markdown.replace("<!-- built: emergencies -->", fault_codes.emergencies_table())
-    markdown = _MERMAID.sub(diagram, markdown)
+    markdown = _MERMAID.sub(diagram, reference_tables.with_tables(markdown))
     markdown = _PICTURE.sub(picture, markdown)
     return _LINK.sub(lambda m: m[0] if _is_in_the_site(m[2], page) else m[1], markdown)
 

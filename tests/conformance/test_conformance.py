@@ -337,9 +337,3 @@ def test_another_eds_or_none() -> None:
         read_eds(EDS.parent / "buses" / "fd_5k.toml", 10)
     with pytest.raises(ConfigError, match="no amplifier"):
         simulated_talker(load("buses", "local_20k", BusConfig))
-
-
-def test_the_doc_lists_the_lines_that_are_made() -> None:
-    text = (EDS.parents[1] / "docs" / "do" / "conformance.md").read_text(encoding="utf-8")
-    listed = [line for line in text.partition("## Lines")[2].partition("\n## ")[0].splitlines() if line[:2] == "| "][1:]
-    assert listed == [f"| {check.group} | {check.name} | {check.expected} | {check.basis} |" for check in CHECKS]

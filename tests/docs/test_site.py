@@ -5,11 +5,13 @@ from html.parser import HTMLParser
 from pathlib import Path
 
 import pytest
+import reference_tables
 from fault_codes import CLEARS, EMERGENCY_CAUSES, stem
 from generated_pages import commands, field_meanings
 from mkdocs.commands.build import build
 from mkdocs.config import load_config
 
+from hil.conformance.run import CHECKS
 from pkxyz_ctrl.can.emergency import _EXACT
 from pkxyz_ctrl.loop.row import ROW, columns
 from pkxyz_ctrl.safety.trips import Trip
@@ -90,6 +92,27 @@ def test_every_column_is_on_the_page_with_its_meaning(site: Path) -> None:
     text = (site / "lookup" / "recording.html").read_text(encoding="utf-8")
     for field in meanings:
         assert all(f"<code>{column}</code>" in text for column in columns(field))
+
+
+@pytest.mark.parametrize("name", sorted(reference_tables.BUILT))
+def test_every_table_of_the_code_stands_on_a_page_of_the_site(site: Path, name: str) -> None:
+    pages = [p for p in (ROOT / "docs").rglob("*.md") if f"<!-- built: {name} -->" in p.read_text(encoding="utf-8")]
+    assert len(pages) == 1
+    text = (site / pages[0].relative_to(ROOT / "docs")).with_suffix(".html").read_text(encoding="utf-8")
+    rows = reference_tables.BUILT[name]().splitlines()[2:]
+    assert len(rows) > 5
+    assert text.count("<tr>") > len(rows)
+    assert f"built: {name}" not in text
+
+
+def test_every_check_of_an_amplifier_is_in_its_table() -> None:
+    text = reference_tables.conformance()
+    assert all(f"| {check.name} | {check.expected} | {check.basis} |" in text for check in CHECKS)
+
+
+def test_a_mark_that_nobody_serves_is_an_error() -> None:
+    with pytest.raises(KeyError, match="nothing"):
+        reference_tables.with_tables("<!-- built: nothing -->")
 
 
 def test_every_fault_and_emergency_code_is_on_the_troubleshooting_page_with_an_address(site: Path) -> None:

@@ -170,7 +170,7 @@ def report(jobs: list[Job], outcomes: dict[Job, str]) -> tuple[str, int]:
     """The text of docs/lookup/mutation.md, and how many survivors have no reason."""
     reasons = known_survivors()
     met: Counter[tuple[str, str, str]] = Counter()
-    rows, survivors, unexplained = [], [], 0
+    rows, unexplained = [], []
     for module in TARGETS:
         made = [job for job in jobs if job.module == module]
         tried = [job for job in made if job in outcomes]
@@ -180,38 +180,29 @@ def report(jobs: list[Job], outcomes: dict[Job, str]) -> tuple[str, int]:
         for job in lived:
             key = key_of(job)
             met[key] += 1
-            reason, times = reasons.get(key, ("", 0))
-            known = met[key] <= times
-            unexplained += not known
-            change = one_line(job.mutant.change).replace("|", "\\|")
-            survivors.append(f"| `{module}`:{job.mutant.line} | `{change}` | {reason if known else '**none yet**'} |")
+            if met[key] > reasons.get(key, ("", 0))[1]:
+                change = one_line(job.mutant.change).replace("|", "\\|")
+                unexplained.append(f"- `{module}`:{job.mutant.line} `{change}`")
     killed = sum(result != "survived" for result in outcomes.values())
     table = "\n".join(rows)
-    listed = "\n".join(survivors) or "| none | | |"
+    listed = "\n".join(["", "Without a reason:", "", *unexplained, ""]) if unexplained else ""
     return (
         f"""# Mutation testing
 
 `make mutate` changes one thing at a time in the code that stands between a mistake and 200 V, and asks whether a test
 notices: comparisons, arithmetic, `and` / `or` / `not`, conditions, `min` / `max`, numbers, what is returned, statements
-left out. In `tests/mutation/`, `mutants.py` makes the mutants and `mutation_run.py` runs each in a forked process,
-compiler off, nothing on disk changed, against those tests that call its function, the fastest first, until one fails.
-It ends with exit code 1 if a survivor has no reason in `mutation_survivors.toml`. A run that was stopped goes on where
-it was.
+left out. Each mutant runs in a forked process, compiler off, nothing on disk changed, against the tests of its
+function. A run that was stopped goes on where it was. It ends with exit code 1 if a survivor has no reason in
+`tests/mutation/mutation_survivors.toml`; nearly all survivors are equivalent code.
 
 Last result: **{len(outcomes)} of {len(jobs)} mutants tried, {killed} killed, {len(outcomes) - killed} survived,
-{unexplained} of them without a reason.**
+{len(unexplained)} of them without a reason.**
 
 | module | mutants | tried | killed (by time-out) | survived |
 |---|---|---|---|---|
 {table}
-
-## Survivors
-
-| where | change | why it may live |
-|---|---|---|
-{listed}
-""",
-        unexplained,
+{listed}""",
+        len(unexplained),
     )
 
 

@@ -72,17 +72,14 @@ _STALE = Trip.SENSE_STALE
 _MISFIT = Trip.COMB_MISFIT_1 | Trip.COMB_MISFIT_2 | Trip.COMB_MISFIT_3
 _FORCE = Trip.COMB_FORCE_1 | Trip.COMB_FORCE_2 | Trip.COMB_FORCE_3
 _MOVED = Trip.INNOVATION_X | Trip.INNOVATION_Y | Trip.INNOVATION_Z
-_SMALL = "smaller than what tells a fault from an imperfect device; the stage is as far off as the sensor"
-_THREE_OF_EIGHT = "three wild samples, of which four in five are wild: 0.1 % need more than eight"
-_LAG = "speed times delay, 0.2 um, is within what an imperfect device shows; noticed if the loop swings over it"
-_ASKED = (
-    "27 ticks (stuck) and 34 (slow) until the change that this scan asks of comb 2, less what came of it, is beyond "
-    "what an imperfect device shows: calculated for a filter without lag, and without feedback, which asks for more"
-)
-_HARDLY_ASKED = "this scan asks too little of comb 1; noticed once the feedback asks for more, or as the fault ends"
-_FOLLOWS_SLOWLY = "37 ticks, calculated likewise: 0.06 V a tick against the 0.2 V that are asked"
-_HEARTBEAT = "50 ms after the last heartbeat, and the tick that tells; by then 250 counted PDOs have come either way"
-_WHICH = "which of two is right nobody can tell, since counter and CRC of both are; four in short order are a fault"
+_SMALL = "no more than an imperfect device shows"
+_THREE_OF_EIGHT = "three wild samples, of which four in five are wild"
+_LAG = "speed times delay, 0.2 um, is no more than an imperfect device shows; noticed if the loop swings over it"
+_ASKED = "nothing to see until the scan asks comb 2 to move: 27 ticks (stuck), 34 (slow), sooner by the feedback"
+_HARDLY_ASKED = "this scan asks too little of comb 1"
+_FOLLOWS_SLOWLY = "37 ticks likewise: 0.06 V a tick against the 0.2 V that are asked"
+_HEARTBEAT = "50 ms after the last heartbeat; counted PDOs come all the while"
+_WHICH = "which of two is right nobody can tell; four in short order are a fault"
 _CHANNEL_2 = Trip.COMB_FORCE_2 | Trip.COMB_MISFIT_2
 _CHANNEL_1 = Trip.COMB_FORCE_1 | Trip.COMB_MISFIT_1
 _NODE = Trip.HEARTBEAT_LOST | Trip.NODE_EMERGENCY | Trip.NODE_NOT_OPERATIONAL

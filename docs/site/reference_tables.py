@@ -1,0 +1,100 @@
+"""Tables that are made from the code while the site is built; on a page each stands as ``<!-- built: NAME -->``.
+
+In the repository a page shows only the mark, and says beside it which command or file has the same.
+"""
+
+import re
+from pathlib import Path
+
+import canopen
+import fault_codes
+
+from hil.conformance.run import CHECKS
+from hil.faults.catalogue import KINDS, PARTS
+from pkxyz_ctrl.can.wire_doc import object_table
+from pkxyz_ctrl.mechanics.published import entries
+from pkxyz_ctrl.mechanics.reproduction import reproduction_table
+from pkxyz_ctrl.safety.modes import EVENT_MEANING, TRANSITIONS, Event, Mode
+from pkxyz_ctrl.safety.sdo_rules import WRITE_RULES
+from pkxyz_ctrl.stage import Stage
+
+EDS = Path(__file__).parents[2] / "configs" / "comb_amplifier.eds"
+_MARK = re.compile(r"<!-- built: (\w+) -->")
+
+
+def table(header: list[str], rows: list[list[str]]) -> str:
+    """A Markdown table; a pipe within a cell is escaped."""
+    lines = [header, ["---"] * len(header), *rows]
+    return "\n".join("| " + " | ".join(cell.replace("|", "\\|") for cell in cells) + " |" for cells in lines)
+
+
+def transitions() -> str:
+    """The next mode of every event in every mode; an empty cell is refused."""
+    rows = [
+        [event.name, EVENT_MEANING[event]]
+        + [TRANSITIONS[mode, event].name if (mode, event) in TRANSITIONS else "" for mode in Mode]
+        for event in Event
+    ]
+    return table(["event", "meaning", *(mode.name for mode in Mode)], rows)
+
+
+def writes() -> str:
+    """The objects that the transmit gate lets an SDO write, with the values that it permits."""
+    rows = []
+    for rule in WRITE_RULES:
+        index = f"0x{rule.first:04X}" + (f" to 0x{rule.last:04X}" if rule.last > rule.first else "")
+        subindex = f"{rule.sub_first}" + (f" to {rule.sub_last}" if rule.sub_last > rule.sub_first else "")
+        rows.append([index, subindex, str(rule.size), rule.what, rule.permitted])
+    return table(["object", "sub-index", "bytes", "what", "permitted values"], rows)
+
+
+def kinds() -> str:
+    """The catalogue of faults with their parameters, defaults and ranges."""
+    rows = []
+    for family, its in KINDS.items():
+        target = f"{family}.{'/'.join(PARTS[family])}" if family in ("sense", "amplifier") else family
+        if family == "bus":
+            target = f"bus, bus.{'/'.join(PARTS[family])}"
+        for name, kind in its.items():
+            parameters = ", ".join(
+                f"{key} = {p.default:g} ({p.low:g} to {p.high:g}; {p.meaning})" for key, p in kind.parameters.items()
+            )
+            rows.append([target, name, kind.meaning, parameters])
+    return table(["target", "kind", "what it does", "parameters"], rows)
+
+
+def conformance() -> str:
+    """Every check of ``pkxyz check-amplifier``, what it expects and by which document."""
+    rows = [[check.group, check.name, check.expected, check.basis] for check in CHECKS]
+    return table(["group", "check", "expected", "by"], rows)
+
+
+def paper() -> str:
+    """Every number of the paper with its verdict."""
+    rows = []
+    for row in reproduction_table(entries(), Stage.load("printed"), Stage.load("reconstructed")):
+        figures = ["" if v is None else f"{v:.6g}" for v in (row.printed, row.reconstructed)]
+        rows.append([row.where, row.quantity, row.unit, row.published_text, *figures, str(row.verdict), row.why])
+    return table(["where", "number", "unit", "published", "printed design", "reconstructed", "verdict", "why"], rows)
+
+
+def objects() -> str:
+    """The object dictionary of the EDS."""
+    return object_table(canopen.import_od(str(EDS), 10))
+
+
+BUILT = {
+    "trips": fault_codes.trips_table,
+    "emergencies": fault_codes.emergencies_table,
+    "transitions": transitions,
+    "writes": writes,
+    "kinds": kinds,
+    "conformance": conformance,
+    "paper": paper,
+    "objects": objects,
+}
+
+
+def with_tables(markdown: str) -> str:
+    """A page with its tables. Raises KeyError for a mark that nobody serves."""
+    return _MARK.sub(lambda mark: BUILT[mark[1]](), markdown)
