@@ -84,7 +84,7 @@ def table(found: dict[str, tuple[Array, Array]]) -> str:
     """As Markdown."""
     lines = ["| noise of `lab`, alone | x | y | z | |", "| --- | ---: | ---: | ---: | --- |"]
     for words, (deviation, _) in found.items():
-        seen = "seen, of stroke 1, 2, 3" if words in SHOWS.values() else "moves the table"
+        seen = "seen, of stroke 1, 2, 3" if words in SHOWS.values() else "moves the platform"
         lines.append(f"| {words} | {' | '.join(f'{v:.2g}' for v in deviation)} | {seen} |")
     return "\n".join(lines)
 
