@@ -13,14 +13,35 @@ from numpy.typing import NDArray
 
 Array = NDArray[np.float64]
 
+SCRATCH = np.dtype(
+    [
+        ("hessian", "f8", (3, 3)),
+        ("linear", "f8", (3,)),
+        ("trial_n", "f8", (3,)),
+    ],
+    align=True,
+)
+"""Room for the search: what is compiled for a board has no heap."""
+
 _FREE, _LOWER, _UPPER = 0, 1, 2
+_SETS = np.array([[code % 3, code // 3 % 3, code // 9] for code in range(27)], dtype=np.int8)
+_SETS.setflags(write=False)
 
 
 @njit(cache=True, error_model="numpy")
-def allocate(jacobian: Array, inverse: Array, demand_n: Array, lower_n: Array, upper_n: Array, force_n: Array) -> int:
+def allocate(
+    jacobian: Array,
+    inverse: Array,
+    demand_n: Array,
+    lower_n: Array,
+    upper_n: Array,
+    force_n: Array,
+    scratch: np.void,
+) -> int:
     """Write the optimal comb forces (3,) to ``force_n``; returns how many active sets were tried (1: no limit was met).
 
-    ``inverse`` is J^-1 and gives the unconstrained solution J^-T w. Needs lower <= upper.
+    ``inverse`` is J^-1 and gives the unconstrained solution J^-T w. Needs lower <= upper. ``scratch``: a record of
+    ``SCRATCH``.
     """
     inside = True
     for i in range(3):
@@ -28,12 +49,12 @@ def allocate(jacobian: Array, inverse: Array, demand_n: Array, lower_n: Array, u
         inside = inside and lower_n[i] <= force_n[i] <= upper_n[i]
     if inside:
         return 1
-    return _search(jacobian, demand_n, lower_n, upper_n, force_n)
+    return _search(jacobian, demand_n, lower_n, upper_n, force_n, scratch)
 
 
 @njit(cache=True, error_model="numpy")
-def _search(jacobian: Array, demand_n: Array, lower_n: Array, upper_n: Array, best: Array) -> int:
-    hessian, linear, trial = np.empty((3, 3)), np.empty(3), np.empty(3)
+def _search(jacobian: Array, demand_n: Array, lower_n: Array, upper_n: Array, best: Array, scratch: np.void) -> int:
+    hessian, linear, trial = scratch["hessian"], scratch["linear"], scratch["trial_n"]
     scale = 0.0
     for i in range(3):
         for k in range(3):
@@ -44,9 +65,8 @@ def _search(jacobian: Array, demand_n: Array, lower_n: Array, upper_n: Array, be
         scale = max(scale, abs(linear[i]), abs(upper_n[i]))
     tolerance = 1e-13 * scale
     least = np.inf
-    state = np.empty(3, np.int64)
     for code in range(1, 27):
-        state[0], state[1], state[2] = code % 3, (code // 3) % 3, code // 9
+        state = _SETS[code]
         _solve_fixed(hessian, linear, lower_n, upper_n, state, trial)
         violation = kkt_violation(hessian, linear, lower_n, upper_n, state, trial)
         if violation < least:
@@ -60,22 +80,20 @@ def _search(jacobian: Array, demand_n: Array, lower_n: Array, upper_n: Array, be
 
 @njit(cache=True, error_model="numpy")
 def _solve_fixed(
-    hessian: Array, linear: Array, lower: Array, upper: Array, state: NDArray[np.int64], out: Array
+    hessian: Array, linear: Array, lower: Array, upper: Array, state: NDArray[np.int8], out: Array
 ) -> None:
     """Minimise 1/2 F^T H F - linear^T F with the non-free components held at their bounds."""
-    free = np.empty(3, np.int64)
-    count = 0
-    for i in range(3):
-        if state[i] == _FREE:
-            free[count] = i
-            count += 1
+    i, k = -1, -1  # the first and the last that are free
+    for n in range(3):
+        if state[n] == _FREE:
+            i, k = n if i < 0 else i, n
         else:
-            out[i] = lower[i] if state[i] == _LOWER else upper[i]
-    if count == 1:
-        i = free[0]
+            out[n] = lower[n] if state[n] == _LOWER else upper[n]
+    if i < 0:
+        return
+    if i == k:
         out[i] = _residual(hessian, linear, state, out, i) / hessian[i, i]
-    elif count == 2:
-        i, k = free[0], free[1]
+    else:
         ri, rk = _residual(hessian, linear, state, out, i), _residual(hessian, linear, state, out, k)
         determinant = hessian[i, i] * hessian[k, k] - hessian[i, k] * hessian[k, i]
         out[i] = (hessian[k, k] * ri - hessian[i, k] * rk) / determinant
@@ -83,7 +101,7 @@ def _solve_fixed(
 
 
 @njit(cache=True, error_model="numpy")
-def _residual(hessian: Array, linear: Array, state: NDArray[np.int64], fixed: Array, row: int) -> float:
+def _residual(hessian: Array, linear: Array, state: NDArray[np.int8], fixed: Array, row: int) -> float:
     """Right-hand side of a free row after the fixed components went over to it."""
     total = linear[row]
     for k in range(3):
@@ -94,7 +112,7 @@ def _residual(hessian: Array, linear: Array, state: NDArray[np.int64], fixed: Ar
 
 @njit(cache=True, error_model="numpy")
 def kkt_violation(
-    hessian: Array, linear: Array, lower: Array, upper: Array, state: NDArray[np.int64], force: Array
+    hessian: Array, linear: Array, lower: Array, upper: Array, state: NDArray[np.int8], force: Array
 ) -> float:
     """How far a candidate is from the KKT conditions: bounds passed by free components, multipliers of the wrong sign
     (both in N).

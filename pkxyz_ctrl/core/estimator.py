@@ -44,6 +44,15 @@ ESTIMATE = np.dtype(
     align=True,
 )
 
+FAR = np.dtype(
+    [
+        (name, "f8", (3,))
+        for name in ("start_m", "middle_m", "end_m", "w_n", "w_middle_n", "w_end_n", "w_change_n", "unused_n")
+    ],
+    align=True,
+)
+"""Room for ``predict_far``."""
+
 
 @njit(cache=True, error_model="numpy")
 def update(estimator: np.void, estimate: np.void, measured_m: Array, has_measurement: bool) -> None:
@@ -132,16 +141,24 @@ def goes_far(estimator: np.void, s: Array, after: Array) -> bool:
 
 @njit(cache=True, error_model="numpy")
 def predict_far(
-    geometry: np.void, elasticity: np.void, estimator: np.void, s: Array, force_n: Array, force_old_n: Array, out: Array
+    geometry: np.void,
+    elasticity: np.void,
+    estimator: np.void,
+    s: Array,
+    force_n: Array,
+    force_old_n: Array,
+    scratch: np.void,
+    out: Array,
 ) -> None:
     """``predict`` by Simpson's rule, over ``out`` (9,), which it had written: w at the start, in the middle of the
     cubic that joins both states, and at the end. Input that comes early in a period moves the stage further: of
     the change of w, Gamma / 6 goes from the position, and half of what that would have done meanwhile to the velocity.
+    ``scratch``: a record of ``FAR``.
     """
     phi, gamma = estimator["transition"], estimator["input"]
     origin, bend_s = estimator["operating_point_m"], 0.25 * estimator["half_period_s"]
-    start, middle, end = np.empty(3), np.empty(3), np.empty(3)
-    w, w_middle, w_end, w_change, unused = np.empty(3), np.empty(3), np.empty(3), np.empty(3), np.empty(3)
+    start, middle, end, unused = scratch["start_m"], scratch["middle_m"], scratch["end_m"], scratch["unused_n"]
+    w, w_middle, w_end, w_change = scratch["w_n"], scratch["w_middle_n"], scratch["w_end_n"], scratch["w_change_n"]
     for i in range(3):
         start[i], end[i] = origin[i] + s[i], origin[i] + out[i]
         middle[i] = 0.5 * (start[i] + end[i]) + bend_s * (s[3 + i] - out[3 + i])

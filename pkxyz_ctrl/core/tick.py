@@ -68,10 +68,14 @@ SCRATCH = np.dtype(
         ("acted_n", "f8", (3,)),
         ("lower_n", "f8", (3,)),
         ("upper_n", "f8", (3,)),
+        ("far", filtering.FAR),
+        ("allocation", allocation.SCRATCH),
     ],
     align=True,
 )
-"""Room for intermediate results, because an allocation costs more than a Jacobian. Nothing in it outlives a tick."""
+"""Room for intermediate results: memory from the heap costs more than a Jacobian, and a board has none. Nothing in it
+outlives a tick.
+"""
 
 MEMORY = np.dtype(
     [
@@ -146,7 +150,8 @@ def estimate(law: np.void, memory: np.void, has_measurement: bool) -> None:
         filtering.net_input(law["geometry"], law["elasticity"], estimator, position, acting, acted, w, w_change)
         filtering.predict(estimator, start, w, w_change, ahead)
         if filtering.goes_far(estimator, start, ahead):
-            filtering.predict_far(law["geometry"], law["elasticity"], estimator, start, acting, acted, ahead)
+            far = scratch["far"]
+            filtering.predict_far(law["geometry"], law["elasticity"], estimator, start, acting, acted, far, ahead)
         for i in range(9):  # an assignment of whole arrays costs ten times as much: numba looks whether they overlap
             start[i] = ahead[i]
             if step == 0:
@@ -202,7 +207,8 @@ def act(law: np.void, memory: np.void, here: Array, now: Array, after: Array, la
         feedback.add_feedback(gains, origin, memory["estimate"]["ahead"], row, share, demand)
     _push(memory)
     voltage.force_limits(drive, count[1], scratch["lower_n"], scratch["upper_n"])
-    memory["active_set_steps"] = allocation.allocate(j, inverse, demand, scratch["lower_n"], scratch["upper_n"], force)
+    lower, upper = scratch["lower_n"], scratch["upper_n"]
+    memory["active_set_steps"] = allocation.allocate(j, inverse, demand, lower, upper, force, scratch["allocation"])
     voltage.counts_for_forces(drive, force, count[1], memory["carry_v"], count[0])
     multiply3_transposed(j, force, given)
     for i in range(3):
@@ -260,6 +266,15 @@ def set_position(law: np.void, memory: np.void, position_m: Array) -> None:
         memory["estimate"]["ahead"][i] = known
     for i in range(3):
         memory["estimate"]["innovation_m"][i] = 0.0
+
+
+@njit(cache=True, error_model="numpy")
+def set_at_rest(law: np.void, memory: np.void) -> None:
+    """``set_position`` where the stage is without forces."""
+    position = memory["scratch"]["position_m"]
+    for i in range(3):
+        position[i] = 0.0
+    set_position(law, memory, position)
 
 
 @njit(cache=True, error_model="numpy")

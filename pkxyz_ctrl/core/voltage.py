@@ -56,7 +56,7 @@ def counts_for_forces(drive: np.void, force_n: Array, count_last: Counts, carry_
         if drive["noise_shaping"] != 0 and wanted > 0.0:
             wanted += carry_v[i]
         low, high = max(0, count_last[i] - slew), min(most, count_last[i] + slew)
-        nearest = math.floor(wanted / scale + 0.5) if wanted < scale * (high + 1) else high
+        nearest = np.int32(wanted / scale + 0.5) if wanted < scale * (high + 1) else high  # 0 for the least: -0.5
         count[i] = min(max(nearest, low), high)
         carry_v[i] = min(max(wanted - scale * count[i], -scale), scale)
 

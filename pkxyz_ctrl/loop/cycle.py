@@ -122,20 +122,20 @@ def observe(law_array: Records, memory_array: Records, reference: Records) -> No
     _handle(law, memory, _asked(law, memory))
     seen = memory["input"]
     usable = (seen["sense_status"] & _UNUSABLE) == 0
-    memory["suspects"] = 0
     if NODE_EXPECTED[memory["mode"]] == 0:  # an estimate that ran away with what broke would outlive the clear
-        tick.set_position(law["tick"], memory["tick"], np.zeros(3))
+        tick.set_at_rest(law["tick"], memory["tick"])
     if usable:
         tick.measure(law["tick"], memory["tick"], seen["sense_count"])
         if memory["mode"] == _HOMING:
             _average(law, memory)
         if memory["mode"] == _TRACKING:
             _excite(memory, reference)
-        memory["suspects"] = _suspects(law, memory)
+    memory["suspects"] = _suspects(law, memory) if usable else 0
     believed = usable and memory["suspects"] == 0
     tick.estimate(law["tick"], memory["tick"], believed)
     if memory["suspects"] != 0:
-        memory["tick"]["estimate"]["innovation_m"][:] = memory["surprise_m"]
+        for i in range(3):
+            memory["tick"]["estimate"]["innovation_m"][i] = memory["surprise_m"][i]
     delay = law["tick"]["delay_periods"]
     reference_row(law, memory, reference, 0, memory["here"])
     _asked_for(memory, reference)
@@ -226,7 +226,7 @@ def _handle(law: np.void, memory: np.void, event: int) -> None:
         memory["homing_count"] = 0
         memory["homing_sum"][:] = 0
         memory["tick"]["sense_zero_f"][:] = 0.0
-        tick.set_position(law["tick"], memory["tick"], np.zeros(3))
+        tick.set_at_rest(law["tick"], memory["tick"])
     elif target == _ENABLED and mode == _IDLE:
         memory["setpoint"][:] = 0.0
         memory["reference_tick"] = 0
@@ -265,7 +265,8 @@ def _change_pace(law: np.void, memory: np.void) -> None:
     at = memory["pace_phase"] + gone
     if memory["pace_age"] >= law["pace_ticks"]:
         if memory["pace"] == pace.SLOWING:
-            memory["setpoint"][:] = memory["now"]  # which is ahead of this tick, and so stands already
+            for i in range(_ROW_LENGTH):
+                memory["setpoint"][i] = memory["now"][i]  # which is ahead of this tick, and so stands already
         memory["pace"] = pace.STEADY
     memory["reference_tick"] = np.int64(math.floor(at))
     memory["phase"] = at - math.floor(at)
@@ -296,7 +297,7 @@ def _average(law: np.void, memory: np.void) -> None:
     for i in range(3):
         mean = memory["homing_sum"][i] / memory["homing_count"]
         memory["tick"]["sense_zero_f"][i] = sense["offset_f"] + sense["farad_per_count"] * mean - sense["rest_f"]
-    tick.set_position(law["tick"], memory["tick"], np.zeros(3))
+    tick.set_at_rest(law["tick"], memory["tick"])
     tick.measure(law["tick"], memory["tick"], memory["input"]["sense_count"])
     _handle(law, memory, _HOMED)
 

@@ -10,7 +10,7 @@ from hypothesis import strategies as st
 from loop_rig import stage
 from scipy import sparse
 
-from pkxyz_ctrl.core.allocation import allocate
+from pkxyz_ctrl.core.allocation import SCRATCH, allocate
 
 FORCE_MAX_N = float(stage().force_max_n[0])
 WORKSPACE = st.tuples(*[st.floats(-3e-6, 27e-6)] * 3).map(np.array)  # strokes, a little beyond the device's
@@ -24,7 +24,8 @@ def jacobian_at(strokes_m):
 
 def solve(jacobian, demand_n, lower_n, upper_n):
     force = np.full(3, np.nan)
-    tries = allocate(jacobian, np.linalg.inv(jacobian), demand_n, lower_n, upper_n, force)
+    room = np.zeros(1, SCRATCH)[0]
+    tries = allocate(jacobian, np.linalg.inv(jacobian), demand_n, lower_n, upper_n, force, room)
     return force, tries
 
 
