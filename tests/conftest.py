@@ -4,9 +4,16 @@ import os
 
 os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")  # small matrices: on a busy machine threads only wait for each other
 
+import pytest
 from hypothesis import settings
 
 import pkxyz_ctrl  # noqa: F401
 
 settings.register_profile("same every time", derandomize=True)
 settings.load_profile("same every time")
+
+
+def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
+    """Files with slow tests come first, so that no core waits for the other at the end."""
+    slow = {item.path for item in items if item.get_closest_marker("slow")}
+    items.sort(key=lambda item: item.path not in slow)

@@ -48,6 +48,9 @@ def run(
     replay: Replay = None,
     refresh: Refresh = None,
     replace_earlier: ReplaceEarlier = False,
+    wait_s: Annotated[
+        float, typer.Option("--wait", min=0, max=3600, help="Seconds until somebody else has to be on the bus.")
+    ] = 30.0,
     as_json: Json = False,
 ) -> None:
     """Control an amplifier at rate; exit code 0 if the checks hold, 1 if not, 2 for bad input or a full disk, 128 +
@@ -79,7 +82,7 @@ def run(
     path = out if out is not None else next_free(Path("runs"), loaded.config.name, Lane.WALL)
     folder = RunFolder(path, replace=replace_earlier)
     try:
-        ran = run_into(folder, loaded, _tell, _quiet if as_json else live)
+        ran = run_into(folder, loaded, _tell, _quiet if as_json else live, wait_s)
         draw(folder, ran.summary, ran.lateness_us)
     except RecordingError as error:
         raise ConfigError(str(error)) from None

@@ -20,7 +20,7 @@ from pkxyz_ctrl.io.clocks import percentile_us
 from pkxyz_ctrl.io.realtime import go_real_time, leave_real_time, settle_memory
 from pkxyz_ctrl.learning import Learner
 
-_COMPANY_S, _LOOK_S = 30.0, 0.05
+COMPANY_S, _LOOK_S = 30.0, 0.05
 _COME_BACK = {
     False: "start `pkxyz plant` again, then this",
     True: "check its power and the cable, then start this again",
@@ -54,20 +54,29 @@ class _Watched:
 
 
 def run_into(
-    folder: RunFolder, scenario: Scenario, say: Callable[[str], object], watch: Watch = lambda row: None
+    folder: RunFolder,
+    scenario: Scenario,
+    say: Callable[[str], object],
+    watch: Watch = lambda row: None,
+    company_s: float = COMPANY_S,
 ) -> RanAtRate:
     """Run ``scenario`` at rate and leave everything in ``folder`` but the picture.
 
-    ``say`` is called with what a person should know, ``watch`` with each row, in the writer's process. Raises
-    ``ConfigError``, ``StartUpError``, ``RecordingError``.
+    ``say`` is called with what a person should know, ``watch`` with each row, in the writer's process; an empty bus is
+    given ``company_s`` until somebody else is on it. Raises ``ConfigError``, ``StartUpError``, ``RecordingError``.
     """
     can_config = require_real_bus(scenario.bus)
     with folder.taken():
-        return _run_into(folder, scenario, can_config, say, watch)
+        return _run_into(folder, scenario, can_config, say, watch, company_s)
 
 
 def _run_into(
-    folder: RunFolder, scenario: Scenario, can_config: CanConfig, say: Callable[[str], object], watch: Watch
+    folder: RunFolder,
+    scenario: Scenario,
+    can_config: CanConfig,
+    say: Callable[[str], object],
+    watch: Watch,
+    company_s: float,
 ) -> RanAtRate:
     begun = Begun.begin(folder, scenario, Lane.WALL)
     setup = scenario.setup()
@@ -76,7 +85,7 @@ def _run_into(
         channel = can_config.channel
         recorder = WallRecorder(folder.recording, folder.frames, begun.metadata, channel, watch)
         try:
-            _run(WallRig(setup, recorder, ending), watched, say, ending)
+            _run(WallRig(setup, recorder, ending), watched, say, ending, company_s)
         except Ended as end:
             watched.ended_by = end.signal_number
         finally:
@@ -101,10 +110,10 @@ def _run_into(
     return RanAtRate(summary, watched.ended_by, late)
 
 
-def _run(rig: WallRig, watched: _Watched, say: Callable[[str], object], ending: Ending) -> None:
+def _run(rig: WallRig, watched: _Watched, say: Callable[[str], object], ending: Ending, company_s: float) -> None:
     begin_s = time.monotonic()
     try:
-        _wait_for_others(rig, say, ending)
+        _wait_for_others(rig, say, ending, company_s)
         say(go_real_time())
         settle_memory()
         begin_s = time.monotonic()
@@ -125,11 +134,11 @@ def _run(rig: WallRig, watched: _Watched, say: Callable[[str], object], ending: 
             watched.learner = rig.live.learner if rig.live is not None else None
 
 
-def _wait_for_others(rig: WallRig, say: Callable[[str], object], ending: Ending) -> None:
+def _wait_for_others(rig: WallRig, say: Callable[[str], object], ending: Ending, company_s: float) -> None:
     """A plant that was started in the same moment takes some seconds until it is there."""
-    end_s = time.monotonic() + _COMPANY_S
+    end_s = time.monotonic() + company_s
     if rig.others == 0:
-        say(f"nobody else is on the bus yet: waiting {_COMPANY_S:g} s for `pkxyz plant` in another process")
+        say(f"nobody else is on the bus yet: waiting {company_s:g} s for `pkxyz plant` in another process")
     while rig.others == 0 and time.monotonic() < end_s:
         ending.check()
         time.sleep(_LOOK_S)

@@ -63,6 +63,7 @@ def test_a_name_that_nothing_has_is_one_line(asked: str, named: str) -> None:
 
 
 @pytest.mark.parametrize("name", QUICK)
+@pytest.mark.slow
 def test_figures_are_positive_and_named_after_their_measurement(name: str) -> None:
     figures = suite.measure(name, [])
     assert figures

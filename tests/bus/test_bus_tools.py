@@ -49,6 +49,7 @@ def until(condition, process):
         time.sleep(0.02)
 
 
+@pytest.mark.slow
 def test_player_and_bridge_carry_a_log_from_one_channel_to_another_and_the_logger_writes_it(tmp_path):
     here, there, log, copy = (str(tmp_path / name) for name in ("a", "b", "frames.log", "copy.log"))
     for channel in (here, there):

@@ -54,6 +54,7 @@ def bus(tmp_path):
     assert plant.returncode == 0, err
 
 
+@pytest.mark.slow
 def test_our_node_in_another_process_passes(bus, tmp_path):
     words = ("check-amplifier", "--bus", bus, "--allow-voltage", "--out", tmp_path / "report", "--json")
     check = pkxyz(*words, stdout=subprocess.PIPE)

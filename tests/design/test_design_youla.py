@@ -30,6 +30,7 @@ def s_at(loop, hz):
     return np.abs(loop.response(MIDDLE, np.atleast_1d(hz)).s)
 
 
+@pytest.mark.slow
 def test_the_law_reaches_all_that_is_asked_at_once():
     """Two-sided, as an unexplained improvement is an error too."""
     loop = shipped()

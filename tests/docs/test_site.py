@@ -42,6 +42,7 @@ class Addresses(HTMLParser):
         self.classes.update(given.get("class", "").split())
 
 
+@pytest.mark.slow
 def test_no_page_names_another_host(site: Path) -> None:
     pages = sorted(site.rglob("*.html"))
     assert len(pages) > 20

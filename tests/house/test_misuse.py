@@ -185,7 +185,7 @@ def test_without_a_plant_the_run_says_what_to_start(tmp_path):
         bus.replace('channel = "pkxyz"', f'channel = "{tmp_path}/bus"'), encoding="utf-8"
     )
     done = subprocess.run(
-        [sys.executable, "-m", "hil.cli", "run", "--bus", "mine.toml", "--seconds", "0.5"],
+        [sys.executable, "-m", "hil.cli", "run", "--bus", "mine.toml", "--seconds", "0.5", "--wait", "0.2"],
         cwd=tmp_path, env={**os.environ, "PYTHONPATH": str(ROOT)}, capture_output=True, text=True, check=False,
         timeout=600,
     )  # fmt: skip

@@ -56,6 +56,7 @@ def test_140_ticks_agree_to_a_billionth(compiled, tmp_path):
             assert np.array_equal(a, b), name
 
 
+@pytest.mark.slow
 def test_tests_of_the_core_pass():
     """Kinematics, measuring, 0 V, allocation: their own tests, interpreted."""
     done = without_compiler("-m", "pytest", "-q", "-p", "no:cacheprovider", "tests/core/test_core_tick.py")

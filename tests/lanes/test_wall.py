@@ -296,6 +296,7 @@ def test_a_stopped_controller_goes_on_and_sigterm_ends_it_at_0_v(bench, changes)
     assert log[-1].arbitration_id in (0x000, 0x70A)
 
 
+@pytest.mark.slow
 def test_ctrl_c_ends_at_0_v(bench, changes):
     changes("pre-operational", False)
     words = ("on_slow.toml", "--bus", "slow.toml", "--out", "interrupted", "--replace", "--seconds", "60", "--json")

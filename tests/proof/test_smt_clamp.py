@@ -86,6 +86,7 @@ def prove_clamp(old: str = "", new: str = "") -> int:
     return proven
 
 
+@pytest.mark.slow
 def test_whatever_the_forces_are_a_count_keeps_to_voltage_and_slew() -> None:
     assert prove_clamp() > 4
 

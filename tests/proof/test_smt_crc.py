@@ -82,6 +82,7 @@ def test_every_table_of_ours_is_the_reference(can_id: int) -> None:
 
 
 @pytest.mark.parametrize("flipped", [1, 2, 3])
+@pytest.mark.slow
 def test_no_damage_of_up_to_three_bits_passes(flipped: int) -> None:
     """In counts, counter, CRC or identifier, for every payload: by linearity only the damage matters."""
     damage = z3.BitVec("damage", 80)  # two bytes of identifier, seven of payload, the CRC

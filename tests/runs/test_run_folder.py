@@ -80,7 +80,7 @@ def test_a_run_that_never_begins_leaves_the_earlier_one(earlier, tmp_path):
     (tmp_path / "bus.toml").write_text(text, encoding="utf-8")
     scenario = scenario_of(bus=str(tmp_path / "bus.toml"))
     with pytest.raises(StartUpError):
-        at_rate.run_into(RunFolder(folder, replace=True), scenario, lambda words: None)
+        at_rate.run_into(RunFolder(folder, replace=True), scenario, lambda words: None, company_s=0.1)
     assert content(folder) == before
     assert not (folder / EARLIER).exists()
 

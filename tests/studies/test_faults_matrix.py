@@ -49,6 +49,7 @@ def test_every_bus_file_with_frames_is_among_those_that_are_broken():
 
 @pytest.mark.parametrize("lasting", [False, True], ids=["ends", "lasts"])
 @pytest.mark.parametrize("bus", OTHER_BUSES)
+@pytest.mark.slow
 def test_every_fault_is_survived_on_every_bus(bus, lasting):
     setup = setup_for("lqg", bus=bus)
     problems = {}
