@@ -69,6 +69,8 @@ def rewritten(page: str, results: dict[str, Any]) -> str:
     for name, text in generated(results).items():
         block = re.search(rf"<!-- generated: {name} -->\n(.*?)<!-- end -->", page, re.DOTALL)
         if block is None:
+            if f"<!-- built: {name} -->" in page:
+                continue  # is made when the site is built
             raise ValueError(f"{PAGE.name} has no block named {name}")
         page = f"{page[: block.start(1)]}{text}\n{page[block.end(1) :]}"
     return page

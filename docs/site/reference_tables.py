@@ -3,7 +3,10 @@
 In the repository a page shows only the mark, and says beside it which command or file has the same.
 """
 
+import json
 import re
+import runpy
+from functools import partial
 from pathlib import Path
 
 import canopen
@@ -18,7 +21,8 @@ from pkxyz_ctrl.safety.modes import EVENT_MEANING, TRANSITIONS, Event, Mode
 from pkxyz_ctrl.safety.sdo_rules import WRITE_RULES
 from pkxyz_ctrl.stage import Stage
 
-EDS = Path(__file__).parents[2] / "configs" / "comb_amplifier.eds"
+ROOT = Path(__file__).parents[2]
+EDS = ROOT / "configs" / "comb_amplifier.eds"
 _MARK = re.compile(r"<!-- built: (\w+) -->")
 
 
@@ -83,7 +87,24 @@ def objects() -> str:
     return object_table(canopen.import_od(str(EDS), 10))
 
 
+def rooms() -> str:
+    """The rooms of the house and which room may use which; the table is that of the test that holds it."""
+    house = runpy.run_path(str(ROOT / "tests" / "house" / "rooms.py"))
+    return str(house["page_table"](house["House"].of(ROOT).sources))
+
+
+def measured(name: str) -> str:
+    """A table of benchmarks/results.json: the parts of a tick, which explain the figures on the page."""
+    drawing = runpy.run_path(str(ROOT / "docs" / "figures" / "performance.py"))
+    blocks = drawing["generated"](json.loads(drawing["RESULTS"].read_text(encoding="utf-8")))
+    return str(blocks[name])
+
+
 BUILT = {
+    "rooms": rooms,
+    "share": partial(measured, "share"),
+    "parts": partial(measured, "parts"),
+    "floor": partial(measured, "floor"),
     "trips": fault_codes.trips_table,
     "emergencies": fault_codes.emergencies_table,
     "transitions": transitions,

@@ -180,7 +180,7 @@ def test_the_page_shows_the_committed_results() -> None:
     assert measured == set(suite.MEASUREMENTS)
     for f in results["figures"]:
         assert set(f) == KEYS
-        assert f"| {f['name']} |" in page
+        assert f"| {f['name']} |" in page + "".join(drawing["generated"](results).values())
 
 
 def test_what_the_law_reaches_stands_beside_the_open_loop(monkeypatch: pytest.MonkeyPatch) -> None:

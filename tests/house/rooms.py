@@ -1,19 +1,16 @@
 """The rooms of the house, and which room may use which. A room is a folder of modules; its subfolders are rooms too.
 
-    python tests/house/rooms.py        # renews the table in docs/understand/architecture.md
-
-The table stands in the order in which the house is built: a room uses only rooms above it, so there is no circle.
+The table stands in the order in which the house is built: a room uses only rooms above it, so there is no circle. The
+site shows it on docs/understand/architecture.md.
 """
 
 import ast
-import re
 from collections.abc import Iterable, Iterator, Mapping
 from pathlib import Path
 from types import MappingProxyType
 from typing import NamedTuple
 
 ROOT = Path(__file__).parents[2]
-PAGE = ROOT / "docs" / "understand" / "architecture.md"
 PACKAGES = ("pkxyz_ctrl", "hil", "sim")
 
 NUMBERS = ("math", "numpy", "numba")
@@ -236,13 +233,3 @@ def page_table(sources: Mapping[str, str]) -> str:
         )
         lines.append(f"| `{name}` | {about} | {', '.join(f'`{other}`' for other in room.uses) or 'nothing'} |")
     return "\n".join(lines)
-
-
-def renewed(page: str, sources: Mapping[str, str]) -> str:
-    """The page with the table as it has to be."""
-    pattern = r"(<!-- generated: rooms -->\n).*?(<!-- end -->)"
-    return re.sub(pattern, lambda match: f"{match[1]}{page_table(sources)}\n{match[2]}", page, flags=re.DOTALL)
-
-
-if __name__ == "__main__":
-    PAGE.write_text(renewed(PAGE.read_text(encoding="utf-8"), House.of(ROOT).sources), encoding="utf-8")
