@@ -29,7 +29,7 @@ COMBINED = [
     for comb in (0.1, -0.1)
 ]
 """All at once at the ends of the tolerances "wide": soft, heavy and hardly damped, and the opposite. With one thing
-changed at a time the search found a law that 6 of 200 drawn plants were unstable with.
+changed at a time the search found a law that 6 of 200 sampled plants were unstable with.
 """
 
 

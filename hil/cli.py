@@ -15,7 +15,7 @@ COMMANDS = {
     "margins": ("hil.commands.studies.margins:margins", "How far a law is from instability."),
     "identify": ("hil.commands.studies.identify:identify", "Measure the stage in its running loop."),
     "tune": ("hil.commands.studies.tune:tune", "Better numbers for a controller file."),
-    "montecarlo": ("hil.commands.studies.montecarlo:montecarlo", "A law against many drawn plants."),
+    "montecarlo": ("hil.commands.studies.montecarlo:montecarlo", "A law against many sampled plants."),
     "faults": ("hil.commands.studies.faults:faults", "Break everything once, under each law."),
     "soak": ("hil.commands.studies.soak:soak", "Half an hour under random faults."),
     "replay": ("hil.commands.replay:replay", "A recording once more through the tick."),

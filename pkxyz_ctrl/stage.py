@@ -33,9 +33,7 @@ class StageDomainError(ValueError):
 
 
 class Stage:
-    """The user's handle on one device. Immutable; every method is a pure function of its arguments and the stage
-    file.
-    """
+    """The user's handle on one device. Immutable; methods are pure functions of their arguments and the stage file."""
 
     def __init__(self, config: StageConfig) -> None:
         self.config = config
@@ -72,14 +70,14 @@ class Stage:
         return f"Stage({self.config.name!r})"
 
     def inverse_kinematics(self, position_m: ArrayLike) -> Array:
-        """Strokes (..., 3) in m for positions (..., 3) in m (Eq. 8); raises ``StageDomainError`` where a link can't
-        reach.
+        """Strokes (..., 3) in m for positions (..., 3) in m (Eq. 8); raises
+        ``StageDomainError`` where a link can't reach.
         """
         return self._at_positions(position_m, _strokes_each, (3,))
 
     def forward_kinematics(self, strokes_m: ArrayLike) -> Array:
-        """Positions (..., 3) in m for strokes (..., 3) in m, on the assembly branch of the rest pose (Newton on the
-        exact closure).
+        """Positions (..., 3) in m for strokes (..., 3) in m, on the assembly branch of the
+        rest pose (Newton on the exact closure).
 
         Raises ``StageDomainError`` for strokes at which the links don't close.
         """
@@ -157,8 +155,8 @@ class Stage:
         return self._at_elastic(position_m, _holding_each, (3,))
 
     def holding_voltages(self, position_m: ArrayLike) -> Array:
-        """Comb voltages (..., 3) in V that hold a position; ``StageDomainError`` where that takes a push or more than
-        the limit.
+        """Comb voltages (..., 3) in V that hold a position; ``StageDomainError`` where
+        that takes a push or more than the limit.
         """
         force = self.holding_forces(position_m)
         return self.comb_voltage(np.where((force < 0) & (force > -1e-15), 0.0, force))

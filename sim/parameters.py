@@ -57,8 +57,8 @@ def _mechanism(p: np.void, config: PlantConfig, device: Device) -> None:
     p["crank_m"] = device.geometry.crank_length_m
     p["link_m"] = math.hypot(projection_m, height_m)
     p["projection_rest_m"], p["height_rest_m"] = projection_m, height_m
-    # one folded spring is two clamped beams in series; a beam of length l gives E h t^3 / l^3 (paper Eq. 26: four of
-    # these)
+    # one folded spring is two clamped beams in series; a beam of length l gives E h t^3 / l^3
+    # (paper Eq. 26: four of these)
     leaf = (
         4
         * f.youngs_modulus_pa
@@ -127,8 +127,8 @@ def _drive_combs(p: np.void, config: PlantConfig, device: Device) -> None:
     p["fringe_per_m"] = config.fringe.relative_per_25um / STROKE_SCALE_M if config.fringe.on else 0.0
     p["levitation"] = config.levitation.ratio if config.levitation.on else 0.0
     p["overlap_rest_m"] = comb.overlap_rest_m
-    # lateral stiffness of a slider: its four folded springs across the motion, each two leaves in series along their
-    # length
+    # lateral stiffness of a slider: its four folded springs across the motion,
+    # each two leaves in series along their length
     lateral = (
         16
         * f.youngs_modulus_pa

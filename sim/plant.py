@@ -86,7 +86,7 @@ class Plant:
         kernels.drive(self.params, self.state, row)
 
     def sample(self) -> tuple[int, int, int]:
-        """Sample the three sense channels now; their noise is drawn. INTEGER16 counts, saturated."""
+        """Sample the three sense channels now; their noise is new. INTEGER16 counts, saturated."""
         kernels.sample(self.params, self.state, self._counts_out)
         a, b, c = self._counts_out.tolist()
         return a, b, c

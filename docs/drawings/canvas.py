@@ -1,5 +1,5 @@
-"""What the drawings share: two themes, for light and dark pages, and a way to write an SVG with the same bytes each
-time.
+"""What the drawings share: two themes, for light and dark pages, and a way to
+write an SVG with the same bytes each time.
 """
 
 from dataclasses import dataclass

@@ -2,8 +2,8 @@
 
     python docs/figures/faults.py [SOAK.JSON]
 
-The soak's line and picture are taken over only where the result of ``pkxyz soak --out`` is given: that takes ten
-minutes.
+The soak's line and picture are taken over only where the result of ``pkxyz soak
+--out`` is given: that takes ten minutes.
 """
 
 import json

@@ -43,7 +43,7 @@ COLOURS = {
     "irc": REFERENCE, "irc_robust": MUTED, "robust": INK,
 }  # fmt: skip
 SHOWN = ("youla", "lqg", "lqg_wide", "hinf", "pi_notch_robust", "irc_robust", "robust")
-DRAWN = range(1, 201)
+SAMPLED = range(1, 201)
 BEGIN, END = "<!-- table: begin -->\n", "<!-- table: end -->"
 
 
@@ -68,9 +68,9 @@ def table(all_loops: dict[str, Loop]) -> str:
         noise = hold_noise_m(loop.stage, loop.bus, plant, law).max() * 1e9
         slowest_ms = -plant.period_s / np.log(found.spectral_radius) * 1e3
         worst = over_changed_plants(loop, tolerances.cases()).worst[1]
-        drawn = np.array([loop.peak_sensitivity(tolerances.draw(seed)) for seed in DRAWN])
-        lost = int(np.count_nonzero(np.isinf(drawn)))
-        most = np.percentile(drawn, 95, method="higher")
+        sampled = np.array([loop.peak_sensitivity(tolerances.sample(seed)) for seed in SAMPLED])
+        lost = int(np.count_nonzero(np.isinf(sampled)))
+        most = np.percentile(sampled, 95, method="higher")
         lines.append(
             f"| `{name}` | {found.mimo.peak_s:.2f} | {found.mimo.disk_margin:.2f} | {found.mimo.bandwidth_hz:.0f} "
             f"| {20.0 * math.log10(found.axes[0].gain_margin):.1f} | {noise:.2f} | {effort(loop):.1f} "

@@ -1,4 +1,4 @@
-"""Draw plants from tolerances and run a law on each."""
+"""Sample plants from tolerances and run a law on each."""
 
 from collections.abc import Callable
 from dataclasses import dataclass
@@ -15,8 +15,8 @@ Progress = Callable[[int, int], None]
 
 
 @dataclass(frozen=True)
-class DrawnPlants:
-    """What a law does on plants drawn from tolerances."""
+class SampledPlants:
+    """What a law does on plants sampled from tolerances."""
 
     study: Study
     results: tuple[Result, ...]
@@ -29,7 +29,7 @@ class DrawnPlants:
 
     def scenario_of(self, seed: int) -> Scenario:
         """The scenario on the plant of a seed, to be run alone; its figures come out the same, bit for bit."""
-        return self.study.drawn(seed)
+        return self.study.sampled(seed)
 
 
 def montecarlo(
@@ -41,8 +41,8 @@ def montecarlo(
     out: str | Path,
     workers: int | None = None,
     on_progress: Progress = lambda done, total: None,
-) -> DrawnPlants:
-    """Run a scenario on ``plants`` plants drawn from a tolerances file, each seeded by its own number.
+) -> SampledPlants:
+    """Run a scenario on ``plants`` plants sampled from a tolerances file, each seeded by its own number.
 
     Results are kept in ``out``/results.jsonl at once: called again it goes on, also after an interruption. ``workers``:
     processes, by default as many as cores; a program that uses more than one starts under ``if __name__ ==
@@ -55,4 +55,4 @@ def montecarlo(
     results = Results(folder / "results.jsonl", study)
     seeds = range(first_seed, first_seed + plants)
     run_study(study, seeds, results, workers or cores(), None, on_progress)
-    return DrawnPlants(study, tuple(results.found[seed] for seed in seeds))
+    return SampledPlants(study, tuple(results.found[seed] for seed in seeds))

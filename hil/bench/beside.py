@@ -52,8 +52,8 @@ def beside() -> list[Figure]:
 
 
 def _run(scenario: str, place: str, controller: str | None) -> RowFigures:
-    """Figures of one run of the fast lane, with the scenario's own law or another. Raises ``RuntimeError`` on a
-    fault."""
+    """Figures of one run of the fast lane, with the scenario's own law or another.
+    Raises ``RuntimeError`` on a fault."""
     setup = _setup(scenario, place, controller)
     metrics = Metrics(setup.trajectory, setup.bus.period_us)
     result = lanes.run(setup, Lane.FAST, on_block=metrics.update)

@@ -20,10 +20,10 @@ from pkxyz_ctrl.design.margins.margins import Margins
 from pkxyz_ctrl.design.margins.tolerances import Tolerances
 from pkxyz_ctrl.stage import Stage
 
-LAW, DRAWN = "youla", 500
+LAW, SAMPLED = "youla", 500
 PEAK_S, DISK, CHANGED = 1.9, 0.64, 2.5
-DRAWN_95, DRAWN_MAX = 3.0, 4.0
-"""Ms of drawn devices: 95 % of them, and the worst."""
+SAMPLED_95, SAMPLED_MAX = 3.0, 4.0
+"""Ms of sampled devices: 95 % of them, and the worst."""
 FAST_PEAK_S = 2.0
 REJECTED_HZ, RESONANCE_HZ = 200.0, 631.0
 """Up to where |S| has to stay below -3 dB: on fd_5k, and on local_20k, where that is the first resonance."""
@@ -41,8 +41,8 @@ def margins() -> list[Figure]:
     reach = {name: _rejected_hz(_loop(stage, name, "fd_5k").margins(middle)) for name in BASELINES}
     tolerances = load("tolerances", "wide", Tolerances)
     changed = over_changed_plants(loop, tolerances.cases())
-    drawn = np.array([loop.peak_sensitivity(tolerances.draw(seed)) for seed in range(1, DRAWN + 1)])
-    unstable = int(np.isinf(drawn).sum())
+    sampled = np.array([loop.peak_sensitivity(tolerances.sample(seed)) for seed in range(1, SAMPLED + 1)])
+    unstable = int(np.isinf(sampled).sum())
     case, worst = changed.worst
     words = ", ".join(f"{name} {hz:.0f} Hz" for name, hz in reach.items())
     each = "worst of x, y, z and MIMO, law youla, nominal plant"
@@ -55,9 +55,9 @@ def margins() -> list[Figure]:
                detail=f"as far as the commercial baseline and irc, each tuned to be as robust: {words}"),
         Figure("margins.changed_plants", worst if math.isfinite(worst) else 1e9, "Ms", CHANGED, "at most",
                detail=f"worst of {len(changed.cases)} changed plants at nine points: {case.name}"),
-        Figure("margins.drawn_95", _finite(np.percentile(drawn, 95)), "Ms", DRAWN_95, "at most",
-               detail=f"95 % of {DRAWN} devices with everything drawn at once, delay, poles and parasitic modes too"),
-        Figure("margins.drawn_worst", _finite(drawn.max()), "Ms", DRAWN_MAX, "at most",
+        Figure("margins.sampled_95", _finite(np.percentile(sampled, 95)), "Ms", SAMPLED_95, "at most",
+               detail=f"95 % of {SAMPLED} sampled devices: everything at once, delay, poles and parasitic modes too"),
+        Figure("margins.sampled_worst", _finite(sampled.max()), "Ms", SAMPLED_MAX, "at most",
                detail=f"the worst of them; {unstable} unstable"),
         Figure("margins.measured", _measured(loop, middle), "of bound", 1.0, "at most",
                detail="largest distance of S measured in the running loop from S computed, over what noise explains"),

@@ -9,7 +9,7 @@ import time
 from hil.bench.figure import Figure
 from hil.runs.scenario import load_scenario
 from hil.studies.montecarlo import Study, run_one
-from hil.studies.spread.workers import as_done, given, hands
+from hil.studies.spread.workers import as_done, with_constant, worker_pool
 from hil.studies.tune.search import evaluate, load_problem
 from pkxyz_ctrl.config.files import load
 from pkxyz_ctrl.design.margins.tolerances import Tolerances
@@ -29,13 +29,15 @@ def study() -> list[Figure]:
     plants = Study(load_scenario("raster", controller="lqg"), load("tolerances", "wide", Tolerances))
     stage_s = plants.scenario.config.duration_s
     walls, busy = [], []
-    with hands(WORKERS) as (pool, width):
-        list(as_done(pool, width, given(_timed, plants), range(4 * WORKERS)))
+    with worker_pool(WORKERS) as (pool, width):
+        list(as_done(pool, width, with_constant(_timed, plants), range(4 * WORKERS)))
         for n in range(ROUNDS):
             gc.collect()
             begin = time.perf_counter()
             seeds = range(1000 * (n + 1), 1000 * (n + 1) + PLANTS)
-            busy.append(sum(cpu_s for _, cpu_s in as_done(pool, width, given(_timed, plants), seeds, ahead=width)))
+            busy.append(
+                sum(cpu_s for _, cpu_s in as_done(pool, width, with_constant(_timed, plants), seeds, ahead=width))
+            )
             walls.append(time.perf_counter() - begin)
         list(as_done(pool, width, _trial, range(2 * WORKERS)))
         trial_s = [cpu_s for _, cpu_s in as_done(pool, width, _trial, range(2 * WORKERS, TRIALS))]
@@ -49,7 +51,7 @@ def study() -> list[Figure]:
         Figure("study.realtime_clock", max(by_clock), "times", None, None, statistics.median(by_clock),
                "the same by the clock on the wall, with whatever else the machine does"),
         Figure("study.plant", each_ms, "ms", None, None, statistics.median(busy) / PLANTS * 1e3,
-               "processor time of a plant: drawn, run, its figures, Ms of its linear loop"),
+               "processor time of a plant: sampled, run, its figures, Ms of its linear loop"),
         Figure("study.trial", min(trial_s) * 1e3, "ms", None, None, statistics.median(trial_s) * 1e3,
                "processor time of a trial of `pkxyz tune lqg`: designed, margins, Ms of 135 changed plants, two runs"),
     ]  # fmt: skip

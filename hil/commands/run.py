@@ -25,7 +25,7 @@ Bus = Annotated[
 ]
 Json = Annotated[bool, typer.Option("--json", help="Print JSON, and nothing else.")]
 Learn = Annotated[bool, typer.Option("--learn", help="Learn what errs alike in every period of the scan.")]
-Replay = Annotated[
+Apply = Annotated[
     str | None, typer.Option(metavar="FILE", help="Correct by what a run has learnt (its learnt.json), as it is.")
 ]
 ReplaceEarlier = Annotated[
@@ -45,7 +45,7 @@ def run(
     controller: Annotated[str | None, typer.Option(help="Name or file, instead of the scenario's.")] = None,
     duration_s: Annotated[float | None, typer.Option("--seconds", help="Instead of the scenario's.")] = None,
     learn: Learn = False,
-    replay: Replay = None,
+    apply: Apply = None,
     refresh: Refresh = None,
     replace_earlier: ReplaceEarlier = False,
     wait_s: Annotated[
@@ -69,7 +69,7 @@ def run(
     from pkxyz_ctrl.design.model.design_error import DesignError
     from pkxyz_ctrl.loop.controller import StartUpError
 
-    learning = learning_of(learn, replay, refresh)
+    learning = learning_of(learn, apply, refresh)
     require_seconds(duration_s)
     say_if_compiling(quiet=as_json)
     try:
@@ -145,12 +145,12 @@ def plant(
         raise ConfigError(f"--truth: {truth}: {reason(error)}") from None
 
 
-def learning_of(learn: bool, replay: str | None, refresh: str | None) -> dict[str, str] | None:
+def learning_of(learn: bool, apply: str | None, refresh: str | None) -> dict[str, str] | None:
     """What the options say in place of a scenario's [learning]; None if none is given."""
     asked: list[dict[str, str]] = [{"mode": "learn"}] if learn else []
-    asked += [{"mode": mode, "file": f} for mode, f in (("replay", replay), ("refresh", refresh)) if f is not None]
+    asked += [{"mode": mode, "file": f} for mode, f in (("apply", apply), ("refresh", refresh)) if f is not None]
     if len(asked) > 1:
-        raise ConfigError("--learn, --replay and --refresh: give one of them")
+        raise ConfigError("--learn, --apply and --refresh: give one of them")
     return asked[0] if asked else None
 
 

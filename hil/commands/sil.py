@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from hil.commands.run import Learn, Refresh, ReplaceEarlier, Replay, learning_of
+from hil.commands.run import Apply, Learn, Refresh, ReplaceEarlier, learning_of
 from hil.lanes.lane import Lane
 from hil.screen.choices import InProcessLane, require_simulated
 from hil.screen.figures import error_lines, where_to_read
@@ -36,7 +36,7 @@ def sil(
         typer.Option(metavar="TARGET:KIND@S[+S][,NAME=VALUE]", help="Such as sense.2:stuck@0.3+0.05; may be repeated."),
     ] = None,
     learn: Learn = False,
-    replay: Replay = None,
+    apply: Apply = None,
     refresh: Refresh = None,
     replace_earlier: ReplaceEarlier = False,
     as_json: Annotated[bool, typer.Option("--json", help="Print the summary as JSON, and nothing else.")] = False,
@@ -51,7 +51,7 @@ def sil(
     from hil.runs.scenario import load_scenario
 
     faults = [parse(text) for text in fault or ()]
-    learning = learning_of(learn, replay, refresh)
+    learning = learning_of(learn, apply, refresh)
     loaded = load_scenario(
         scenario, seed=seed, stage=stage, plant=plant, controller=controller, bus=bus, faults=faults, learning=learning
     )
@@ -91,8 +91,8 @@ def _show(summary: "Summary", folder: Path) -> None:
         verdict = {True: good("holds"), False: bad("fails"), None: faint("no bus")}[check.ok]
         table.add_row(check.name, value, bound_words(check), verdict)
     speed = summary.loop.realtime_factor
-    pace = f", {speed:.1f} times real time" if speed is not None else ""
-    say(f"{summary.scenario}, {summary.lane} lane, seed {summary.seed}: {summary.rows.ticks} ticks{pace}")
+    rate = f", {speed:.1f} times real time" if speed is not None else ""
+    say(f"{summary.scenario}, {summary.lane} lane, seed {summary.seed}: {summary.rows.ticks} ticks{rate}")
     screen().print(table)
     for line in error_lines(summary.rows, summary.loop.errors_are_of):
         say(line)

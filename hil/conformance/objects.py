@@ -4,7 +4,7 @@ from collections.abc import Iterator
 
 from hil.conformance.deviation import DeviationError, NotTestedError, deviate_if
 from hil.conformance.eds import Variable
-from hil.conformance.sdo_client import Outcome, upload_request
+from hil.conformance.sdo_client import SdoResult, upload_request
 from hil.conformance.talker import Talker
 from hil.conformance.verdict import OUR_CONTRACT, Check
 from pkxyz_ctrl.can.sdo import abort_text
@@ -25,19 +25,19 @@ _OWN_VALUES = (0x1000, 0x1001, 0x1003, 0x1009, 0x100A, 0x1018, 0x2000, 0x2001, 0
 
 def _answers(talker: Talker) -> str:
     talker.reset()
-    outcome = talker.read(0x1000, 0)
-    if not outcome.ok:
-        raise DeviationError(f"0x1000:00: {outcome.text}")
-    return f"0x1000:00 reads {outcome.text}"
+    result = talker.read(0x1000, 0)
+    if not result.ok:
+        raise DeviationError(f"0x1000:00: {result.text}")
+    return f"0x1000:00 reads {result.text}"
 
 
 def _identity(talker: Talker) -> str:
     talker.reset()
     deviations, told = [], []
     for step in identity_steps(talker.driver):
-        outcome = talker.read(step.index, step.subindex)
-        told.append(f"{step.what} 0x{outcome.unsigned:08X}" if outcome.ok else f"{step.what}: {outcome.text}")
-        if not outcome.ok or (step.value is not None and outcome.unsigned != step.value):
+        result = talker.read(step.index, step.subindex)
+        told.append(f"{step.what} 0x{result.unsigned:08X}" if result.ok else f"{step.what}: {result.text}")
+        if not result.ok or (step.value is not None and result.unsigned != step.value):
             deviations.append(f"{step.name}: {told[-1]}, expected 0x{step.value or 0:08X}")
     deviate_if(deviations)
     return ", ".join(told)
@@ -47,23 +47,21 @@ def _objects_read(talker: Talker) -> str:
     talker.reset()
     readable = [variable for variable in talker.variables if variable.readable]
     outcomes = ((variable, talker.read(variable.index, variable.subindex)) for variable in readable)
-    deviate_if(
-        [f"{variable.label}: {outcome.text}" for variable, outcome in outcomes if not _is_there(variable, outcome)]
-    )
+    deviate_if([f"{variable.label}: {result.text}" for variable, result in outcomes if not _is_there(variable, result)])
     return f"all {len(readable)} read"
 
 
-def _is_there(variable: Variable, outcome: Outcome) -> bool:
+def _is_there(variable: Variable, result: SdoResult) -> bool:
     """An error that has not happened is no data: that object exists all the same."""
-    return outcome.ok or (variable.index == 0x1003 and variable.subindex > 0 and outcome.abort in _NO_ERROR_YET)
+    return result.ok or (variable.index == 0x1003 and variable.subindex > 0 and result.abort in _NO_ERROR_YET)
 
 
 def _read_values(talker: Talker) -> Iterator[tuple[Variable, bytes]]:
     """What can be read; what cannot has a line of its own."""
     talker.reset()
     for variable in talker.variables:
-        if variable.readable and (outcome := talker.read(variable.index, variable.subindex)).data is not None:
-            yield variable, outcome.data
+        if variable.readable and (result := talker.read(variable.index, variable.subindex)).data is not None:
+            yield variable, result.data
 
 
 def _lengths(talker: Talker) -> str:
@@ -91,9 +89,9 @@ def _read_only(talker: Talker) -> str:
     for variable, data in list(_read_values(talker)):
         if not variable.writable:
             tried += 1
-            outcome = talker.write_bytes(variable.index, variable.subindex, data)
-            if outcome.abort not in (_READ_ONLY, _UNSUPPORTED):
-                deviations.append(f"{variable.label}: {outcome.text}")
+            result = talker.write_bytes(variable.index, variable.subindex, data)
+            if result.abort not in (_READ_ONLY, _UNSUPPORTED):
+                deviations.append(f"{variable.label}: {result.text}")
     deviate_if(deviations)
     return f"{tried} writes refused"
 
@@ -104,9 +102,9 @@ def _writable(talker: Talker) -> str:
         drives = variable.index in (0x6411, 0x6444) and any(data) and not talker.allow_voltage
         if variable.writable and not variable.is_pdo_parameter and not drives and 1 <= len(data) <= 4:
             tried += 1
-            outcome = talker.write_bytes(variable.index, variable.subindex, data)
-            if not outcome.ok:
-                deviations.append(f"{variable.label}: {outcome.text}")
+            result = talker.write_bytes(variable.index, variable.subindex, data)
+            if not result.ok:
+                deviations.append(f"{variable.label}: {result.text}")
     deviate_if(deviations)
     return f"{tried} objects take the value that they have"
 
@@ -116,13 +114,13 @@ def _configuration(talker: Talker) -> str:
     deviations, steps = [], configuration_steps(talker.driver)
     for step in steps:
         if step.write:
-            outcome = talker.write(step.index, step.subindex, step.value or 0, step.size)
-            if not outcome.ok:
-                deviations.append(f"{step.name} = 0x{step.value or 0:X}: {outcome.text}")
+            result = talker.write(step.index, step.subindex, step.value or 0, step.size)
+            if not result.ok:
+                deviations.append(f"{step.name} = 0x{step.value or 0:X}: {result.text}")
         else:
-            outcome = talker.read(step.index, step.subindex)
-            if outcome.unsigned != step.value:
-                deviations.append(f"{step.name}: {outcome.text}, not 0x{step.value or 0:X}")
+            result = talker.read(step.index, step.subindex)
+            if result.unsigned != step.value:
+                deviations.append(f"{step.name}: {result.text}, not 0x{step.value or 0:X}")
     deviate_if(deviations)
     return f"{len(steps)} transfers as they should be"
 
@@ -131,9 +129,9 @@ def _mapping_in_use(talker: Talker) -> str:
     talker.operational()
     deviations = []
     for index in (0x1601, 0x1A01):
-        outcome = talker.write(index, 0, 0, 1)
-        if outcome.abort not in _IN_USE:
-            deviations.append(f"0x{index:04X}:00 = 0: {outcome.text}")
+        result = talker.write(index, 0, 0, 1)
+        if result.abort not in _IN_USE:
+            deviations.append(f"0x{index:04X}:00 = 0: {result.text}")
     deviate_if(deviations)
     return "both refused"
 
@@ -165,9 +163,9 @@ def _wrong_lengths(talker: Talker, change: int, codes: tuple[int, ...]) -> str:
         length = (variable.length or 0) + change
         if variable.writable and not variable.is_pdo_parameter and variable.length and 1 <= length <= 4:
             tried += 1
-            outcome: Outcome = talker.write_bytes(variable.index, variable.subindex, bytes(length))
-            if outcome.abort not in codes:
-                deviations.append(f"{variable.label} with {length} bytes: {outcome.text}")
+            result: SdoResult = talker.write_bytes(variable.index, variable.subindex, bytes(length))
+            if result.abort not in codes:
+                deviations.append(f"{variable.label} with {length} bytes: {result.text}")
     deviate_if(deviations)
     return f"{tried} refused"
 
@@ -192,9 +190,9 @@ def _out_of_range(talker: Talker) -> str:
         beyond += [variable.low - 1] if variable.low is not None and variable.low > lowest else []
         for value in beyond:
             tried += 1
-            outcome = talker.write_bytes(variable.index, variable.subindex, variable.bytes_of(value))
-            if outcome.abort not in _RANGES:
-                deviations.append(f"{variable.label} = {value}: {outcome.text}")
+            result = talker.write_bytes(variable.index, variable.subindex, variable.bytes_of(value))
+            if result.abort not in _RANGES:
+                deviations.append(f"{variable.label} = {value}: {result.text}")
     if not tried:
         raise NotTestedError("the EDS gives no limits within the types")
     deviate_if(deviations)

@@ -31,8 +31,8 @@ def _energised(talker: Talker, configure: Callable[[], object] = lambda: None) -
 
 
 def _measure_if(found: list[str]) -> None:
-    """0x6411 may hold what was written last and not what is at the terminals (CiA 401 leaves it open): it decides
-    nothing.
+    """0x6411 may hold what was written last and not what is at the terminals (CiA
+    401 leaves it open): it decides nothing.
     """
     if found:
         raise UndecidedError(f"{first_few(found)}: hold a voltmeter to the terminals; 0 V there is needed where 0 is")
@@ -167,9 +167,9 @@ def _by_sdo(talker: Talker) -> str:
     _energised(talker)
     deviations = []
     for comb in (1, 2, 3):
-        outcome = talker.write(0x6411, comb, _OTHER[comb - 1], 2)
-        if not outcome.abort:
-            deviations.append(f"0x6411:{comb:02X}: {outcome.text}")
+        result = talker.write(0x6411, comb, _OTHER[comb - 1], 2)
+        if not result.abort:
+            deviations.append(f"0x6411:{comb:02X}: {result.text}")
     if (outputs := talker.outputs()) != TEST_COUNTS:
         deviations.append(f"0x6411 {outputs}")
     deviate_if(deviations)

@@ -13,7 +13,7 @@ _SEGMENTS_MAX = 40  # 280 bytes: no object of this profile is longer; a server t
 
 
 @dataclass(frozen=True)
-class Outcome:
+class SdoResult:
     """Of one transfer. ``data``: what was read (empty after a write); ``abort``: the server's code, else 0."""
 
     data: bytes | None
@@ -56,7 +56,7 @@ def is_answer(request: bytes, reply: bytes) -> bool:
     return is_abort or reply[0] >> 5 == 0 if command == 3 else True
 
 
-def read(exchange: Exchange, index: int, subindex: int) -> Outcome:
+def read(exchange: Exchange, index: int, subindex: int) -> SdoResult:
     """Upload of an object of any length."""
     head = struct.pack("<HB", index, subindex)
     reply = exchange(upload_request(index, subindex))
@@ -64,26 +64,26 @@ def read(exchange: Exchange, index: int, subindex: int) -> Outcome:
     if failed is not None or reply is None:
         return failed or _SILENT
     if reply[0] & 0xE2 == 0x42:
-        return Outcome(reply[4 : 8 - (reply[0] >> 2 & 3)] if reply[0] & 1 else reply[4:8])
+        return SdoResult(reply[4 : 8 - (reply[0] >> 2 & 3)] if reply[0] & 1 else reply[4:8])
     if reply[0] & 0xE2 != 0x40:
-        return Outcome(None, trouble=f"a reply that is no upload: {reply.hex(' ')}")
+        return SdoResult(None, trouble=f"a reply that is no upload: {reply.hex(' ')}")
     data, toggle = b"", 0
     for _ in range(_SEGMENTS_MAX):
         segment = exchange(bytes((0x60 | toggle << 4,)) + bytes(7))
         if segment is None:
             return _SILENT
         if segment[0] == 0x80:
-            return Outcome(None, int.from_bytes(segment[4:], "little"))
+            return SdoResult(None, int.from_bytes(segment[4:], "little"))
         if segment[0] >> 5 or segment[0] >> 4 & 1 != toggle:
-            return Outcome(None, trouble=f"a segment that does not fit: {segment.hex(' ')}")
+            return SdoResult(None, trouble=f"a segment that does not fit: {segment.hex(' ')}")
         data += segment[1 : 8 - (segment[0] >> 1 & 7)]
         if segment[0] & 1:
-            return Outcome(data)
+            return SdoResult(data)
         toggle ^= 1
-    return Outcome(None, trouble=f"more than {7 * _SEGMENTS_MAX} bytes")
+    return SdoResult(None, trouble=f"more than {7 * _SEGMENTS_MAX} bytes")
 
 
-def write(exchange: Exchange, index: int, subindex: int, data: bytes) -> Outcome:
+def write(exchange: Exchange, index: int, subindex: int, data: bytes) -> SdoResult:
     """Expedited download of 1 to 4 bytes; of a longer object only the request with its length is made."""
     head = struct.pack("<HB", index, subindex)
     request = (
@@ -96,18 +96,18 @@ def write(exchange: Exchange, index: int, subindex: int, data: bytes) -> Outcome
     if failed is not None or reply is None:
         return failed or _SILENT
     if reply[0] != 0x60:
-        return Outcome(None, trouble=f"a reply that is no download: {reply.hex(' ')}")
-    return Outcome(b"")
+        return SdoResult(None, trouble=f"a reply that is no download: {reply.hex(' ')}")
+    return SdoResult(b"")
 
 
-def _failure(reply: bytes | None, head: bytes) -> Outcome | None:
+def _failure(reply: bytes | None, head: bytes) -> SdoResult | None:
     if reply is None:
         return _SILENT
     if reply[1:4] != head:
-        return Outcome(None, trouble=f"a reply about another object: {reply.hex(' ')}")
+        return SdoResult(None, trouble=f"a reply about another object: {reply.hex(' ')}")
     if reply[0] == 0x80:
-        return Outcome(None, int.from_bytes(reply[4:], "little"))
+        return SdoResult(None, int.from_bytes(reply[4:], "little"))
     return None
 
 
-_SILENT = Outcome(None, trouble="no answer")
+_SILENT = SdoResult(None, trouble="no answer")

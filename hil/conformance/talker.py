@@ -5,7 +5,7 @@ from collections.abc import Callable
 from hil.conformance import sdo_client
 from hil.conformance.deviation import UndecidedError
 from hil.conformance.eds import Variable
-from hil.conformance.sdo_client import Outcome
+from hil.conformance.sdo_client import SdoResult
 from pkxyz_ctrl.can import cob_id
 from pkxyz_ctrl.can.cob_id import NmtCommand
 from pkxyz_ctrl.can.codec import Counts, ProcessCodec
@@ -146,13 +146,13 @@ class Talker:
         self.first(replies, _LATE_ANSWERS_US * timeout_us)
         return None
 
-    def read(self, index: int, subindex: int) -> Outcome:
+    def read(self, index: int, subindex: int) -> SdoResult:
         return sdo_client.read(self.exchange, index, subindex)
 
-    def write(self, index: int, subindex: int, value: int, length: int) -> Outcome:
+    def write(self, index: int, subindex: int, value: int, length: int) -> SdoResult:
         return self.write_bytes(index, subindex, (value % (1 << 8 * length)).to_bytes(length, "little"))
 
-    def write_bytes(self, index: int, subindex: int, data: bytes) -> Outcome:
+    def write_bytes(self, index: int, subindex: int, data: bytes) -> SdoResult:
         return sdo_client.write(self.exchange, index, subindex, data)
 
     def nmt(self, command: NmtCommand, node_id: int | None = None) -> None:
@@ -219,9 +219,9 @@ class Talker:
     def outputs(self) -> Counts:
         """0x6411 as the node tells it. Raises UndecidedError if it does not."""
         outcomes = [self.read(0x6411, comb) for comb in (1, 2, 3)]
-        if silent := next((outcome for outcome in outcomes if not outcome.ok), None):
+        if silent := next((result for result in outcomes if not result.ok), None):
             raise UndecidedError(f"0x6411 cannot be read ({silent.text}): hold a voltmeter to the terminals")
-        a, b, c = (outcome.unsigned for outcome in outcomes)
+        a, b, c = (result.unsigned for result in outcomes)
         return a, b, c
 
 

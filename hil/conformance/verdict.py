@@ -45,7 +45,7 @@ class Check:
 
 @dataclass(frozen=True)
 class Line:
-    """The outcome of a check."""
+    """The result of a check."""
 
     group: str
     name: str

@@ -7,12 +7,12 @@ from collections.abc import Callable, Sequence
 
 from hil.faults.fault import Fault
 from hil.plant.on_bus import PlantOnBus
+from pkxyz_ctrl.can.codec import Counts
 from pkxyz_ctrl.config.bus import BusConfig
 from sim.plant import Plant
 
 FAMILIES = ("sense", "amplifier", "plant")
 
-Counts = tuple[int, int, int]
 Channel = Callable[[float, int], float]
 """What a channel makes of a value at t_us; a new one each time that its fault begins."""
 

@@ -92,7 +92,7 @@ def excitation(
     first_tick: int,
     seed: int,
 ) -> Excitation:
-    """x, y, z in turn; "multisine": all tones at once, in phases drawn from the seed; "stepped": one after another."""
+    """x, y, z in turn; "multisine": all tones at once, in phases sampled by the seed; "stepped": one after another."""
     if not (bins.min() > 0 and bins.max() < period_ticks / 2):
         raise ValueError(f"tones must lie between 0 and half the sampling rate, not at bins {bins.min()}..{bins.max()}")
     phases = np.random.default_rng(seed).uniform(0.0, 2.0 * np.pi, (3, len(bins)))

@@ -1,5 +1,5 @@
-"""The fast lane: the same cycle and the same plant in one compiled loop, with the delays and the quantisation of the
-bus.
+"""The fast lane: the same cycle and the same plant in one compiled loop, with the
+delays and the quantisation of the bus.
 
 No frames, no gate, no driver: on a fault-free scenario they change no bit, and a test holds the two lanes to that.
 """

@@ -95,9 +95,7 @@ def _run_fast(setup: Setup, run_block: RunBlock, memory: NDArray[np.void], plant
 
 
 def _sample_us(setup: Setup, first: int, count: int) -> NDArray[np.int64]:
-    """Plant time of the samples: the end of each tick's SYNC, whose length depends on its counter, since the first
-    one.
-    """
+    """Plant time of the samples: end of each tick's SYNC (its length depends on its counter), since the first one."""
     tick = np.arange(first, first + count, dtype=np.int64)
     can = setup.bus.can
     if can is None:

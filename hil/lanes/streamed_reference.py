@@ -13,8 +13,8 @@ PIECE_ROWS = 32
 
 
 class StreamedReference:
-    """``runtime.Reference`` of two blocks: the loop reads one while ``prepare``, called after each tick, fills the
-    other.
+    """``runtime.Reference`` of two blocks: the loop reads one while ``prepare``,
+    called after each tick, fills the other.
 
     A reference that begins anew, as after a fault that was cleared, is sampled in that tick.
     """

@@ -4,7 +4,7 @@ from collections.abc import Callable
 from typing import Protocol
 
 
-class Clock(Protocol):
+class Scheduler(Protocol):
     """Owner of time: integer microseconds, and appointments that are kept in order."""
 
     @property
@@ -18,7 +18,7 @@ class Alarm:
 
     __slots__ = ("_armed_us", "_clock", "_ring", "due_us")
 
-    def __init__(self, clock: Clock, ring: Callable[[int], None]) -> None:
+    def __init__(self, clock: Scheduler, ring: Callable[[int], None]) -> None:
         self._clock = clock
         self._ring = ring
         self._armed_us: int | None = None  # the appointment that counts; earlier-made ones wake up and go back to sleep

@@ -8,8 +8,8 @@ from collections.abc import Callable
 from enum import IntEnum
 from pathlib import Path
 
-from hil.node.alarm import Alarm, Clock
-from hil.node.drive import Counts, DriveReceiver
+from hil.node.alarm import Alarm, Scheduler
+from hil.node.drive import DriveReceiver, Outputs
 from hil.node.emergency import EmergencyProducer, ErrorCode, FrameErrors
 from hil.node.heartbeat import HeartbeatConsumer, HeartbeatProducer
 from hil.node.object_dictionary import ObjectDictionary
@@ -46,7 +46,7 @@ class AmplifierNode:
     def __init__(
         self,
         node_id: int,
-        clock: Clock,
+        clock: Scheduler,
         send: Callable[[Frame], object],
         plant: Plant,
         eds_path: str | Path,
@@ -60,7 +60,7 @@ class AmplifierNode:
             raise ValueError(f"node id {node_id}: CiA 301 allows 1 to 127")
         self.node_id = node_id
         self.state = NmtState.INITIALISING
-        self.outputs: Counts = (0, 0, 0)  # what the amplifier was last told
+        self.outputs: Outputs = (0, 0, 0)  # what the amplifier was last told
         self._clock = clock
         self._send = send
         self._plant = plant
@@ -242,7 +242,7 @@ class AmplifierNode:
             self._plant.advance_to(t_us)
             self._apply(self._drive.pending, t_us)
 
-    def _apply(self, counts: Counts, t_us: int) -> None:
+    def _apply(self, counts: Outputs, t_us: int) -> None:
         """Put counts on the converters; 0 V from anywhere, else no further from what is there than 0x2011 says."""
         a, b, c = counts
         if a or b or c:
@@ -279,7 +279,7 @@ class AmplifierNode:
         self._outputs_to_error_value()
         self._drive.demand_zero()
 
-    def _set_outputs(self, counts: Counts, t_us: int) -> None:
+    def _set_outputs(self, counts: Outputs, t_us: int) -> None:
         self._drive.pending = None
         self.outputs = counts
         self._plant.advance_to(t_us)

@@ -8,7 +8,9 @@ from hil.node.emergency import ErrorCode, FrameErrors
 from hil.node.object_dictionary import ObjectDictionary
 from hil.node.pdo import Layout, PdoParameters
 
-Counts = tuple[int, int, int]
+Outputs = tuple[int, int, int]
+"""Counts of the three combs, as object 0x6411 holds them."""
+
 
 _unpack_protected = struct.Struct("<3HBB").unpack
 _OUTPUT = 0x6411
@@ -29,14 +31,14 @@ class DriveReceiver:
     """
 
     def __init__(
-        self, od: ObjectDictionary, parameters: PdoParameters, errors: FrameErrors, outputs: Callable[[], Counts]
+        self, od: ObjectDictionary, parameters: PdoParameters, errors: FrameErrors, outputs: Callable[[], Outputs]
     ) -> None:
         self._parameters = parameters
         self._errors = errors
         self._w0, self._w1, self._w2 = WORDS
         self._outputs = outputs
         self._od = od
-        self.pending: Counts | None = None
+        self.pending: Outputs | None = None
         self.counter: int | None = None  # of the last frame with a correct CRC
         self.crc = 0
         self._is_zero_due = False
@@ -104,11 +106,11 @@ class DriveReceiver:
         self._is_owed, self._was_refused = False, True
         self._errors.bad(code, t_us, info)
 
-    def _is_late(self, counts: Counts, t_us: int) -> bool:
+    def _is_late(self, counts: Outputs, t_us: int) -> bool:
         self._refuse(ErrorCode.DRIVE_LATE, t_us, bytes((self.counter or 0,)))
         return any(counts)
 
-    def _zeroed(self, counts: Counts) -> bool:
+    def _zeroed(self, counts: Outputs) -> bool:
         self._is_zero_due = any(counts)
         self._was_refused = self._is_zero_due
         return not self._is_zero_due
@@ -152,5 +154,5 @@ class DriveReceiver:
         self._errors.bad(code, t_us, bytes((len(data), expected)))
 
 
-def _channels_over(words: list[int] | Counts, limit: int) -> bytes:
+def _channels_over(words: list[int] | Outputs, limit: int) -> bytes:
     return bytes((sum(1 << channel for channel, word in enumerate(words) if word > limit),))

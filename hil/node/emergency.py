@@ -5,7 +5,7 @@ from collections import deque
 from collections.abc import Callable
 from enum import IntEnum
 
-from hil.node.alarm import Alarm, Clock
+from hil.node.alarm import Alarm, Scheduler
 from hil.node.object_dictionary import ObjectDictionary
 
 HISTORY_LENGTH = 8
@@ -42,7 +42,7 @@ class EmergencyProducer:
     Objects: 0x1001 register, 0x1003 history (newest first), 0x1014 COB-ID, 0x1015 inhibit time in 100 us.
     """
 
-    def __init__(self, od: ObjectDictionary, clock: Clock, send: Callable[[int, bytes], None]) -> None:
+    def __init__(self, od: ObjectDictionary, clock: Scheduler, send: Callable[[int, bytes], None]) -> None:
         self._od = od
         self._clock = clock
         self._send = send

@@ -2,13 +2,13 @@
 
 from collections.abc import Callable
 
-from hil.node.alarm import Alarm, Clock
+from hil.node.alarm import Alarm, Scheduler
 
 
 class HeartbeatProducer:
     """Sends a heartbeat at least every period: behind a sense PDO where there is one in time, else by itself."""
 
-    def __init__(self, clock: Clock, send: Callable[[], None]) -> None:
+    def __init__(self, clock: Scheduler, send: Callable[[], None]) -> None:
         self._alarm = Alarm(clock, self._beat)
         self._clock = clock
         self._send = send
@@ -37,7 +37,7 @@ class HeartbeatProducer:
 class HeartbeatConsumer:
     """Watches one node. Starts with its first heartbeat; then ``lost`` is called exactly when the time is over."""
 
-    def __init__(self, clock: Clock, lost: Callable[[int], None], found: Callable[[], None]) -> None:
+    def __init__(self, clock: Scheduler, lost: Callable[[int], None], found: Callable[[], None]) -> None:
         self._alarm = Alarm(clock, self._time_out)
         self._lost = lost
         self._found = found

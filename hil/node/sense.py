@@ -4,7 +4,7 @@ import struct
 from collections.abc import Callable
 from typing import Protocol
 
-from hil.node.alarm import Alarm, Clock
+from hil.node.alarm import Alarm, Scheduler
 from hil.node.crc import WORDS, crc8h2f, last_byte_table
 from hil.node.heartbeat import HeartbeatProducer
 from hil.node.object_dictionary import ObjectDictionary
@@ -37,7 +37,7 @@ class SenseTransmitter:
         self,
         od: ObjectDictionary,
         parameters: PdoParameters,
-        clock: Clock,
+        clock: Scheduler,
         plant: Plant,
         send: Callable[[int, bytes], None],
         heartbeat: HeartbeatProducer,

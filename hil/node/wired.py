@@ -2,7 +2,7 @@
 
 from collections.abc import Callable
 
-from hil.node.alarm import Clock
+from hil.node.alarm import Scheduler
 from hil.node.amplifier import AmplifierNode
 from hil.node.sense import Plant
 from pkxyz_ctrl.can.frame import Frame
@@ -15,7 +15,7 @@ EDS = CONFIG_DIR / "comb_amplifier.eds"
 
 def wired_node(
     can: CanConfig,
-    clock: Clock,
+    clock: Scheduler,
     send: Callable[[Frame], object],
     plant: Plant,
     node_type: type[AmplifierNode] = AmplifierNode,

@@ -10,7 +10,7 @@ from hil.studies.identify.identification import Identification
 
 def draw_response(found: Identification, path: Path) -> None:
     """Rows: sense chains. Left: size of the three entries in each comb's V^2; then phase of the chain's own comb; then
-    coherence, and the residual in standard deviations.
+    coherence, and the residual in standard errors.
     """
     hz = ", ".join(f"{v:.1f}" for v in found.modes.frequency_hz)
     setup = found.setup
@@ -33,11 +33,11 @@ def draw_response(found: Identification, path: Path) -> None:
         for j, colour in enumerate(AXIS):
             name = f"comb {j + 1}" + (" (its own)" if i == j else "")
             size.errorbar(
-                f, np.abs(r.p[:, i, j]), yerr=r.deviation[:, i, j], fmt=".", ms=3, lw=0.6, color=colour, alpha=0.55
+                f, np.abs(r.p[:, i, j]), yerr=r.standard_error[:, i, j], fmt=".", ms=3, lw=0.6, color=colour, alpha=0.55
             )
             size.plot(fine, np.abs(fitted[:, i, j]), color=colour, lw=1.3, label=name)
             apart = r.p[used, i, j] - at_tones[used, i, j]
-            left.plot(f[used], np.abs(apart) / r.deviation[used, i, j], ".", ms=3, color=colour, alpha=0.6)
+            left.plot(f[used], np.abs(apart) / r.standard_error[used, i, j], ".", ms=3, color=colour, alpha=0.6)
         phase.plot(f, _degrees(r.p[:, i, i]), ".", ms=3, color=AXIS[i], alpha=0.55)
         phase.plot(fine, _degrees(fitted[:, i, i]), color=AXIS[i], lw=1.2)
         coherence.plot(f, r.coherence[:, i], color=INK, lw=1.0)
@@ -53,7 +53,7 @@ def draw_response(found: Identification, path: Path) -> None:
         "size: measured (points), fit (lines)",
         "phase, own comb (deg)",
         "coherence",
-        "|measured - fit| / deviation",
+        "|measured - fit| / standard error",
     )
     for axes, title in zip(panels[0], titles, strict=True):
         axes.set_title(title, fontsize=LABEL_PT)

@@ -139,8 +139,8 @@ def section(stage: Stage, height_m: float, line_m: Array) -> tuple[Array, Array]
 
 
 EDGE_PATH = np.array([[0, 0, 0], [1, 0, 0], [1, 1, 0], [1, 1, 1]], dtype=float)
-"""Corners of the path of Appendix B in units of full stroke: rest, greatest lateral displacement, and on to the
-highest point.
+"""Corners of the path of Appendix B in units of full stroke: rest, greatest lateral
+displacement, and on to the highest point.
 """
 
 

@@ -47,8 +47,8 @@ def _exchange(
 
 
 class PlantOnBus:
-    """A plant whose time 0 is the first sample: until then it stands in equilibrium at 0 V, however long the start-up
-    takes.
+    """A plant whose time 0 is the first sample: until then it stands in equilibrium
+    at 0 V, however long the start-up takes.
 
     ``advance_to`` and ``drive`` wait for what follows, so that the SYNC's three steps are one compiled call; whatever
     ends otherwise (a fault that discharges the combs between two samples) is carried out as it comes.

@@ -9,8 +9,8 @@ from sim.structure.pose import combs_seen, stand
 
 @njit(cache=True, error_model="numpy")
 def observe(plant: np.void, state: np.void, out: np.void) -> None:
-    """Write ``position_m``, ``stroke_m`` and ``comb_voltage_v`` (3,) of a plant's records to those fields of the
-    record ``out``.
+    """Write ``position_m``, ``stroke_m`` and ``comb_voltage_v`` (3,) of a plant's
+    records to those fields of the record ``out``.
 
     As ``sim.plant.Plant`` defines them: the modes' part is in the position and in the strokes.
     """

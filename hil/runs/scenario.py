@@ -148,9 +148,9 @@ def load_scenario(
     faults: Sequence[Fault] = (),
     learning: dict[str, str] | None = None,
 ) -> Scenario:
-    """Read a scenario and all that it names, with what the caller wants otherwise (paths from the working folder).
-    ``faults`` come on top of the scenario's own. The ``config.toml`` of a run is a scenario, too, with all that it
-    named inside.
+    """Read a scenario and all that it names, with what the caller wants otherwise (paths from the
+    working folder). ``faults`` come on top of the scenario's own. The ``config.toml`` of a run is a
+    scenario, too, with all that it named inside.
 
     Raises ``ConfigError`` with one line for each thing that is wrong, over all the files; ``TrajectoryError``, which is
     one, for a reference that the stage can't follow.

@@ -1,6 +1,6 @@
-"""A law against plants that were drawn from tolerances: one closed-loop run and one Ms each, kept line by line.
+"""A law against plants that were sampled from tolerances: one closed-loop run and one Ms each, kept line by line.
 
-Plant n is drawn by seed n, which also seeds its noise, so any of them runs again alone and gives the same bits.
+Plant n is sampled by seed n, which also seeds its noise, so any of them runs again alone and gives the same bits.
 """
 
 import dataclasses
@@ -18,7 +18,7 @@ from hil.lanes.lane import Lane
 from hil.runs.metrics import Metrics
 from hil.runs.scenario import Scenario, resolve
 from hil.studies.margins.loop import Loop
-from hil.studies.spread.workers import as_done, given, hands
+from hil.studies.spread.workers import as_done, with_constant, worker_pool
 from pkxyz_ctrl.config import files as config
 from pkxyz_ctrl.config.files import ConfigError
 from pkxyz_ctrl.config.refused import reason
@@ -28,7 +28,7 @@ from pkxyz_ctrl.stage import Stage
 from sim.config import PlantConfig
 
 FIGURES = {"rms_error_nm": "nm", "hold_noise_nm": "nm", "peak_s": ""}
-"""Figures of a plant that distributions are drawn of, with their units. Of axes, the worst one."""
+"""Figures of a plant that distributions are shown of, with their units. Of axes, the worst one."""
 
 
 @dataclass(frozen=True)
@@ -43,9 +43,9 @@ class Study:
         data = resolve(self.scenario)
         return config.digest({"scenario": data, "tolerances": config.plain(self.tolerances)})
 
-    def drawn(self, seed: int) -> Scenario:
+    def sampled(self, seed: int) -> Scenario:
         """The scenario on the plant of a seed."""
-        case = self.tolerances.draw(seed)
+        case = self.tolerances.sample(seed)
         return replace(
             self.scenario,
             config=self.scenario.config.model_copy(update={"seed": seed}),
@@ -96,13 +96,13 @@ class Result:
 
 
 def run_one(study: Study, seed: int) -> Result:
-    """Run the plant of a seed on the fast lane; its Ms is that of the linear loop at the point that was drawn."""
-    scenario = study.drawn(seed)
+    """Run the plant of a seed on the fast lane; its Ms is that of the linear loop at the point that was sampled."""
+    scenario = study.sampled(seed)
     setup = scenario.setup()
     metrics = Metrics(setup.trajectory, setup.bus.period_us)
     result = lanes.run(setup, Lane.FAST, on_block=metrics.update)
     figures = metrics.figures()
-    case = study.tolerances.draw(seed)
+    case = study.tolerances.sample(seed)
     peak = Loop(Stage(setup.stage), setup.bus, setup.law).peak_sensitivity(case)
 
     def worst(values: Mapping[str, float] | None) -> float | None:
@@ -165,14 +165,14 @@ def run_study(
     on_progress(done, len(seeds))
     if not left:
         return
-    with hands(workers, scheduler) as (pool, width):
+    with worker_pool(workers, scheduler) as (pool, width):
         for n, (_, result) in enumerate(_all_done(pool, width, study, left), start=1):
             results.add(result)
             on_progress(done + n, len(seeds))
 
 
 def _all_done(pool: Any, width: int, study: Study, seeds: list[int]) -> Iterator[tuple[int, Result]]:
-    return as_done(pool, width, given(run_one, study), seeds, ahead=width)
+    return as_done(pool, width, with_constant(run_one, study), seeds, ahead=width)
 
 
 def summary(results: Sequence[Result]) -> dict[str, Any]:

@@ -92,8 +92,8 @@ class SenseInput:
     def take(self) -> tuple[int, int, int, int]:
         """``(counts 1, counts 2, counts 3, status)``, once a tick; with SENSE_MISSING, the last valid counts.
 
-        The status says what happened since the last call, so that a frame that comes too late is reported with the
-        next tick.
+        The status says what happened since the last call, so that a frame that comes
+        too late is reported with the next tick.
         """
         status = self._flags if self.fresh else self._flags | SENSE_MISSING
         self._flags = 0

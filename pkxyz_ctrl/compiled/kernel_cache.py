@@ -93,8 +93,8 @@ def _forget_empty(folder: Path) -> None:
 
 
 def _digest_of_kernels() -> str:
-    """Over every file that holds a kernel and all of ours that these import: a kernel freezes the constants that it
-    uses.
+    """Over every file that holds a kernel and all of ours that these import: a
+    kernel freezes the constants that it uses.
     """
     root = Path(__file__).parents[2]
     sources = {path: path.read_bytes() for package in _PACKAGES for path in sorted((root / package).rglob("*.py"))}

@@ -23,7 +23,7 @@ SenseScale = Literal["drawing", "reciprocity", "instrument"]
 
 
 class StandardErrors(FrozenModel):
-    """One standard deviation of each number, in its own unit; 0: not measured, taken as drawn."""
+    """Standard error of each number, in its own unit; 0: not measured, taken as drawn."""
 
     comb_gain: EachError
     lift: Error

@@ -35,8 +35,7 @@ class RegulatorConfig(FrozenModel):
     velocity_error_m_per_s: Positive
     force_n: Positive
     authority_force_n: Positive
-    """Least holding force of a comb from which the feedback has its full gain; below it fades out, as combs can't
-    push.
+    """Least holding force of a comb from which the feedback has its full gain; below it fades out, as combs can't push.
     """
 
 

@@ -13,8 +13,7 @@ Positive = Annotated[float, Field(gt=0)]
 
 class GeometryConfig(FrozenModel):
     """Dimensions of the mechanism (paper, Fig. 2 and 3). The out-of-plane link is given either by its projection and
-    height
-    at rest or by its length and elevation at rest."""
+    height at rest or by its length and elevation at rest."""
 
     base_radius_m: Positive
     """r: centre to base point, after the platform was collapsed to a point."""

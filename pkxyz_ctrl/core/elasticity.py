@@ -1,8 +1,8 @@
-"""Strain energy of the flexures, its gradient (the force that holds a position) and its Hessian (the stiffness),
-compiled.
+"""Strain energy of the flexures, its gradient (the force that holds a position) and
+its Hessian (the stiffness), compiled.
 
-    V = 2 K1 sum q_i^2 + 2 K2 sum theta_i^2 + 2 c K3 (alpha - alpha_0)^2,   sin(theta_i) = s_i / L1,   sin(alpha) = z
-    / L2
+    V = 2 K1 sum q_i^2 + 2 K2 sum theta_i^2 + 2 c K3 (alpha - alpha_0)^2
+    sin(theta_i) = s_i / L1,   sin(alpha) = z / L2
 
 c chains count in the out-of-plane term (Eq. 19 as printed: 1). The Hessian at rest is Eq. 19; elsewhere the curvature
 of q, theta and alpha, which the paper drops, is in it.
@@ -68,8 +68,8 @@ def energy(geometry: np.void, elasticity: np.void, position_m: Array) -> float:
 
 @njit(cache=True, error_model="numpy")
 def _elevation_change(geometry: np.void, dz: float, delta: float) -> float:
-    """alpha - alpha_0 in rad from its sine, z delta_0 - delta z_0 over L2^2, with the small difference written as a
-    quotient.
+    """alpha - alpha_0 in rad from its sine, z delta_0 - delta z_0 over L2^2, with the
+    small difference written as a quotient.
     """
     z0, delta0, reach = geometry["height_rest_m"], geometry["projection_rest_m"], geometry["link_m"]
     return arcsine(dz * (delta0 + z0 * (dz + 2.0 * z0) / (delta + delta0)) / (reach * reach))

@@ -56,8 +56,8 @@ FAR = np.dtype(
 
 @njit(cache=True, error_model="numpy")
 def update(estimator: np.void, estimate: np.void, measured_m: Array, has_measurement: bool) -> None:
-    """Measurement update at a sample: filtered = predicted + gain (y - h(predicted)). Without a measurement the
-    prediction stands.
+    """Measurement update at a sample: filtered = predicted + gain (y - h(predicted)).
+    Without a measurement the prediction stands.
     """
     predicted, filtered, innovation = estimate["predicted"], estimate["filtered"], estimate["innovation_m"]
     gain, origin, tau = estimator["gain"], estimator["operating_point_m"], estimator["sense_delay_s"]
@@ -72,8 +72,7 @@ def update(estimator: np.void, estimate: np.void, measured_m: Array, has_measure
 @njit(cache=True, error_model="numpy")
 def midway(estimator: np.void, s: Array, position_m: Array) -> None:
     """Position (3,) half a period after the state ``s`` (9,), where ``net_input`` is to be evaluated: at the start of
-    the period
-    it would lag behind a moving stage, and the disturbance would have to make up for it."""
+    the period it would lag behind a moving stage, and the disturbance would have to make up for it."""
     for i in range(3):
         position_m[i] = estimator["operating_point_m"][i] + s[i] + estimator["half_period_s"] * s[3 + i]
 
@@ -89,8 +88,8 @@ def net_input(
     w: Array,
     w_change: Array,
 ) -> None:
-    """w (3,) and w_old - w (3,) in N at an estimated position, for the comb forces that act now and those that acted
-    before.
+    """w (3,) and w_old - w (3,) in N at an estimated position, for the comb forces
+    that act now and those that acted before.
     """
     stiffness, origin = estimator["stiffness_n_per_m"], estimator["operating_point_m"]
     energy_gradient(geometry, elasticity, position_m, w_change)

@@ -35,8 +35,8 @@ _JUMP_M = 1e-9
 
 @njit(cache=True, error_model="numpy")
 def ahead(feedback: np.void, now: Array, after: Array, out: Array) -> None:
-    """Reference row (9,) at ``lead_s`` past the row ``now``, on the quintic that joins it to the row ``after``, one
-    period later.
+    """Reference row (9,) at ``lead_s`` past the row ``now``, on the quintic that joins it
+    to the row ``after``, one period later.
 
     A row is position m, velocity m/s, acceleration m/s^2. Of a sine of 4 samples a period the quintic's acceleration in
     mid-interval is right to 0.4 %, where one between the two accelerations would be 30 % too small. Where the position
@@ -82,8 +82,8 @@ def add_held_share(feedforward_n: Array, last_n: Array, next_n: Array, share: fl
 
 @njit(cache=True, error_model="numpy")
 def sampled_target(feedback: np.void, now: Array, feedforward_n: Array, feedforward_last_n: Array, out: Array) -> None:
-    """The row (9,) that the sampled state has to meet: ``now``, with the velocity that held forces really give at a
-    sample.
+    """The row (9,) that the sampled state has to meet: ``now``, with the velocity
+    that held forces really give at a sample.
 
     A force that is held for a period T in place of one that grows by f' in the time makes the velocity ripple about
     its mean; at the samples the ripple is -f' T^2 / (12 m), which at 631 Hz and 5 kHz is 5 % of the velocity. Without

@@ -174,9 +174,9 @@ def curvature(geometry: np.void, position_m: Array, out: Array) -> None:
 def newton_step(geometry: np.void, strokes_m: Array, position_m: Array) -> float:
     """Move ``position_m`` (3,) in place by one Newton step towards q(x) = ``strokes_m``; the size of the step in m.
 
-    The Jacobian is the exact one at the position handed in, so the error that is left is quadratic in the step: a
-    step of 1 um leaves about 1 nm, one of 30 nm less than 1 pm. Returns inf and moves nothing where the Jacobian is
-    singular.
+    The Jacobian is the exact one at the position handed in, so the error that is left is quadratic
+    in the step: a step of 1 um leaves about 1 nm, one of 30 nm less than 1 pm. Returns inf and
+    moves nothing where the Jacobian is singular.
 
     The third column of J is the same in every row, so z is eliminated by differences and two unknowns remain.
     """
@@ -206,8 +206,8 @@ def newton_step(geometry: np.void, strokes_m: Array, position_m: Array) -> float
 
 @njit(cache=True, error_model="numpy")
 def position_from_strokes(geometry: np.void, strokes_m: Array, position_m: Array) -> int:
-    """Forward kinematics: Newton from the position handed in (rest is always a good start), in place, until it stands
-    still.
+    """Forward kinematics: Newton from the position handed in (rest is always a good
+    start), in place, until it stands still.
 
     Returns the number of steps (4 to 5 within the workspace) or -1 where it leaves the links' domain or doesn't settle.
     """

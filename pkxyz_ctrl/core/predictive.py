@@ -131,8 +131,8 @@ def _step(estimator: np.void, e: Array, nu_n: Array, jump_m: Array, out: Array) 
 
 @njit(cache=True, error_model="numpy")
 def slope(law: np.void, pulls0: Array, e: Array, out: Array) -> None:
-    """Half the derivative (3n,) of the cost by v at v = 0, from where that leads: e (n+1, 6). Backwards, as adjoints
-    go.
+    """Half the derivative (3n,) of the cost by v at v = 0, from where that leads: e
+    (n+1, 6). Backwards, as adjoints go.
     """
     numbers, phi, gamma = law["predictive"], law["estimator"]["transition"], law["estimator"]["input"]
     adjoint, before, by_nu = np.empty(6), np.empty(6), np.empty(3)

@@ -1,5 +1,5 @@
-"""The tick: sense counts in, drive counts out. Composes kinematics, filter, law, allocation and voltage; PURE and
-compiled.
+"""The tick: sense counts in, drive counts out. Composes kinematics, filter, law,
+allocation and voltage; PURE and compiled.
 
 Three steps, so that whoever composes them can look between: ``measure`` (counts -> position), ``estimate`` (filter
 and its prediction to the instant of action), ``act`` (law -> comb forces -> counts). ``rest`` stands in for ``act``
@@ -127,9 +127,7 @@ def measure(law: np.void, memory: np.void, sense_count: NDArray[np.int32]) -> No
 
 @njit(cache=True, error_model="numpy")
 def estimate(law: np.void, memory: np.void, has_measurement: bool) -> None:
-    """Filter the measurement, then predict to the next sample and on to the instant from which this tick's force
-    acts.
-    """
+    """Filter the measurement, then predict to the next sample and on to when this tick's force begins to act."""
     estimator, state, drive, scratch = law["estimator"], memory["estimate"], law["drive"], memory["scratch"]
     filtering.update(estimator, state, memory["measurement_m"], has_measurement)
     youla.note(law["youla"], memory["youla"], state["innovation_m"])
@@ -167,7 +165,7 @@ def act(law: np.void, memory: np.void, here: Array, now: Array, after: Array, la
     """
     geometry, gains, drive, scratch = law["geometry"], law["feedback"], law["drive"], memory["scratch"]
     demand, force, count = memory["demand_n"], memory["force_n"], memory["count"]
-    j, inverse, row, given = scratch["pulls"], scratch["inverse"], scratch["row"], scratch["w_n"]
+    j, inverse, row, applied = scratch["pulls"], scratch["inverse"], scratch["row"], scratch["w_n"]
     following = scratch["next_n"]
     feedback.ahead(gains, after, later, row)
     feedforward(law, row, following)
@@ -210,9 +208,9 @@ def act(law: np.void, memory: np.void, here: Array, now: Array, after: Array, la
     lower, upper = scratch["lower_n"], scratch["upper_n"]
     memory["active_set_steps"] = allocation.allocate(j, inverse, demand, lower, upper, force, scratch["allocation"])
     voltage.counts_for_forces(drive, force, count[1], memory["carry_v"], count[0])
-    multiply3_transposed(j, force, given)
+    multiply3_transposed(j, force, applied)
     for i in range(3):
-        memory["slack_n"][i] = demand[i] - given[i]
+        memory["slack_n"][i] = demand[i] - applied[i]
     if kind == LINEAR:
         linear_law.advance(law["linear"], memory["linear"], memory["slack_n"], share)
     return memory["active_set_steps"] > 1
@@ -286,9 +284,9 @@ def is_discharged(memory: np.void) -> bool:
 
 @njit(cache=True, error_model="numpy")
 def unexplained_force(law: np.void, memory: np.void, out_n: Array) -> None:
-    """Comb forces (3,) that would explain what was seen: B^-T (d + K_0 e), with ``pulls`` of the last ``act``; d is
-    the estimated disturbance, which takes its time, and K_0 e what holds the stage where it is instead of where it
-    was expected.
+    """Comb forces (3,) that would explain what was seen: B^-T (d + K_0 e), with ``pulls`` of the last
+    ``act``; d is the estimated disturbance, which takes its time, and K_0 e what holds the stage
+    where it is instead of where it was expected.
 
     A comb that does not give the force of its voltage shows up in its own entry alone.
     """

@@ -12,7 +12,7 @@ from numba import njit
 from numpy.typing import NDArray
 
 Array = NDArray[np.float64]
-Counts = NDArray[np.int32]
+CountVector = NDArray[np.int32]
 
 DRIVE = np.dtype(
     [
@@ -27,7 +27,7 @@ DRIVE = np.dtype(
 
 
 @njit(cache=True, error_model="numpy")
-def force_limits(drive: np.void, count_last: Counts, lower_n: Array, upper_n: Array) -> None:
+def force_limits(drive: np.void, count_last: CountVector, lower_n: Array, upper_n: Array) -> None:
     """Comb forces (3,) reachable in one tick from the last counts (3,): slew limit, no push, voltage limit."""
     slew, most, scale, gain = (
         drive["count_slew_max"],
@@ -43,8 +43,10 @@ def force_limits(drive: np.void, count_last: Counts, lower_n: Array, upper_n: Ar
 
 
 @njit(cache=True, error_model="numpy")
-def counts_for_forces(drive: np.void, force_n: Array, count_last: Counts, carry_v: Array, count: Counts) -> None:
-    """Counts (3,) for forces (3,) >= 0; ``carry_v`` (3,) holds the error from tick to tick, at most one count of it.
+def counts_for_forces(
+    drive: np.void, force_n: Array, count_last: CountVector, carry_v: Array, count: CountVector
+) -> None:
+    """The counts (3,) for forces >= 0; ``carry_v`` (3,) holds the error from tick to tick, at most one count of it.
 
     Whatever the forces are (NaN and infinity too), every count stays within 0..count_max and within the slew limit of
     the last one.
@@ -62,7 +64,7 @@ def counts_for_forces(drive: np.void, force_n: Array, count_last: Counts, carry_
 
 
 @njit(cache=True, error_model="numpy")
-def forces_of_counts(drive: np.void, count: Counts, force_n: Array) -> None:
+def forces_of_counts(drive: np.void, count: CountVector, force_n: Array) -> None:
     """Comb forces (3,) in N that counts (3,) give by the law."""
     gain = drive["force_gain_n_per_v2"]
     for i in range(3):

@@ -1,6 +1,4 @@
-"""Comb drives and sense combs: force, capacitance and the stroke at which a comb snaps sideways (paper, Eq. 33 and
-34).
-"""
+"""Drive and sense combs: force, capacitance and the stroke at which a comb snaps sideways (paper, Eq. 33 and 34)."""
 
 import math
 

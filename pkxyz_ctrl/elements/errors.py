@@ -8,9 +8,7 @@ class GeometryError(ValueError):
 
 
 class InfeasibleDesignError(ValueError):
-    """Requirements that no dimensions fulfil. The message names the binding constraint and by how much it is
-    missed.
-    """
+    """Requirements that no dimensions fulfil. The message names the binding constraint and by how much it is missed."""
 
 
 def require_positive(**quantities: float) -> None:

@@ -7,9 +7,7 @@ from pkxyz_ctrl.elements.errors import require_positive
 
 
 def folded_spring_stiffness(flexures: FlexureConfig) -> float:
-    """K_1 in N/m: one folded leaf spring along the motion (Eq. 26), two clamped leaves in series. Four act on a
-    slider.
-    """
+    """K_1 in N/m: one folded leaf spring along the motion (Eq. 26), two clamped leaves in series; four to a slider."""
     f = flexures
     return (
         4 * f.youngs_modulus_pa * f.leaf_height_m * f.leaf_thickness_m**3

@@ -14,10 +14,10 @@ class LearningError(ConfigError):
 class LearningConfig(FrozenModel):
     """The section [learning] of a scenario."""
 
-    mode: Literal["learn", "replay", "refresh"] = "learn"
-    """learn: from nothing; replay: a stored correction as it is; refresh: a stored one, and go on learning"""
+    mode: Literal["learn", "apply", "refresh"] = "learn"
+    """learn: from nothing; apply: a stored correction as it is; refresh: a stored one, and go on learning"""
     file: Annotated[str, Field(min_length=1)] | None = None
-    """the stored correction of replay and refresh; a path, in a scenario from the scenario's folder"""
+    """the stored correction of apply and refresh; a path, in a scenario from the scenario's folder"""
     cutoff_hz: Annotated[float, Field(gt=0)] = 450.0
     """harmonics up to here are learnt: below the resonance, where a device answers as its model does"""
     gain: Annotated[float, Field(gt=0, le=1)] = 1.0
@@ -28,7 +28,7 @@ class LearningConfig(FrozenModel):
     @model_validator(mode="after")
     def _file_where_needed(self) -> Self:
         if self.mode == "learn" and self.file is not None:
-            raise ValueError("learn begins with nothing; with a file, mode is 'replay' or 'refresh'")
+            raise ValueError("learn begins with nothing; with a file, mode is 'apply' or 'refresh'")
         if self.mode != "learn" and self.file is None:
             raise ValueError(f"mode {self.mode!r} needs the file of a stored correction")
         return self

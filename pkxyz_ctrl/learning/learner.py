@@ -76,7 +76,7 @@ class Learner:
         self._known = update.beginning(start, config.gain)
         # (first tick of fading in, rows of a period), in order; older ones have faded out
         self._changes: list[tuple[int, Array]] = [(table.begin - FADE_TICKS, self._period(start))]
-        windows = 0 if config.mode == "replay" else table.windows
+        windows = 0 if config.mode == "apply" else table.windows
         self._last = windows if config.updates is None else min(windows, config.updates)
         self._window = 0
         self._seen = np.zeros((table.window, 3))
@@ -94,8 +94,8 @@ class Learner:
 
     @property
     def due(self) -> int:
-        """Tick of the trajectory by which all rows before it have to be seen; ``NEVER`` if there is nothing to learn
-        any more.
+        """Tick of the trajectory by which all rows before it have to be seen; ``NEVER``
+        if there is nothing to learn any more.
         """
         over = self._window >= self._last or self._lost or self._held
         return NEVER if over else self.table.window_end(self._window)

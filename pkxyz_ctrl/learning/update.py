@@ -25,8 +25,8 @@ DRIFT = 0.01
 """Of R: what may change from window to window by itself, such as combs that charge."""
 WORSE_SIGMA = 4.0
 WORSE_NOISE = 12.0
-"""A harmonic is worse than the best if its square, over the axes, has grown by more than so many sigma and by so many
-R."""
+"""A harmonic is worse than the best if its square, over the axes, has grown by
+more than so many sigma and by so many R."""
 
 
 @dataclass(frozen=True)

@@ -82,8 +82,8 @@ class Controller:
             self.send(frame, t_us)
 
     def dialogue(self, frame: Frame | None, t_us: int) -> bool:
-        """One step of the start-up: a frame that came, or None if none came for a while. True once the node is
-        operational.
+        """One step of the start-up: a frame that came, or None if none came for a
+        while. True once the node is operational.
 
         Raises ``StartUpError``, also for a frame that our own gate blocks: nobody would ever answer it.
         """
@@ -167,8 +167,8 @@ class Controller:
             self._enter(mode)
 
     def finish(self, t_us: int, heartbeat_until_us: int) -> None:
-        """Send the voltages of this tick, and our heartbeat behind them if it is due and still fits before the next
-        SYNC.
+        """Send the voltages of this tick, and our heartbeat behind them if it is due
+        and still fits before the next SYNC.
         """
         driver = self.driver
         self.send(driver.drive(self._drive_counts, t_us), t_us)

@@ -1,8 +1,8 @@
 """One period of the controller, compiled: events and modes, the tick, the monitors, the record.
 
-This is where core and safety meet: neither knows the other. ``cycle`` is called once a period, by the loop that waits
-for a clock and by the lane that does not; it reads ``memory["input"]`` and leaves counts, mode and record in
-``memory["row"]``.
+This is where core and safety meet: neither knows the other. ``cycle`` is called once a period, by the
+loop that waits for a clock and by the lane that does not; it reads ``memory["input"]`` and leaves
+counts, mode and record in ``memory["row"]``.
 """
 
 import math
@@ -11,7 +11,7 @@ import numpy as np
 from numba import njit
 from numpy.typing import NDArray
 
-from pkxyz_ctrl.core import pace, tick
+from pkxyz_ctrl.core import feed_hold, tick
 from pkxyz_ctrl.loop.row import ROW
 from pkxyz_ctrl.safety.modes import (
     LOOP_CLOSED,
@@ -47,7 +47,7 @@ LAW = np.dtype(
         ("limits", LIMITS),
         ("period_us", "i8"),
         ("homing_ticks", "i4"),
-        ("pace_ticks", "i4"),  # even: how long the path takes to stop, and to be taken up again
+        ("feed_hold_ticks", "i4"),  # even: how long the path takes to stop, and to be taken up again
         ("autostart", "i4"),  # 1: home, enable and track by itself, as a scenario wants it
     ],
     align=True,
@@ -66,9 +66,9 @@ MEMORY = np.dtype(
         ("now", "f8", (9,)),  # ... and where this tick's force begins and ends to act
         ("after", "f8", (9,)),
         ("later", "f8", (9,)),  # ... and a period after that
-        ("surprise_m", "f8", (3,)),  # innovation of a measurement that was not believed
+        ("rejected_innovation_m", "f8", (3,)),  # innovation of a measurement that was not believed
         ("phase", "f8"),  # where between reference_tick and the next row the path stands; 0 unless a hold was cut short
-        ("pace_phase", "f8"),  # where the change of the path speed began, from reference tick 0
+        ("feed_phase", "f8"),  # where the change of the path speed began, from reference tick 0
         ("tick_index", "i8"),
         ("reference_tick", "i8"),
         ("mode", "i4"),
@@ -77,8 +77,8 @@ MEMORY = np.dtype(
         ("homing_sum", "i8", (3,)),
         ("safe_cycles", "i4"),
         ("suspects", "i4"),  # combs whose stroke was not believed in this tick, one bit each
-        ("pace", "i4"),  # pace.SLOWING, STEADY, STARTING
-        ("pace_age", "i4"),
+        ("feed", "i4"),  # feed_hold.SLOWING, STEADY, STARTING
+        ("feed_age", "i4"),
         ("held", "i4"),  # 1: somebody asked to hold, and the automatic start leaves it at that
     ],
     align=True,
@@ -104,8 +104,8 @@ def new_memory(mode: Mode = Mode.BOOT) -> NDArray[np.void]:
 
 @njit(cache=True, error_model="numpy")
 def cycle(law_array: Records, memory_array: Records, reference: Records) -> None:
-    """One period. ``law_array`` (1,) of ``LAW``, ``memory_array`` (1,) of ``MEMORY``, ``reference`` (n,) of
-    ``REFERENCE``.
+    """One period. ``law_array`` (1,) of ``LAW``, ``memory_array`` (1,) of
+    ``MEMORY``, ``reference`` (n,) of ``REFERENCE``.
 
     The row of ``reference_tick`` is the set-point at this sample; the law looks up to four rows further. Ticks before
     the first and past the last row are taken as these. What is added to the measurement while tracking passes round
@@ -135,7 +135,7 @@ def observe(law_array: Records, memory_array: Records, reference: Records) -> No
     tick.estimate(law["tick"], memory["tick"], believed)
     if memory["suspects"] != 0:
         for i in range(3):
-            memory["tick"]["estimate"]["innovation_m"][i] = memory["surprise_m"][i]
+            memory["tick"]["estimate"]["innovation_m"][i] = memory["rejected_innovation_m"][i]
     delay = law["tick"]["delay_periods"]
     reference_row(law, memory, reference, 0, memory["here"])
     _asked_for(memory, reference)
@@ -158,8 +158,8 @@ def respond(law_array: Records, memory_array: Records) -> None:
     _write_row(law, memory, trips, saturated)
     usable = (seen["sense_status"] & _UNUSABLE) == 0
     memory["safe_cycles"] = next_safe_cycles(memory["safe_cycles"], memory["mode"], usable, tick.is_discharged(state))
-    if memory["pace"] != pace.STEADY:
-        _change_pace(law, memory)
+    if memory["feed"] != feed_hold.STEADY:
+        _scale_time(law, memory)
     elif memory["mode"] == _TRACKING:
         memory["reference_tick"] += 1
     memory["tick_index"] += 1
@@ -221,7 +221,7 @@ def _handle(law: np.void, memory: np.void, event: int) -> None:
         return
     memory["mode"] = target
     if LOOP_CLOSED[target] == 0:
-        memory["pace"] = pace.STEADY
+        memory["feed"] = feed_hold.STEADY
     if target == _HOMING:
         memory["homing_count"] = 0
         memory["homing_sum"][:] = 0
@@ -231,43 +231,43 @@ def _handle(law: np.void, memory: np.void, event: int) -> None:
         memory["setpoint"][:] = 0.0
         memory["reference_tick"] = 0
         memory["phase"] = 0.0
-        memory["pace"] = pace.STEADY
+        memory["feed"] = feed_hold.STEADY
         memory["held"] = 0
     elif target == _ENABLED and mode == _TRACKING:
         memory["held"] = 1
-        _turn_pace(law, memory, pace.SLOWING)
+        _turn_feed(law, memory, feed_hold.SLOWING)
     elif target == _TRACKING:
         if memory["held"] != 0:
-            _turn_pace(law, memory, pace.STARTING)
+            _turn_feed(law, memory, feed_hold.STARTING)
         memory["held"] = 0
 
 
 @njit(cache=True, error_model="numpy")
-def _turn_pace(law: np.void, memory: np.void, direction: int) -> None:
+def _turn_feed(law: np.void, memory: np.void, direction: int) -> None:
     """Begin to stop on the path, or to go on along it; in the middle of the other, from the speed that there is."""
     at = memory["reference_tick"] + memory["phase"]
     age = 0
-    if memory["pace"] == -direction:
-        gone, _, _ = pace.advance(memory["pace"], memory["pace_age"], law["pace_ticks"])
-        at = memory["pace_phase"] + gone
-        age = max(0, law["pace_ticks"] - memory["pace_age"])  # where the mirrored ramp has this speed
-    gone, _, _ = pace.advance(direction, age, law["pace_ticks"])
-    memory["pace"] = direction
-    memory["pace_age"] = age
-    memory["pace_phase"] = at - gone
+    if memory["feed"] == -direction:
+        covered, _, _ = feed_hold.advance(memory["feed"], memory["feed_age"], law["feed_hold_ticks"])
+        at = memory["feed_phase"] + covered
+        age = max(0, law["feed_hold_ticks"] - memory["feed_age"])  # where the mirrored ramp has this speed
+    covered, _, _ = feed_hold.advance(direction, age, law["feed_hold_ticks"])
+    memory["feed"] = direction
+    memory["feed_age"] = age
+    memory["feed_phase"] = at - covered
 
 
 @njit(cache=True, error_model="numpy")
-def _change_pace(law: np.void, memory: np.void) -> None:
+def _scale_time(law: np.void, memory: np.void) -> None:
     """A tick of slowing down or starting has passed; at its end the path stands, or goes on at its own speed."""
-    memory["pace_age"] += 1
-    gone, _, _ = pace.advance(memory["pace"], memory["pace_age"], law["pace_ticks"])
-    at = memory["pace_phase"] + gone
-    if memory["pace_age"] >= law["pace_ticks"]:
-        if memory["pace"] == pace.SLOWING:
+    memory["feed_age"] += 1
+    covered, _, _ = feed_hold.advance(memory["feed"], memory["feed_age"], law["feed_hold_ticks"])
+    at = memory["feed_phase"] + covered
+    if memory["feed_age"] >= law["feed_hold_ticks"]:
+        if memory["feed"] == feed_hold.SLOWING:
             for i in range(_ROW_LENGTH):
                 memory["setpoint"][i] = memory["now"][i]  # which is ahead of this tick, and so stands already
-        memory["pace"] = pace.STEADY
+        memory["feed"] = feed_hold.STEADY
     memory["reference_tick"] = np.int64(math.floor(at))
     memory["phase"] = at - math.floor(at)
 
@@ -281,7 +281,7 @@ def _suspects(law: np.void, memory: np.void) -> int:
     if combs != 0:
         origin, predicted = law["tick"]["estimator"]["operating_point_m"], memory["tick"]["estimate"]["predicted"]
         for i in range(3):
-            memory["surprise_m"][i] = memory["tick"]["measurement_m"][i] - origin[i] - predicted[i]
+            memory["rejected_innovation_m"][i] = memory["tick"]["measurement_m"][i] - origin[i] - predicted[i]
     return combs
 
 
@@ -317,13 +317,13 @@ def _excite(memory: np.void, reference: Records) -> None:
 def reference_row(law: np.void, memory: np.void, reference: Records, ahead: int, out: Array) -> None:
     """Write the row (9,) of the set-point ``ahead`` ticks from this one to ``out``."""
     base = reference[0]["tick"]
-    if memory["pace"] != pace.STEADY:
-        gone, speed, change = pace.advance(memory["pace"], memory["pace_age"] + ahead, law["pace_ticks"])
-        at = memory["pace_phase"] - base + gone
-        pace.sample(reference, at, speed, change, law["period_us"] * 1e-6, out)
+    if memory["feed"] != feed_hold.STEADY:
+        covered, speed, change = feed_hold.advance(memory["feed"], memory["feed_age"] + ahead, law["feed_hold_ticks"])
+        at = memory["feed_phase"] - base + covered
+        feed_hold.sample(reference, at, speed, change, law["period_us"] * 1e-6, out)
     elif memory["mode"] == _TRACKING and memory["phase"] != 0.0:
         at = memory["reference_tick"] - base + ahead + memory["phase"]
-        pace.sample(reference, at, 1.0, 0.0, law["period_us"] * 1e-6, out)
+        feed_hold.sample(reference, at, 1.0, 0.0, law["period_us"] * 1e-6, out)
     elif memory["mode"] == _TRACKING:
         index = memory["reference_tick"] - base + ahead
         motion = reference[min(max(index, 0), len(reference) - 1)]["motion"]
@@ -337,7 +337,7 @@ def reference_row(law: np.void, memory: np.void, reference: Records, ahead: int,
 @njit(cache=True, error_model="numpy")
 def _asked_for(memory: np.void, reference: Records) -> None:
     """Note the position asked for at this sample, for the record; while the path stops or starts, with its shift."""
-    on_time = memory["pace"] == pace.STEADY and memory["phase"] == 0.0
+    on_time = memory["feed"] == feed_hold.STEADY and memory["phase"] == 0.0
     from_row = memory["mode"] == _TRACKING and on_time
     index = min(max(memory["reference_tick"] - reference[0]["tick"], 0), len(reference) - 1)
     for i in range(3):

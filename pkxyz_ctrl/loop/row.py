@@ -1,8 +1,7 @@
 """The record of one tick: what the controller saw, thought and did, with room for the truth beside it.
 
-One row a tick, in blocks of a structured array. The names carry the units; ``columns`` spreads a field of three over
-x, y, z or over combs 1, 2, 3: ``reference_m`` becomes ``reference_x_m`` ..., ``voltage_v`` becomes ``voltage_1_v``
-...
+One row a tick, in blocks of a structured array. The names carry the units; ``columns`` spreads a field of three over x,
+y, z or over combs 1, 2, 3: ``reference_m`` becomes ``reference_x_m`` ..., ``voltage_v`` becomes ``voltage_1_v`` ...
 """
 
 import numpy as np
@@ -54,8 +53,8 @@ _UNIT_SUFFIXES = ("_m_per_s", "_count", "_m", "_n", "_v", "_f")
 
 
 def columns(field: str) -> tuple[str, ...]:
-    """Names of the scalar columns of one field of ``ROW``: the field itself, or three names with the axis before the
-    unit.
+    """Names of the scalar columns of one field of ``ROW``: the field itself, or
+    three names with the axis before the unit.
     """
     if ROW[field].shape != (3,):
         return (field,)

@@ -62,8 +62,8 @@ def start(clock: Clock, port: Port, controller: Controller) -> None:
 def run(
     clock: Clock, port: Port, controller: Controller, reference: Reference, ticks: int, record: Callable[[int], object]
 ) -> int:
-    """Run ``ticks`` periods from the next instant of ``clock``; returns how many were missed: skipped, or late on the
-    wire.
+    """Run ``ticks`` periods from the next instant of ``clock``; returns how many were
+    missed: skipped, or late on the wire.
 
     Deadlines are absolute: a tick that begins late shifts no other, and ticks that are past are skipped whole. Other
     frames than the one that is waited for do not put the deadline off, however many there are.

@@ -81,8 +81,8 @@ def standing_cube_m(stage: Stage) -> float:
     """Side in m of the largest cube that stands on its corner with the mechanism's own symmetry;
     0 where none is found.
 
-    A hundred times faster than ``inscribed_cube``; at most 0.1 % above what fits, as it watches the lower limit on
-    a grid.
+    A hundred times faster than ``inscribed_cube``; at most 0.1 % above what fits, as
+    it watches the lower limit on a grid.
     """
     return _standing(stage)[0]
 

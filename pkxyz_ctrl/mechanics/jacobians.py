@@ -40,8 +40,8 @@ def nominal_jacobians(geometry: GeometryConfig) -> Jacobians:
 
 
 def joint_angles(stage: Stage, position_m: ArrayLike) -> tuple[Array, Array]:
-    """Crank angles theta (..., 3), counter-clockwise from e_i, and link elevation alpha (...), in rad, at positions
-    (..., 3).
+    """Crank angles theta (..., 3), counter-clockwise from e_i, and link elevation
+    alpha (...), in rad, at positions (..., 3).
     """
     _, s, z = _reach(stage, position_m)
     record = stage.geometry[0]
@@ -64,11 +64,10 @@ def exact_jacobians(stage: Stage, position_m: ArrayLike) -> Jacobians:
 
 
 def stroke_curvature_per_m(stage: Stage, position_m: ArrayLike) -> Array:
-    """d2q_i/dx2 (..., 3, 3, 3) in 1/m, first of the last three axes the chain; never negative: strokes are convex
-    in x.
+    """d2q_i/dx2 (..., 3, 3, 3) in 1/m, first of the last three axes the chain; never negative: strokes are convex in x.
 
-    In the plane n_i n_i^T / (L1 cos^3(theta_i)), along z L2^2 / delta^3. It is what the paper's constant Jacobian
-    leaves out.
+    In the plane n_i n_i^T / (L1 cos^3(theta_i)), along z L2^2 / delta^3. It is what
+    the paper's constant Jacobian leaves out.
     """
     return stage.stroke_curvature(position_m)
 

@@ -19,8 +19,8 @@ Array = NDArray[np.float64]
 
 @dataclass(frozen=True)
 class LinearisationStudy:
-    """Errors (n, 3) in m, estimate minus truth along x, y, z, at the positions (n, 3) of a regular grid of strokes
-    (n, 3).
+    """Errors (n, 3) in m, estimate minus truth along x, y, z, at the positions (n,
+    3) of a regular grid of strokes (n, 3).
     """
 
     strokes_m: Array
@@ -32,8 +32,8 @@ class LinearisationStudy:
     newton_m: Array
     """The estimate of ``at_rest_m`` followed by one Newton step."""
     relinearised_m: Array
-    """Jacobian at the set-point: the worst error along each axis over moves of up to ``move_m`` on each axis away
-    from it.
+    """Jacobian at the set-point: the worst error along each axis over moves of up to
+    ``move_m`` on each axis away from it.
     """
     move_m: float
 

@@ -66,8 +66,8 @@ def reproduction_table(entries: list[Entry], printed: Stage, reconstructed: Stag
 
 
 def verdict(published_text: str, values: list[float], corrected: tuple[float, float] | None = None) -> Verdict:
-    """The verdict on a number as printed against what the designs give, and against the corrected reading if there
-    is one.
+    """The verdict on a number as printed against what the designs give, and against
+    the corrected reading if there is one.
     """
     published = float(published_text)
     unit = 10.0 ** int(Decimal(published_text).as_tuple().exponent)

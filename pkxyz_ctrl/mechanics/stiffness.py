@@ -20,8 +20,8 @@ Array = NDArray[np.float64]
 
 
 def spring_energy_j(spring_n_per_m: float, strokes_m: ArrayLike) -> Array:
-    """Eq. 15 and 16: 2 K_1 sum(q_i^2) (...) in J, four folded springs of stiffness K_1 on each slider; strokes
-    (..., 3).
+    """Eq. 15 and 16: 2 K_1 sum(q_i^2) (...) in J, four folded springs of stiffness
+    K_1 on each slider; strokes (..., 3).
     """
     strokes = np.asarray(strokes_m, dtype=np.float64)
     return np.asarray(2 * spring_n_per_m * (strokes**2).sum(axis=-1))

@@ -1,10 +1,10 @@
 """What the platform reaches: the image of the box of strokes,
 and the part of it that voltages below a limit can hold.
 
-Volumes are integrals of det(dx/dq) over strokes (dx/dq is the inverse of ``Stage.jacobian``), taken along rays
-from the stroke nearest to rest: the box is cut into one pyramid for each face, and on every ray the held part is a
-set of intervals whose ends are found by bisection. Both volumes come at two resolutions; their difference is the
-error estimate.
+Volumes are integrals of det(dx/dq) over strokes (dx/dq is the inverse of ``Stage.jacobian``), taken
+along rays from the stroke nearest to rest: the box is cut into one pyramid for each face, and on every
+ray the held part is a set of intervals whose ends are found by bisection. Both volumes come at two
+resolutions; their difference is the error estimate.
 """
 
 from dataclasses import dataclass
@@ -87,8 +87,8 @@ def geometric_volume(stage: Stage, nodes: int = 6) -> Volume:
 
 
 def voltage_needed_v(stage: Stage, strokes_m: ArrayLike) -> Array:
-    """Highest of the three comb voltages (...) in V that hold strokes (..., 3), without limit; NaN where a comb
-    must push.
+    """Highest of the three comb voltages (...) in V that hold strokes (..., 3),
+    without limit; NaN where a comb must push.
     """
     force = stage.holding_forces(stage.forward_kinematics(strokes_m))
     pull = np.where(abs(force) < _PUSH_N, 0.0, force)
@@ -96,8 +96,8 @@ def voltage_needed_v(stage: Stage, strokes_m: ArrayLike) -> Array:
 
 
 def held_volume(stage: Stage, voltage_max_v: float, cells: int = 32) -> Volume:
-    """Volume that voltages up to ``voltage_max_v`` hold (all three combs within 0..limit), by rays, ``cells``^2 to
-    a pyramid.
+    """Volume that voltages up to ``voltage_max_v`` hold (all three combs within
+    0..limit), by rays, ``cells``^2 to a pyramid.
 
     Cells are doubled until the error estimate is below 1e-3; with strokes from 0 the first count gives 1e-6, but
     where strokes below rest are allowed, the limit of no push runs along the rays. An interval of a ray shorter

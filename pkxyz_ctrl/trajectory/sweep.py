@@ -19,8 +19,8 @@ _LEAD_MAX_DECADES = 6
 class Sweep(FrozenModel):
     """A sine whose frequency runs from ``from_hz`` to ``to_hz``, up or down, at one amplitude.
 
-    In lead-in and lead-out the frequency runs on by the same law, so that nothing bends where the full amplitude
-    begins.
+    In lead-in and lead-out the frequency runs on by the same law, so that nothing
+    bends where the full amplitude begins.
     """
 
     kind: Literal["sweep"]

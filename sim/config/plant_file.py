@@ -1,7 +1,7 @@
 """A plant file: every effect with its own switch and size. SI units.
 
-With ``on = false`` an effect's sizes change nothing. Random effects have ``seed_offset``, which moves that stream
-alone."""
+With ``on = false`` an effect's sizes change nothing. Random effects have
+``seed_offset``, which moves that stream alone."""
 
 import tomllib
 from pathlib import Path
@@ -98,8 +98,8 @@ class Brownian(Model):
 
 
 class Stops(Model):
-    """Mechanical stops, ``clearance_m`` beyond both ends of the stroke range. Force k d (1 + damping d'), never
-    pulling."""
+    """Mechanical stops, ``clearance_m`` beyond both ends of the stroke range. Force
+    k d (1 + damping d'), never pulling."""
 
     on: bool = True
     clearance_m: NotNegative = 2e-6
@@ -173,8 +173,8 @@ class AmplifierOffset(Model):
 
 
 class Dac(Model):
-    """A converter coarser than the counts on the wire. Off: as fine as the counts, which are themselves a
-    quantisation."""
+    """A converter coarser than the counts on the wire. Off: as fine as the counts,
+    which are themselves a quantisation."""
 
     on: bool = False
     step_counts: Annotated[int, Field(ge=1, le=4096)] = 1

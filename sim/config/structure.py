@@ -26,8 +26,8 @@ class FlexibleMode(Model):
 
 
 class FlexibleModes(Model):
-    """Modes in both directions: combs, weight and shaking of the base drive them, and they push table and mechanism
-    back."""
+    """Modes in both directions: combs, weight and shaking of the base drive them,
+    and they push table and mechanism back."""
 
     on: bool = False
     modes: Annotated[tuple[FlexibleMode, ...], Field(max_length=MODES_MAX)] = ()

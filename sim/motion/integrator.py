@@ -24,8 +24,8 @@ from sim.motion.mechanics import comb_acceleration, undamped_acceleration
 from sim.motion.nystrom import B_RATE, STAGES, A, B, C
 
 LONGEST_S = 205e-6
-"""Longest step: a sixth of the fastest rigid mode's period, at which the order-8 method is exact to 1e-14 m in a
-scan."""
+"""Longest step: a sixth of the fastest rigid mode's period, at which the order-8 method
+is exact to 1e-14 m in a scan."""
 CONTACT_S = 2.5e-6
 """Step while a stop or a snapped comb touches."""
 LAST = STAGES - 1
@@ -34,8 +34,8 @@ LAST = STAGES - 1
 
 @njit(cache=True, error_model="numpy")
 def tabulate(p: np.void, s: np.void, h: float) -> None:
-    """E, exp(-D t / 2) and exp(D t / 2) at the stages of a step of h s, the last of which lies at its end. Kept until
-    h changes."""
+    """E, exp(-D t / 2) and exp(D t / 2) at the stages of a step of h s, the last of
+    which lies at its end. Kept until h changes."""
     if s["tabulated_h_s"] == h:
         return
     s["tabulated_h_s"] = h
@@ -102,14 +102,14 @@ def _transient(p: np.void, s: np.void) -> None:
 
 
 @njit(cache=True, error_model="numpy")
-def _weighted(given: np.ndarray, weights: np.ndarray, n: int) -> tuple[float, float, float]:
-    """Sum of the first n rows of ``given`` (8, 3), each times its weight."""
+def _weighted(slopes: np.ndarray, weights: np.ndarray, n: int) -> tuple[float, float, float]:
+    """Sum of the first n rows of ``slopes`` (8, 3), each times its weight."""
     x, y, z = 0.0, 0.0, 0.0
     for r in range(n):
         w = weights[r]
-        x += w * given[r, 0]
-        y += w * given[r, 1]
-        z += w * given[r, 2]
+        x += w * slopes[r, 0]
+        y += w * slopes[r, 1]
+        z += w * slopes[r, 2]
     return x, y, z
 
 
@@ -118,7 +118,7 @@ def _step(p: np.void, s: np.void, h: float) -> None:
     """Integrate motion and voltages over h s, without a look at stops."""
     tabulate(p, s, h)
     _transient(p, s)
-    motion, given, volt2, decay = s["motion"], s["given"], s["volt2"], s["decay"]
+    motion, slopes, volt2, decay = s["motion"], s["slopes"], s["volt2"], s["decay"]
     k, h2 = 1.0 / p["amplifier_s"] if p["amplifier_s"] > 0.0 else 0.0, h * h
     x1, y1, z1 = s["fast_1_m"][0], s["fast_1_m"][1], s["fast_1_m"][2]
     x2, y2, z2 = s["fast_2_m"][0], s["fast_2_m"][1], s["fast_2_m"][2]
@@ -128,7 +128,7 @@ def _step(p: np.void, s: np.void, h: float) -> None:
     for i in range(STAGES):
         t, e1 = C[i] * h, decay[i]
         e2 = e1 * e1
-        gx, gy, gz = _weighted(given, A[i], i)
+        gx, gy, gz = _weighted(slopes, A[i], i)
         ux, uy, uz = t * vx + h2 * gx, t * vy + h2 * gy, t * vz + h2 * gz
         px, py, pz = times(s["shrink"][i], ux, uy, uz)
         for c in range(3):
@@ -144,10 +144,10 @@ def _step(p: np.void, s: np.void, h: float) -> None:
         ax, ay, az = ax + one[0] * e1 + two[0] * e2, ay + one[1] * e1 + two[1] * e2, az + one[2] * e1 + two[2] * e2
         ax, ay, az = times(s["swell"][i], ax, ay, az)
         gx, gy, gz = times(p["damping2_per_s2"], ux, uy, uz)
-        given[i, 0], given[i, 1], given[i, 2] = ax + gx, ay + gy, az + gz
-    gx, gy, gz = _weighted(given, B, STAGES)
+        slopes[i, 0], slopes[i, 1], slopes[i, 2] = ax + gx, ay + gy, az + gz
+    gx, gy, gz = _weighted(slopes, B, STAGES)
     ux, uy, uz = h * vx + h2 * gx, h * vy + h2 * gy, h * vz + h2 * gz
-    gx, gy, gz = _weighted(given, B_RATE, STAGES)
+    gx, gy, gz = _weighted(slopes, B_RATE, STAGES)
     dx, dy, dz = times(p["damping_per_s"], ux, uy, uz)
     px, py, pz = times(s["shrink"][LAST], ux, uy, uz)
     vx, vy, vz = times(s["shrink"][LAST], vx + h * gx - 0.5 * dx, vy + h * gy - 0.5 * dy, vz + h * gz - 0.5 * dz)
@@ -162,8 +162,8 @@ def _step(p: np.void, s: np.void, h: float) -> None:
 
 @njit(cache=True, error_model="numpy")
 def step(p: np.void, s: np.void, h: float) -> None:
-    """Integrate motion and voltages over h s, at most LONGEST_S. If any stage met a stop, the step is done again in
-    short ones."""
+    """Integrate motion and voltages over h s, at most LONGEST_S. If any stage met a
+    stop, the step is done again in short ones."""
     start = s["start"]
     for j in range(6):
         start[j] = s["motion"][j]

@@ -5,8 +5,8 @@
     m x'' = -grad V + J^T F + F_levitation + F_stops + F_external - m D x'
         with F_i = k_i (1 + phi q_i) (V_i - V_charge,i)^2
 
-The record keeps leaf = 4 K1, crank_hinge = 4 K2 and link_hinge = 4 c K3, so each energy is half of that times the
-square."""
+The record keeps leaf = 4 K1, crank_hinge = 4 K2 and link_hinge = 4 c K3, so each
+energy is half of that times the square."""
 
 import math
 

@@ -1,7 +1,7 @@
 """Random numbers inside compiled code: one small generator per source, its whole memory in the plant's state.
 
-SFC64 (Doty-Humphrey, PractRand), the same stream as ``numpy.random.SFC64``, and normal deviates by Marsaglia's polar
-method."""
+SFC64 (Doty-Humphrey, PractRand), the same stream as ``numpy.random.SFC64``, and
+normal deviates by Marsaglia's polar method."""
 
 import math
 
@@ -49,8 +49,8 @@ def _uniform(words: np.ndarray) -> float:
 
 @njit(cache=True, error_model="numpy")
 def normal(words: np.ndarray, spare: np.ndarray) -> float:
-    """Standard normal deviate. Each accepted pair yields two: the second waits in ``spare`` (2,): [is there one, its
-    value]."""
+    """Standard normal deviate. Each accepted pair yields two: the second waits in
+    ``spare`` (2,): [is there one, its value]."""
     if spare[0] != 0.0:
         spare[0] = 0.0
         return float(spare[1])

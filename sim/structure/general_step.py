@@ -24,11 +24,11 @@ from sim.motion.nystrom import B_RATE, STAGES, A, B, C
 
 
 @njit(cache=True, error_model="numpy")
-def cubic(given: np.ndarray, j: int, t: float) -> float:
+def cubic(coefficients: np.ndarray, j: int, t: float) -> float:
     """Value at t s of column j of coefficients (4, 3)."""
     value = 0.0
     for n in range(CUBIC - 1, -1, -1):
-        value = value * t + given[n, j]
+        value = value * t + coefficients[n, j]
     return value
 
 
@@ -44,8 +44,8 @@ def _comb_forces(p: np.void, volt2: np.ndarray, x: float, y: float, z: float, ou
 
 @njit(cache=True, error_model="numpy")
 def _generalise(p: np.void, forces_n: np.ndarray, ax: float, ay: float, az: float, modes: int, out: np.ndarray) -> None:
-    """Accelerations (3 + modes,) from the mechanism's, P / m, and from the comb forces, without the modes' own
-    springs."""
+    """Accelerations (3 + modes,) from the mechanism's, P / m, and from the comb forces,
+    without the modes' own springs."""
     out[0], out[1], out[2] = ax, ay, az
     mass = p["mass_kg"]
     for k in range(modes):
@@ -89,11 +89,11 @@ def _tabulate_modes(p: np.void, s: np.void, h: float) -> None:
 
 
 @njit(cache=True, error_model="numpy")
-def _answer(response: np.ndarray, given: np.ndarray, n: int, out: np.ndarray) -> None:
+def _answer(response: np.ndarray, vector: np.ndarray, n: int, out: np.ndarray) -> None:
     for j in range(n):
         out[j] = 0.0
         for k in range(n):
-            out[j] += response[j, k] * given[k]
+            out[j] += response[j, k] * vector[k]
 
 
 @njit(cache=True, error_model="numpy")
@@ -125,11 +125,11 @@ def _transient(p: np.void, s: np.void, n: int) -> None:
 
 
 @njit(cache=True, error_model="numpy")
-def _shrunk(m: np.ndarray, modes: np.ndarray, given: np.ndarray, n: int, out: np.ndarray) -> None:
+def _shrunk(m: np.ndarray, modes: np.ndarray, vector: np.ndarray, n: int, out: np.ndarray) -> None:
     """A table's matrix (3, 3) and the modes' factors times a vector (n,)."""
-    out[0], out[1], out[2] = times(m, given[0], given[1], given[2])
+    out[0], out[1], out[2] = times(m, vector[0], vector[1], vector[2])
     for k in range(n - 3):
-        out[3 + k] = modes[k] * given[3 + k]
+        out[3 + k] = modes[k] * vector[3 + k]
 
 
 @njit(cache=True, error_model="numpy")
@@ -148,14 +148,14 @@ def _step(p: np.void, s: np.void, h: float) -> None:
     tabulate(p, s, h)
     _tabulate_modes(p, s, h)
     _transient(p, s, n)
-    z, v, at, rate, u, pull, given = (
+    z, v, at, rate, u, pull, slopes = (
         s["z"],
         s["rate"],
         s["z_at"],
         s["rate_at"],
         s["change"],
         s["pull"],
-        s["general_given"],
+        s["general_slopes"],
     )
     one, two, one_push, two_push = s["general_one"], s["general_two"], s["general_one_push"], s["general_two_push"]
     k, h2 = 1.0 / p["amplifier_s"] if p["amplifier_s"] > 0.0 else 0.0, h * h
@@ -171,7 +171,7 @@ def _step(p: np.void, s: np.void, h: float) -> None:
         for j in range(n):
             g = 0.0
             for r in range(i):
-                g += A[i, r] * given[r, j]
+                g += A[i, r] * slopes[r, j]
             u[j] = t * v[j] + h2 * g
             rate[j] = v[j] + mean * g - k * (one[j] * e1 + 2.0 * two[j] * e2)
         _shrunk(s["shrink"][i], s["mode_shrink"][i], u, n, at)
@@ -183,24 +183,24 @@ def _step(p: np.void, s: np.void, h: float) -> None:
             pull[j] += one_push[j] * e1 + two_push[j] * e2
         ax, ay, az = times(s["swell"][i], pull[0], pull[1], pull[2])
         gx, gy, gz = times(p["damping2_per_s2"], u[0], u[1], u[2])
-        given[i, 0], given[i, 1], given[i, 2] = ax + gx, ay + gy, az + gz
+        slopes[i, 0], slopes[i, 1], slopes[i, 2] = ax + gx, ay + gy, az + gz
         for m in range(n - 3):
             d = 0.5 * p["mode_damping_per_s"][m]
-            given[i, 3 + m] = pull[3 + m] / s["mode_shrink"][i, m] + d * d * u[3 + m]
+            slopes[i, 3 + m] = pull[3 + m] / s["mode_shrink"][i, m] + d * d * u[3 + m]
     _end(p, s, h, n)
 
 
 @njit(cache=True, error_model="numpy")
 def _end(p: np.void, s: np.void, h: float, n: int) -> None:
     """From the stages to motion, modes and voltages at the step's end."""
-    z, v, at, rate, u, given = s["z"], s["rate"], s["z_at"], s["rate_at"], s["change"], s["general_given"]
+    z, v, at, rate, u, slopes = s["z"], s["rate"], s["z_at"], s["rate_at"], s["change"], s["general_slopes"]
     one, two = s["general_one"], s["general_two"]
     k = 1.0 / p["amplifier_s"] if p["amplifier_s"] > 0.0 else 0.0
     for j in range(n):
         g, gr = 0.0, 0.0
         for r in range(STAGES):
-            g += B[r] * given[r, j]
-            gr += B_RATE[r] * given[r, j]
+            g += B[r] * slopes[r, j]
+            gr += B_RATE[r] * slopes[r, j]
         u[j] = h * v[j] + h * h * g
         rate[j] = v[j] + h * gr
     dx, dy, dz = times(p["damping_per_s"], u[0], u[1], u[2])

@@ -1,5 +1,5 @@
-"""Temperature and age: what springs, drive combs and sense combs are now, written into the record of parameters once a
-call."""
+"""Temperature and age: what springs, drive combs and sense combs are now, written
+into the record of parameters once a call."""
 
 import math
 

@@ -89,7 +89,7 @@ def test_margins_are_those_of_the_command() -> None:
     assert law.record["period_us"][0] == 200
 
 
-def test_drawn_plants_go_on_and_run_alone_to_the_bit(tmp_path: Path) -> None:
+def test_sampled_plants_go_on_and_run_alone_to_the_bit(tmp_path: Path) -> None:
     scenario = hil.build_scenario(BRIEF)
     first = hil.montecarlo(scenario, plants=2, workers=1, out=tmp_path)
     again = hil.montecarlo(scenario, plants=3, workers=1, out=tmp_path)

@@ -1,5 +1,5 @@
-"""``pkxyz paper``, ``workspace``, ``design``, ``linearisation``: what they print, write and refuse, with hil.cli's
-own ``main``.
+"""``pkxyz paper``, ``workspace``, ``design``, ``linearisation``: what they print, write
+and refuse, with hil.cli's own ``main``.
 """
 
 import json

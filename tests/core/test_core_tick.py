@@ -57,14 +57,14 @@ def test_where_the_jacobian_is_singular_nothing_moves():
 @given(
     STROKES, st.tuples(*[st.floats(-200e-9, 200e-9)] * 3).map(np.array), st.tuples(*[st.floats(-50e-15, 50e-15)] * 3)
 )
-def test_counts_become_the_position_that_they_mean(strokes_m, surprise_m, zero_f):
+def test_counts_become_the_position_that_they_mean(strokes_m, innovation_m, zero_f):
     """From a prediction 0.2 um off and with sense offsets that homing found: to 0.2 nm, the Newton step's remainder,
     of the exact kinematics at the strokes that the counts stand for."""
     law, memory, analog = tick_law(), new_tick_memory(), bus().analog
     memory["sense_zero_f"][:] = zero_f
     raw_f = stage().sense_capacitance(strokes_m) + zero_f
     count = np.round((raw_f - analog.sense_offset_f) / analog.sense_farad_per_count).astype(np.int32)
-    memory["estimate"]["predicted"][:3] = exact(strokes_m) + surprise_m - law["estimator"]["operating_point_m"]
+    memory["estimate"]["predicted"][:3] = exact(strokes_m) + innovation_m - law["estimator"]["operating_point_m"]
     tick.measure(law, memory, count)
     meant_f = analog.sense_offset_f + count * analog.sense_farad_per_count - zero_f
     meant_m = stage().strokes_from_capacitance(meant_f)

@@ -64,10 +64,10 @@ def measured(static, acceleration, relative=1e-6) -> ModalFit:
     scale = relative * np.repeat([np.abs(static).max(), np.abs(acceleration).max()], 9)
     spread = np.full(3, 1e-4)
     return ModalFit(
-        frequency_hz=np.full(3, 600.0), frequency_deviation_hz=spread, damping=np.full(3, 0.025),
-        damping_deviation=spread, static_gain=static, static_gain_deviation=scale[:9].reshape(3, 3),
-        acceleration_gain=acceleration, acceleration_gain_deviation=scale[9:].reshape(3, 3),
-        gains_covariance=np.diag(scale**2), lag_s=5.3e-6, lag_deviation_s=1e-7, chi_square=1.0,
+        frequency_hz=np.full(3, 600.0), frequency_standard_error_hz=spread, damping=np.full(3, 0.025),
+        damping_standard_error=spread, static_gain=static, static_gain_standard_error=scale[:9].reshape(3, 3),
+        acceleration_gain=acceleration, acceleration_gain_standard_error=scale[9:].reshape(3, 3),
+        gains_covariance=np.diag(scale**2), lag_s=5.3e-6, lag_standard_error_s=1e-7, chi_square=1.0,
         used_hz=(5.0, 1500.0), _coefficients=np.zeros(0), _period_s=200e-6, _delay_periods=1,
     )  # fmt: skip
 
@@ -308,11 +308,11 @@ def test_the_harsh_plant_follows_six_times_better_save_an_offset(file):
 def test_a_second_run_from_the_file_finds_what_it_says(file):
     """Gains of 1 relative to the file, and the same numbers, within their standard errors; another seed's noise."""
     again = identified(file, seed=2)
-    product, deviation = again.chain_gain
+    product, error = again.chain_gain
     numbers, errors = first().calibrated.calibration, first().calibrated.calibration.standard_error
     here, here_errors = again.calibrated.calibration, again.calibrated.calibration.standard_error
     assert product == pytest.approx(np.ones(3), abs=0.005)
-    assert (np.abs(product - 1.0) < 4.5 * np.hypot(deviation, np.array(errors.comb_gain))).all()
+    assert (np.abs(product - 1.0) < 4.5 * np.hypot(error, np.array(errors.comb_gain))).all()
     for name in ("comb_gain", "lift", "slider_stiffness", "crank_stiffness", "link_stiffness", "sense_delay_s"):
         apart = np.array(getattr(here, name)) - np.array(getattr(numbers, name))
         spread = np.hypot(np.array(getattr(here_errors, name)), np.array(getattr(errors, name)))

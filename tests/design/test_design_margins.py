@@ -223,7 +223,7 @@ def test_mimo_figures_are_those_of_a_dense_sweep():
 @given(st.integers(0, 2**32 - 1))
 def test_the_sensitivity_of_many_frequencies_is_the_inverse_of_one_and_the_loop(seed):
     """By the Schur form against (I + L)^-1 from two linear systems; and its poles against the eigenvalues."""
-    tolerances = load("tolerances", "wide", Tolerances).draw(seed)
+    tolerances = load("tolerances", "wide", Tolerances).sample(seed)
     p = plant(strokes_m=tolerances.strokes_m, perturbation=tolerances.perturbation)
     k = lqg_equivalent(stage(), law(), tolerances.strokes_m, tolerances.perturbation)
     f = frequency_grid_hz(p, k, 100)[:-1]

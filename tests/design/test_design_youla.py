@@ -1,4 +1,4 @@
-"""The law youla against all its goals, over changed and drawn devices, and the cone programmes that found its taps."""
+"""The law youla against all its goals, on changed and sampled devices, and the cone programmes that found its taps."""
 
 import numpy as np
 import pytest
@@ -52,11 +52,11 @@ def test_the_law_reaches_all_that_is_asked_at_once():
 
 
 def test_the_law_bears_devices_with_everything_changed_at_once():
-    """Delay, poles and parasitic modes among it: 100 drawn ones, of the 500 that the bench looks at."""
+    """Delay, poles and parasitic modes among it: 100 sampled ones, of the 500 that the bench looks at."""
     loop, tolerances = shipped(), load("tolerances", "wide", Tolerances)
-    drawn = [loop.peak_sensitivity(tolerances.draw(seed)) for seed in range(1, 101)]
-    assert 2.2 < np.percentile(drawn, 95) <= 3.0
-    assert max(drawn) <= 4.0
+    sampled = [loop.peak_sensitivity(tolerances.sample(seed)) for seed in range(1, 101)]
+    assert 2.2 < np.percentile(sampled, 95) <= 3.0
+    assert max(sampled) <= 4.0
     ends = [loop.peak_sensitivity(case) for case in tolerances.combined(3)]
     assert 2.5 < max(ends) <= 4.0
 
@@ -69,7 +69,7 @@ def test_a_quiet_hold_is_quieter_and_as_stable_on_its_way(scale):
     faded = Youla(filter=(config.youla.filter[0].model_copy(update=fade),))
     loop = loop_of(config.model_copy(update={"youla": faded}))
     tolerances = load("tolerances", "wide", Tolerances)
-    assert max(loop.peak_sensitivity(case) for case in tolerances.combined(3)) <= 4.0  # as drawn devices may have
+    assert max(loop.peak_sensitivity(case) for case in tolerances.combined(3)) <= 4.0  # as sampled devices may have
     plant, about = loop_plant(stage(), bus(), MIDDLE), law_about(stage(), loop.law, MIDDLE)
     noise_nm = 1e9 * hold_noise_m(stage(), bus(), plant, about).max()
     if scale == 0.0:

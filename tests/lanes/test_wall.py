@@ -127,8 +127,8 @@ def controller(folder, *words):
 
 
 def is_driving(observer, run):
-    """Whether within a minute, and before the node complains, the observer on the bus sees voltages for some ticks of a
-    controller's process.
+    """Whether within a minute, and before the node complains, the observer on the bus sees
+    voltages for some ticks of a controller's process.
     """
     end_s, driven = time.monotonic() + 60, 0
     while driven < 200 and run.poll() is None and time.monotonic() < end_s:
@@ -197,9 +197,9 @@ def test_trajectories_agree_with_lockstep_within_the_noise(bench, changes):
     """Ticks 30 periods after any that was missed are compared: the stage's swing has died away by then. A machine that
     stands still may leave too few of them, or end in a fault, and then it runs again.
 
-    Same plant, same seed. The samples' noise is drawn in order, so it is the same only until the first missed tick:
-    two independent draws differ by sqrt(2) times the noise of one, and a millisecond's jitter of 5 us at 20 um/s is
-    0.1 nm.
+    Same plant, same seed. The samples' noise is generated in order, so it is the same only until the first missed tick:
+    two independent draws differ by sqrt(2) times the noise of one, and a millisecond's
+    jitter of 5 us at 20 um/s is 0.1 nm.
     """
     changes("pre-operational", False)
     blocks = []

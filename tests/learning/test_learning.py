@@ -249,7 +249,7 @@ def test_frames_of_an_odd_number_of_lines_are_refused():
 @pytest.mark.parametrize(
     ("section", "words"),
     [
-        ({"mode": "replay"}, "needs the file"),
+        ({"mode": "apply"}, "needs the file"),
         ({"mode": "refresh"}, "needs the file"),
         ({"mode": "learn", "file": "a.json"}, "learn begins with nothing"),
         ({"gain": 1.5}, "gain: .*1"),

@@ -358,7 +358,7 @@ def test_hold_stops_on_the_path_and_track_goes_on_along_it():
     """The path is never left, its speed falls from 1 to 0 and rises again, nothing jumps, and a hold costs half its
     length on either side."""
     c = tracking(swing(range(300)))
-    ramp_ticks = int(c.law["pace_ticks"][0])
+    ramp_ticks = int(c.law["feed_hold_ticks"][0])
     assert ramp_ticks == 20
     asked(c, 30)
     slowing = asked(c, ramp_ticks, Event.HOLD)

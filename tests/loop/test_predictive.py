@@ -175,8 +175,8 @@ def test_both_lanes_have_the_same_bits_while_it_solves():
 
 
 def test_a_full_range_move_that_saturates():
-    """Voltage, slew and strokes keep their limits, and it is in place no later than the clipped regulator, upward
-    and downward."""
+    """Voltage, slew and strokes keep their limits, and it is in place no later than the
+    clipped regulator, upward and downward."""
     planned, result = jumped("mpc")
     clipped, _ = jumped("lqg")
     assert clipped["saturated"].sum() > 5  # what it is about
@@ -248,8 +248,8 @@ def test_solutions_are_osqps_to_many_digits():
 
 
 def test_without_a_solution_the_regulator_stands_in_and_it_is_counted():
-    """One iteration is never enough: the clipped regulator answers until the monitor has seen five such ticks in a
-    row."""
+    """One iteration is never enough: the clipped regulator answers until the monitor
+    has seen five such ticks in a row."""
     config = mpc().model_copy(update={"mpc": mpc().mpc.model_copy(update={"iterations_max": 1})})
     failing, result = rows_of(far_jump(config), "fast")
     bad = np.flatnonzero(failing["solver_iterations"] < 0)

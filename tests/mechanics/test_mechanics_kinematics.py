@@ -1,6 +1,4 @@
-"""The paper's kinematics: the sextic against Newton and against Eq. 5, the three Jacobians against finite
-differences.
-"""
+"""The paper's kinematics: the sextic against Newton and against Eq. 5, three Jacobians against finite differences."""
 
 import math
 

@@ -45,9 +45,7 @@ def test_folded_spring_is_two_pairs_of_beams_in_series() -> None:
 
 
 def test_beam_against_euler_bernoulli() -> None:
-    """A clamped-guided beam has 12 E I / l^3 with I = h t^3 / 12, that is E h t^3 / l^3: Eq. 25 counts two of
-    them.
-    """
+    """A clamped-guided beam has 12 E I / l^3 with I = h t^3 / 12, that is E h t^3 / l^3: Eq. 25 counts two of them."""
     E, h, t, length = 150e9, 90e-6, 8e-6, 1.5e-3
     inertia = h * t**3 / 12
     along, across = flexures.clamped_beam_stiffness(E, h, t, length)

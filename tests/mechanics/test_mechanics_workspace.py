@@ -1,6 +1,4 @@
-"""Workspace, what of it can be held, the cubes inside it, and the cost of linear kinematics: Monte Carlo is the
-oracle.
-"""
+"""Workspace, what of it can be held, the cubes inside it, the cost of linear kinematics: Monte Carlo is the oracle."""
 
 import itertools
 
@@ -20,9 +18,7 @@ SPAN_M = 25e-6
 
 
 def by_throwing(stage: Stage, count: int, force_max_n: np.ndarray | float) -> tuple[float, float]:
-    """Volume in position space by throwing points into a box around the workspace: no Jacobian, no forward
-    kinematics.
-    """
+    """Volume in position space by throwing points into a box around it: no Jacobian, no forward kinematics."""
     limits = stage.config.limits
     low, high = np.array([-20e-6, -22e-6, -9e-6]), np.array([20e-6, 22e-6, 39e-6])
     points = seeded_points(count, low, high, seed=7)

@@ -109,11 +109,11 @@ def preload(files: Iterable[str]) -> None:
 def run_mutants(
     subject: Subject, waiting: Sequence[Mutant], end_s: float, workers: int, unmeasured: bool = False
 ) -> Iterator[tuple[Mutant, str]]:
-    """Each mutant with its outcome, as they finish; but for the first few, none begins after ``end_s`` of the
-    monotonic clock.
+    """Each mutant with its outcome, as they finish; but for the first few, none begins
+    after ``end_s`` of the monotonic clock.
 
-    ``unmeasured``: a few mutants only; all tests meet them, in their own order, and nothing is run beforehand. Raises
-    BaselineError.
+    ``unmeasured``: a few mutants only; all tests meet them, in their own order, and nothing
+    is run beforehand. Raises BaselineError.
     """
     baseline = Baseline()
     if not unmeasured:

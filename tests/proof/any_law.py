@@ -14,11 +14,11 @@ from loop_rig import counts_at
 from loop_rig import law as shipped_law
 from numpy.typing import NDArray
 
+from pkxyz_ctrl.can.codec import Counts
 from pkxyz_ctrl.core import kinematics
 from pkxyz_ctrl.core.tick import OPEN_LOOP
 from pkxyz_ctrl.loop.reference import reference_rows
 
-Counts = tuple[int, int, int]
 FRAME_LIMITS = {"stale_count": 2, "sequence_count": 3, "crc_count": 2, "length_count": 2, "frame_leak_ticks": 1}
 NODE_LIMITS = {"overrun_count": 2, "overrun_leak_ticks": 1, "safe_cycles": 2, "range_count": 2}
 OFF = ("frozen", "innovation", "residual", "unexplained_force", "saturation", "slew", "solver")
@@ -38,7 +38,7 @@ def any_law(period_us: int, homing_ticks: int) -> NDArray[np.void]:
     tick["drive"]["count_max"] = tick["drive"]["count_slew_max"] = 32767
     tick["drive"]["noise_shaping"] = 0
     tick["kind"], tick["delay_periods"] = OPEN_LOOP, 1
-    record["period_us"], record["homing_ticks"], record["pace_ticks"] = period_us, homing_ticks, 2
+    record["period_us"], record["homing_ticks"], record["feed_hold_ticks"] = period_us, homing_ticks, 2
     for name, value in (FRAME_LIMITS | NODE_LIMITS).items():
         record["limits"][name] = value
     for name in OFF:

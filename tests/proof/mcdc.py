@@ -1,10 +1,10 @@
 """Branches and conditions that the tests have met: ``make coverage``.
 
-Branches are counted by coverage.py. For modified condition/decision coverage the modules are imported with every
-decision of more than one condition (``and``, ``or``, a chain of comparisons) noting what each condition was and how the
-decision went. A condition is covered if two of these rows differ in it and in the outcome, and in no other condition
-that was looked at (masking MC/DC for operators that stop early, DO-178C). The compiler is off, so the kernels run as
-Python.
+Branches are counted by coverage.py. For modified condition/decision coverage the modules are imported with
+every decision of more than one condition (``and``, ``or``, a chain of comparisons) noting what each
+condition was and how the decision went. A condition is covered if two of these rows differ in it and in the
+outcome, and in no other condition that was looked at (masking MC/DC for operators that stop early, DO-178C).
+The compiler is off, so the kernels run as Python.
 """
 
 import argparse

@@ -1,5 +1,5 @@
-"""CRC and codec, proven for every payload: controller, gate and node compute AUTOSAR's CRC8H2F, and it finds what it
-should.
+"""CRC and codec, proven for every payload: controller, gate and node compute
+AUTOSAR's CRC8H2F, and it finds what it should.
 
 The standard's CRC, bit by bit and without any table, is the reference. One step of its register is shown to be linear
 over GF(2), for all registers and bytes; hence the CRC of a payload is the exclusive or of what its words add, and

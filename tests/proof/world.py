@@ -25,7 +25,7 @@ from hil.node.amplifier import AmplifierNode, NmtState
 from hil.node.emergency import FrameErrors
 from pkxyz_ctrl.can import driver as driver_module
 from pkxyz_ctrl.can import sense_input, startup
-from pkxyz_ctrl.can.codec import ProcessCodec
+from pkxyz_ctrl.can.codec import Counts, ProcessCodec
 from pkxyz_ctrl.can.driver import DriverState
 from pkxyz_ctrl.can.driver_config import DriverConfig
 from pkxyz_ctrl.can.frame import Frame
@@ -37,7 +37,6 @@ from pkxyz_ctrl.safety.gate import GateConfig
 from pkxyz_ctrl.safety.modes import MAY_ENERGISE, Event, Mode
 from pkxyz_ctrl.safety.trips import Trip
 
-Counts = tuple[int, int, int]
 Option = tuple[Any, ...]
 
 PERIOD_US = 20_000
@@ -102,8 +101,8 @@ CONFIGURATIONS: Final = {
         Configuration("whole dialogue", 1, kinds=ANY, whole_dialogue=True),
     )
 }
-"""Every kind of fault; what it costs decides how many at a time. ``late`` covers loss: what is held back may never be
-let go."""
+"""Every kind of fault; what it costs decides how many at a time. ``late`` covers
+loss: what is held back may never be let go."""
 
 
 class Held(NamedTuple):

@@ -8,6 +8,7 @@ from node_rig import EDS, NODE_ID, RecordingPlant
 
 from hil.bus.clock import Lockstep
 from hil.node.amplifier import AmplifierNode, NmtState
+from pkxyz_ctrl.can.codec import Counts
 from pkxyz_ctrl.can.driver import AmplifierDriver, DriverState
 from pkxyz_ctrl.can.driver_config import DriverConfig
 from pkxyz_ctrl.can.frame import Frame
@@ -16,13 +17,12 @@ from pkxyz_ctrl.safety.modes import Mode
 
 PERIOD_US = 200
 STEP = 3276  # 20 V
-Counts = tuple[int, int, int]
 FATES = ("arrives", "lost", "twice", "late", "damaged")
 
 
 class Linked:
-    """``tick`` is one period: SYNC, then a drive frame. A frame that is late arrives behind the next one that does, of
-    whatever kind."""
+    """``tick`` is one period: SYNC, then a drive frame. A frame that is late arrives behind
+    the next one that does, of whatever kind."""
 
     def __init__(self, count_step_max: int = STEP) -> None:
         self.clock = Lockstep()

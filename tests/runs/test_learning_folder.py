@@ -1,4 +1,4 @@
-"""A run that learns, from its file to its folder and back: stored, replayed, refreshed, played again bit for bit."""
+"""A run that learns, from its file to its folder and back: stored, applied, refreshed, played again bit for bit."""
 
 import dataclasses
 import json
@@ -93,16 +93,16 @@ def test_a_recording_of_it_replays_bit_for_bit(learnt):
     assert result.notes == []
 
 
-def test_its_correction_is_replayed_and_refreshed_and_these_replay_too(learnt):
+def test_its_correction_is_applied_and_refreshed_and_these_replay_too(learnt):
     root, first, before = learnt
     file = {"file": str(first.learnt)}
-    for mode in ("replay", "refresh"):
+    for mode in ("apply", "refresh"):
         folder, summary = run(root / mode, scenario_file(root), {"mode": mode} | file)
         sensed = summary.learnt.figures.periods["sensed_nm"]
         first_nm, *_, last_nm = before.learnt.figures.periods["sensed_nm"]
         assert sensed[0] < 0.2 * first_nm  # with what the way in has stirred up, once
         assert 0.7 * last_nm < max(sensed[1:]) < 1.4 * last_nm
-        assert (summary.learnt.stored is None) == (mode == "replay")
+        assert (summary.learnt.stored is None) == (mode == "apply")
         assert (folder.path / "learnt_from.json").read_bytes() == first.learnt.read_bytes()
         result = replay(folder.recording)
         assert result.differences == []
@@ -114,7 +114,7 @@ def test_a_file_of_another_scan_is_refused_before_anything_moves(learnt):
     other = root / "other"
     other.mkdir()
     with pytest.raises(LearningError, match=r"learnt\.json: belongs to another trajectory: .* um away"):
-        load_scenario(scenario_file(other, "0.2e-6"), learning={"mode": "replay", "file": str(first.learnt)})
+        load_scenario(scenario_file(other, "0.2e-6"), learning={"mode": "apply", "file": str(first.learnt)})
 
 
 def test_the_picture_is_drawn(learnt):
@@ -149,8 +149,8 @@ def test_a_correction_that_the_stage_cannot_follow_is_refused_before_anything_mo
     with pytest.raises(
         LearningError, match=r"mine\.json: the stored correction carries the scan beyond what the stage"
     ):
-        load_scenario(root / "short.toml", learning={"mode": "replay", "file": str(path)})
-    scenario = load_scenario(root / "short.toml", learning={"mode": "replay", "file": str(folder.learnt)})
+        load_scenario(root / "short.toml", learning={"mode": "apply", "file": str(path)})
+    scenario = load_scenario(root / "short.toml", learning={"mode": "apply", "file": str(folder.learnt)})
     handed_over = dataclasses.replace(scenario.setup(), stored=load(path))
     with pytest.raises(LearningError, match="carries the scan beyond"):
         handed_over.new_learner()

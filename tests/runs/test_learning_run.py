@@ -95,15 +95,15 @@ def test_in_pieces_between_ticks_it_learns_the_same_bits():
     assert np.array_equal(live.learner.correction, fast.correction)
 
 
-def test_replay_begins_where_learning_ended_and_changes_nothing_more(harsh):
+def test_applying_begins_where_learning_ended_and_changes_nothing_more(harsh):
     learnt_errors, learner, _ = harsh
     stored = stored_of(setup(), learner)
-    replay = dataclasses.replace(
-        setup(frames=4, learning=LearningConfig(mode="replay", file="learnt.json")), stored=stored
+    applying = dataclasses.replace(
+        setup(frames=4, learning=LearningConfig(mode="apply", file="learnt.json")), stored=stored
     )
-    errors, replayer, _ = errors_of(replay)
-    assert np.array_equal(replayer.correction, learner.correction)
-    assert replayer.steps == []
+    errors, applied, _ = errors_of(applying)
+    assert np.array_equal(applied.correction, learner.correction)
+    assert applied.steps == []
     assert errors.sensed_nm[0] < 0.1 * learnt_errors.sensed_nm[0]  # with what the way in has stirred up, once
     later = np.array(errors.sensed_nm[1:]) / learnt_errors.sensed_nm[-1]
     assert ((later > 0.7) & (later < 1.4)).all()

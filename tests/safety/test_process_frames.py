@@ -14,13 +14,12 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from node_rig import DRIVE, SENSE, Rig, protected
 
-from pkxyz_ctrl.can.codec import ProcessCodec
+from pkxyz_ctrl.can.codec import Counts, ProcessCodec
 from pkxyz_ctrl.can.frame import Frame
 from pkxyz_ctrl.can.sense_input import SENSE_MISSING, SenseInput
 from pkxyz_ctrl.safety.gate import TransmitGate
 from pkxyz_ctrl.safety.modes import Mode
 
-Counts = tuple[int, int, int]
 FRAME_BITS = 11 + 64  # identifier and payload
 
 

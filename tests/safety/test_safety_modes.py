@@ -147,7 +147,7 @@ def test_safe_cycles_are_those_since_the_last_unsafe_one(ticks: list[tuple[bool,
 def test_loop_closes_only_after_homing_since_the_last_boot(choices: list[tuple[bool, int]]) -> None:
     """Whoever asks through ``enable_event`` cannot close the loop on offsets of another life.
 
-    Half of the events are drawn from those that the mode accepts, else the walk would hardly ever leave BOOT.
+    Half of the events are sampled from those that the mode accepts, else the walk would hardly ever leave BOOT.
     """
     mode, homed = int(Mode.BOOT), False
     homed_since_boot = False

@@ -60,24 +60,24 @@ def test_modes_and_gains_of_the_harsh_plant(kind):
 
 
 def test_standard_errors_are_those_of_the_errors():
-    """None beyond 4.5 of its deviation; a static gain may differ by 0.2 % more, for the plant drifts meanwhile."""
+    """None beyond 4.5 of its standard error; a static gain may differ by 0.2 % more, for the plant drifts meanwhile."""
     modes, is_ = found().modes, truth()
-    assert (np.abs(modes.frequency_hz - is_.frequency_hz) < 4.5 * modes.frequency_deviation_hz).all()
-    assert (np.abs(modes.damping - is_.damping) < 4.5 * modes.damping_deviation).all()
-    slack = 4.5 * modes.static_gain_deviation + 0.002 * np.abs(is_.static_gain).max()
+    assert (np.abs(modes.frequency_hz - is_.frequency_hz) < 4.5 * modes.frequency_standard_error_hz).all()
+    assert (np.abs(modes.damping - is_.damping) < 4.5 * modes.damping_standard_error).all()
+    slack = 4.5 * modes.static_gain_standard_error + 0.002 * np.abs(is_.static_gain).max()
     assert (np.abs(modes.static_gain - is_.static_gain) < slack).all()
-    slack = 4.5 * modes.acceleration_gain_deviation + 0.002 * np.abs(is_.acceleration_gain).max()
+    slack = 4.5 * modes.acceleration_gain_standard_error + 0.002 * np.abs(is_.acceleration_gain).max()
     assert (np.abs(modes.acceleration_gain - is_.acceleration_gain) < slack).all()
     assert 0.9 < modes.chi_square < 1.1
-    assert (modes.frequency_deviation_hz < 1e-3 * modes.frequency_hz).all()
+    assert (modes.frequency_standard_error_hz < 1e-3 * modes.frequency_hz).all()
 
 
 def test_modes_that_coincide_are_one_pair_of_poles():
     """As drawn, x and y are alike at mid-workspace: three pairs of poles would leave one to the noise, of any Q."""
     modes, is_ = found("nominal").modes, truth("nominal")
     assert modes.apart.tolist() == [True, False, True]
-    assert (np.abs(modes.frequency_hz - is_.frequency_hz) < 4.5 * modes.frequency_deviation_hz).all()
-    assert (np.abs(modes.damping - is_.damping) < 4.5 * modes.damping_deviation).all()
+    assert (np.abs(modes.frequency_hz - is_.frequency_hz) < 4.5 * modes.frequency_standard_error_hz).all()
+    assert (np.abs(modes.damping - is_.damping) < 4.5 * modes.damping_standard_error).all()
     assert modes.static_gain[CHAINS, CHAINS] == pytest.approx(is_.static_gain[CHAINS, CHAINS], rel=0.01)
     assert 0.9 < modes.chi_square < 1.1
     assert found().modes.apart.all()  # 31 Hz apart they are three
@@ -97,9 +97,9 @@ def test_homing_finds_the_capacitance_at_rest():
     offset_f = p["sense_offset_f"] + p["sense_f_per_m"] * at_rest + p["sense_rest_f"]
     offset_f += p["feedthrough_f_per_v"] * p["amplifier_offset_v"] - found().setup.law[0]["tick"]["sense"]["rest_f"]
     walked_f = 4.0 * p["sense_walk_f_per_rt_s"] * np.sqrt(0.1) + 1e-9 * p["sense_f_per_m"]
-    assert (np.abs(zero.offset_f - offset_f) < 4.5 * zero.deviation_f + walked_f).all()
+    assert (np.abs(zero.offset_f - offset_f) < 4.5 * zero.standard_error_f + walked_f).all()
     assert zero.samples in (249, 250)
-    assert (zero.deviation_f < 0.05e-15).all()
+    assert (zero.standard_error_f < 0.05e-15).all()
 
 
 def test_lanes_give_the_same_bits():
@@ -220,11 +220,11 @@ def test_an_outside_reference_gives_each_chains_sense_gain(gain, origin_m):
 
 
 def test_its_standard_errors_are_those_of_its_errors():
-    """100 instruments with 5 nm of noise: mean square of error over deviation is 1 within its own scatter."""
+    """100 instruments with 5 nm of noise: mean square of error over standard error is 1 within its own scatter."""
     rng, gain = np.random.default_rng(1), np.array([1.02, 0.985, 1.01])
     clean = seen_by_an_instrument(gain, np.zeros(3), POINTS_M)
     runs = [outside_scale(stage(), POINTS_M, clean + rng.normal(scale=5e-9, size=clean.shape)) for _ in range(100)]
-    errors = np.array([(run.sense_gain - gain) / run.deviation for run in runs])
+    errors = np.array([(run.sense_gain - gain) / run.standard_error for run in runs])
     assert 0.7 < np.mean(errors**2) < 1.6  # t of 12 degrees has variance 1.2
     stroke_m = 5e-9 * np.sqrt((stage().jacobian(POINTS_M) ** 2).sum(axis=2).mean())  # of that noise
     assert np.mean([run.residual_m for run in runs]) == pytest.approx(stroke_m * np.sqrt(12 / 18), rel=0.05)

@@ -61,7 +61,7 @@ def test_measured_and_computed_sensitivity_differ_by_noise_alone(kind):
     compared = agreement(seen, loop().response(OFF_CENTRE, seen.frequency_hz), PERIODS)
     assert compared.holds
     entries = seen.s.size
-    spread = 4.0 / np.sqrt(entries)  # four deviations of a mean of F(2, 8), whose own deviation is below 2
+    spread = 4.0 / np.sqrt(entries)  # four standard errors of a mean of F(2, 8), whose standard deviation is below 2
     assert abs(compared.mean_square - compared.expected_mean_square) < 2.0 * spread
     assert compared.largest_difference < 0.05
 
@@ -128,9 +128,9 @@ def test_cases_are_every_change_at_every_point_with_names_that_tell_them_apart()
 
 @settings(deadline=None, max_examples=200)
 @given(st.integers(0, 2**32 - 1))
-def test_what_is_drawn_lies_within_the_tolerances_and_is_the_same_again(seed):
+def test_what_is_sampled_lies_within_the_tolerances_and_is_the_same_again(seed):
     t = wide()
-    case, again = t.draw(seed), t.draw(seed)
+    case, again = t.sample(seed), t.sample(seed)
     assert case.perturbation == again.perturbation
     assert np.array_equal(case.strokes_m, again.strokes_m)
     p = case.perturbation

@@ -1,4 +1,4 @@
-"""Monte Carlo: plants drawn by seeds, kept line by line, resumed, and run again alone to the bit."""
+"""Monte Carlo: plants sampled by seeds, kept line by line, resumed, and run again alone to the bit."""
 
 import json
 
@@ -25,7 +25,7 @@ def a_result(seed, error=1.0, peak=1.6, fault=None):
     return Result(seed, error, 0.8, peak, 0, fault)
 
 
-def test_the_drawn_plant_has_what_was_drawn_and_otherwise_what_it_had():
+def test_the_sampled_plant_has_what_was_sampled_and_otherwise_what_it_had():
     change = Perturbation(0.1, -0.05, 50.0, (0.01, -0.02, 0.03))
     plant = changed_plant(setup().plant, change)
     assert plant.stiffness_mismatch.on
@@ -43,7 +43,7 @@ KINDS = ("stiffness_mismatch", "mass_error", "comb_mismatch")
 """Switched on by any perturbation, if only by 0."""
 
 
-def test_electronics_and_modes_that_were_drawn_are_simulated():
+def test_electronics_and_modes_that_were_sampled_are_simulated():
     """Delay and poles, and the first parasitic mode; a delay below 0 is none, and lab keeps its own chain and modes."""
     modes = (ParasiticMode(2500.0, 30.0, 3e-4), ParasiticMode(4500.0, 60.0, 1e-4))
     change = Perturbation(delay_s=40e-6, amplifier_bandwidth=-0.2, sense_bandwidth_hz=20e3, parasitic=modes)
@@ -102,11 +102,11 @@ def test_the_worst_is_a_fault_then_an_unstable_loop_then_the_largest_error():
 
 
 def test_one_plant_alone_leaves_a_run_folder(tmp_path):
-    done = CliRunner().invoke(app, ["montecarlo", "--replay", "3", "--out", str(tmp_path), "--json"])
+    done = CliRunner().invoke(app, ["montecarlo", "--alone", "3", "--out", str(tmp_path), "--json"])
     assert done.exit_code == 0, done.output
     data = json.loads(done.stdout)
     recorded = json.loads((tmp_path / "seed-3" / "summary.json").read_text())
     assert max(recorded["rms_error_nm"].values()) == data["rms_error_nm"]
     assert Recording.open(tmp_path / "seed-3" / "recording.parquet").metadata["seed"] == 3
-    drawn = a_study().tolerances.draw(3).perturbation
-    assert data["drawn"]["stiffness"] == drawn.stiffness
+    sampled = a_study().tolerances.sample(3).perturbation
+    assert data["sampled"]["stiffness"] == sampled.stiffness

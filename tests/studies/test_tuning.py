@@ -1,4 +1,4 @@
-"""Tuning: what numbers are worth against what the parts say, and a small study from search file to controller."""
+"""Tuning: how numbers are valued, against what the parts say, and a small study from search file to controller."""
 
 import json
 
@@ -10,7 +10,7 @@ from typer.testing import CliRunner
 from hil.cli import app
 from hil.pictures.tuning import draw_tuning
 from hil.studies.margins.loop import Loop, over_changed_plants
-from hil.studies.spread.workers import as_done, hands
+from hil.studies.spread.workers import as_done, worker_pool
 from hil.studies.tune.search import UNUSABLE, evaluate, load_problem
 from hil.studies.tune.taps import asks_for_taps
 from hil.studies.tune.tuning import best, importances, nearest, open_study, rounded, search, write_controller
@@ -44,40 +44,40 @@ def test_every_shipped_search_is_one_of_its_controllers_numbers():
         assert len(problem.start()) == len(problem.search.number)
 
 
-def test_the_shipped_law_is_worth_what_its_run_and_its_margins_say(tmp_path):
+def test_the_shipped_law_is_valued_at_what_its_run_and_its_margins_say(tmp_path):
     problem = problem_with(tmp_path, *EASY)
-    worth = evaluate(problem, {})
+    evaluation = evaluate(problem, {})
     rows, _ = rows_of(setup(), "fast")
     scan = setup().trajectory.segments
     window = next(s.scan_us for s in scan if s.scan_us)
     t_us = rows["reference_tick"] * bus().period_us
     inside = (rows["reference_tick"] >= 0) & (t_us >= window[0]) & (t_us < window[1])
     error = (rows["position_m"] - rows["reference_m"])[inside]
-    assert worth.value == pytest.approx(1e9 * np.sqrt((error**2).mean(axis=0)).max(), rel=1e-6)
-    assert max(worth.constraints.values()) <= 0.0
+    assert evaluation.value == pytest.approx(1e9 * np.sqrt((error**2).mean(axis=0)).max(), rel=1e-6)
+    assert max(evaluation.constraints.values()) <= 0.0
     found = Loop(stage(), bus(), setup().law).margins(MIDDLE).mimo
-    assert worth.figures["peak_s"] == found.peak_s
-    assert worth.figures["bandwidth_hz"] == found.bandwidth_hz
-    assert worth.constraints["peak_s_max"] == found.peak_s / 2.0 - 1.0
+    assert evaluation.figures["peak_s"] == found.peak_s
+    assert evaluation.figures["bandwidth_hz"] == found.bandwidth_hz
+    assert evaluation.constraints["peak_s_max"] == found.peak_s / 2.0 - 1.0
 
 
 def test_at_all_points_the_changed_plants_are_those_of_the_margins_command(tmp_path):
     """135 of them, of which the worst is not at mid-workspace; looked at only where the goals are kept there."""
     everywhere = (EASY[0], BY_MARGINS[-1])
-    worth = evaluate(problem_with(tmp_path, *everywhere), {})
+    evaluation = evaluate(problem_with(tmp_path, *everywhere), {})
     changed = over_changed_plants(Loop(stage(), bus(), setup().law), load("tolerances", "wide", Tolerances).cases())
-    assert worth.figures["peak_s_changed"] == changed.worst[1]
-    assert max(worth.constraints.values()) <= 0.0
+    assert evaluation.figures["peak_s_changed"] == changed.worst[1]
+    assert max(evaluation.constraints.values()) <= 0.0
     missed = evaluate(problem_with(tmp_path, *everywhere, ("bandwidth_min_hz = 40.0", "bandwidth_min_hz = 94.0")), {})
     assert missed.figures["peak_s_changed"] == max(changed.peak_s[:15]) < changed.worst[1]
 
 
 def test_what_misses_a_margin_is_not_run_and_what_is_no_loop_misses_all(tmp_path):
     problem = problem_with(tmp_path, *EASY, ("bandwidth_min_hz = 40.0", "bandwidth_min_hz = 94.0"))
-    worth = evaluate(problem, {})
-    assert worth.value is None
-    assert worth.reason == "misses bandwidth_min_hz"
-    assert worth.constraints["bandwidth_min_hz"] == pytest.approx(0.5, abs=0.01)  # 47 Hz
+    evaluation = evaluate(problem, {})
+    assert evaluation.value is None
+    assert evaluation.reason == "misses bandwidth_min_hz"
+    assert evaluation.constraints["bandwidth_min_hz"] == pytest.approx(0.5, abs=0.01)  # 47 Hz
     hopeless = evaluate(problem, {"regulator.force_n": -1.0})
     assert set(hopeless.constraints.values()) == {UNUSABLE}
     assert "greater than 0" in hopeless.reason
@@ -140,7 +140,7 @@ def test_numbers_are_tried_with_the_digits_that_are_written():
     assert rounded(1.99999e-7) == 2e-7
 
 
-# -- hands ------------------------------------------------------------------------------------------------------------
+# -- workers ---------------------------------------------------------------------------------------------------------
 
 
 def square(n):
@@ -152,7 +152,7 @@ def test_a_dask_cluster_does_the_same_as_processes():
 
     with (
         LocalCluster(n_workers=1, threads_per_worker=2, processes=False, dashboard_address=None) as cluster,
-        hands(1, cluster.scheduler_address) as (pool, width),
+        worker_pool(1, cluster.scheduler_address) as (pool, width),
     ):
         assert width == 2
         assert dict(as_done(pool, width, square, range(20))) == {n: n * n for n in range(20)}
@@ -167,7 +167,7 @@ def test_no_scheduler_is_one_line(monkeypatch):
     monkeypatch.setattr(distributed, "Client", refuse)
     with (
         pytest.raises(ConfigError, match=r"no scheduler answers at tcp://127\.0\.0\.1:1"),
-        hands(1, "tcp://127.0.0.1:1"),
+        worker_pool(1, "tcp://127.0.0.1:1"),
     ):
         pass
 

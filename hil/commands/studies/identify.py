@@ -57,8 +57,8 @@ def identify(
     """Frequency response from squared voltages to sense counts, modes, static gains and offsets, in the closed loop;
     and a stage file with what was found, which runs at once: --stage FOLDER/stage.toml.
 
-    Exit code 0 if the fit leaves nothing but noise, 1 if it leaves more (then the errors are no bounds), 2 for bad
-    input.
+    Exit code 0 if the fit leaves nothing but noise, 1 if it leaves more (then the
+    errors are no bounds), 2 for bad input.
     """
     from dataclasses import replace
 
@@ -129,8 +129,8 @@ def _show(found: "Identification", data: dict[str, Any], folder: Path) -> None:
     for i in range(3):
         entries = [f"{v:.3f}" for v in modes.static_gain[i]]
         table.add_row(
-            f"{i + 1}", _pm(modes.static_gain[i, i], modes.static_gain_deviation[i, i]), *entries,
-            _pm(zero.offset_f[i] * 1e15, zero.deviation_f[i] * 1e15), f"{zero.offset_count[i]:.1f}",
+            f"{i + 1}", _pm(modes.static_gain[i, i], modes.static_gain_standard_error[i, i]), *entries,
+            _pm(zero.offset_f[i] * 1e15, zero.standard_error_f[i] * 1e15), f"{zero.offset_count[i]:.1f}",
         )  # fmt: skip
     print_whole(table)
     fit = data["fit"]
@@ -153,12 +153,12 @@ def _show(found: "Identification", data: dict[str, Any], folder: Path) -> None:
 
 def _show_gains(found: "Identification") -> None:
     """Of each chain relative to the stage file; apart from each other with an outside reference only."""
-    outside, comb, (product, deviation) = found.outside, found.comb_gain, found.chain_gain
+    outside, comb, (product, error) = found.outside, found.comb_gain, found.chain_gain
     table = plain_table("chain", "sense x comb / mass", "sense", "comb")
     for i in range(3):
-        sense = "?" if outside is None else _pm(outside.sense_gain[i], outside.deviation[i])
+        sense = "?" if outside is None else _pm(outside.sense_gain[i], outside.standard_error[i])
         pull = "?" if comb is None else _pm(comb[0][i], comb[1][i])
-        table.add_row(f"{i + 1}", _pm(product[i], deviation[i]), sense, pull)
+        table.add_row(f"{i + 1}", _pm(product[i], error[i]), sense, pull)
     say("relative to the stage file, the combs if its mass is right:")
     print_whole(table)
     if outside is not None:

@@ -190,7 +190,7 @@ def _show(
         say(
             "measured S ",
             verdict,
-            f": at most {compared.largest:.1f} deviations from the computed one (noise alone stays "
+            f": at most {compared.largest:.1f} standard errors from the computed one (noise alone stays "
             f"below {compared.bound:.1f}), {compared.largest_difference:.3f} in |S|",
         )
 

@@ -17,9 +17,9 @@ from hil.screen.terminal import bad, plain_table, print_whole, say
 
 def montecarlo(
     scenario: Annotated[str, typer.Argument(help="A shipped scenario's name or a TOML file.")] = "raster",
-    plants: Annotated[int, typer.Option(min=1, help="How many, drawn by the seeds from --seed on.")] = 200,
+    plants: Annotated[int, typer.Option(min=1, help="How many, sampled by the seeds from --seed on.")] = 200,
     seed: Annotated[int, typer.Option(min=0, help="The first plant's.")] = 1,
-    tolerances: Annotated[str, typer.Option(help="Name or file of what they are drawn from.")] = "wide",
+    tolerances: Annotated[str, typer.Option(help="Name or file of what they are sampled from.")] = "wide",
     controller: Annotated[str | None, typer.Option(help="Name or file, instead of the scenario's.")] = None,
     stage: Annotated[str | None, typer.Option(help="Name or file, instead of the scenario's.")] = None,
     plant: Annotated[str | None, typer.Option(help="Name or file of the plant that is changed.")] = None,
@@ -28,7 +28,7 @@ def montecarlo(
     dask: Annotated[
         str | None, typer.Option(metavar="ADDRESS", help="Scheduler of a Dask cluster to work on instead.")
     ] = None,
-    replay: Annotated[
+    alone: Annotated[
         int | None, typer.Option(metavar="SEED", min=0, help="Run this plant alone, with a recording and a report.")
     ] = None,
     out: Annotated[Path, typer.Option(help="Folder for results.jsonl, summary.json and distributions.png.")] = Path(
@@ -36,7 +36,7 @@ def montecarlo(
     ),
     as_json: Annotated[bool, typer.Option("--json", help="Print JSON, and nothing else.")] = False,
 ) -> None:
-    """Run a law against plants drawn from tolerances, on the fast lane. Call it again to go on, or for more plants.
+    """Run a law against plants sampled from tolerances, on the fast lane. Call it again to go on, or for more plants.
 
     Exit code 0 if every loop held, 1 if one did not, 2 for bad input, 130 if interrupted (what is done is kept).
     """
@@ -49,8 +49,8 @@ def montecarlo(
 
     loaded = load_scenario(scenario, controller=controller, stage=stage, plant=plant, bus=bus)
     study = Study(loaded, load("tolerances", tolerances, Tolerances))
-    if replay is not None:
-        _replay(study, replay, out, as_json=as_json)
+    if alone is not None:
+        _run_alone(study, alone, out, as_json=as_json)
     folder_to_write(out)
     say_if_compiling(quiet=as_json)
     results = Results(out / "results.jsonl", study)
@@ -74,26 +74,26 @@ def montecarlo(
     else:
         options = {
             "--tolerances": tolerances, "--controller": controller, "--stage": stage, "--plant": plant, "--bus": bus,
-            "--out": str(out), "--replay": str(data["worst_seed"]),
+            "--out": str(out), "--alone": str(data["worst_seed"]),
         }  # fmt: skip
         words = [word for name, value in options.items() if value is not None for word in (name, value)]
         _show(data, shlex.join(["pkxyz", "montecarlo", scenario, *words]))
     raise typer.Exit(130 if interrupted else 1 if data["not_held"] else 0)
 
 
-def _replay(study: Any, seed: int, out: Path, *, as_json: bool) -> None:
+def _run_alone(study: Any, seed: int, out: Path, *, as_json: bool) -> None:
     """One plant with everything a run leaves; the figures are those of the study, bit for bit."""
     from hil.pictures.run import draw
     from hil.runs.run import run_into
     from hil.runs.run_folder import RunFolder
     from hil.studies.montecarlo import run_one
 
-    scenario = study.drawn(seed)
+    scenario = study.sampled(seed)
     folder = RunFolder(out / f"seed-{seed}", replace=True)
     ran = run_into(folder, scenario, Lane.FAST)
     draw(folder, ran)
-    result, case = run_one(study, seed), study.tolerances.draw(seed)
-    data = vars(result) | {"drawn": dataclasses.asdict(case.perturbation), "folder": str(folder.path)}
+    result, case = run_one(study, seed), study.tolerances.sample(seed)
+    data = vars(result) | {"sampled": dataclasses.asdict(case.perturbation), "folder": str(folder.path)}
     data["strokes_um"] = [float(q) * 1e6 for q in case.strokes_m]
     if as_json:
         print(json.dumps(data, allow_nan=False))

@@ -39,25 +39,26 @@ class Identification:
 
     @property
     def chain_gain(self) -> tuple[Array, Array]:
-        """(3,) sense gain times comb gain over mass of each chain, relative to the stage file, and its deviation."""
+        """(3,) sense gain times comb gain over mass of each chain, relative to the stage file,
+        and its standard error."""
         stage, analog = Stage(self.setup.stage), self.setup.bus.analog
         position = stage.forward_kinematics(self.response.strokes_m)
         drawn = np.diag(stage.jacobian(position) @ stage.pulls(position).T) * stage.force_gain_n_per_v2 / stage.mass_kg
         drawn = drawn * stage.sense_gradient_f_per_m / analog.sense_farad_per_count
         found = self.modes
-        return np.diag(found.acceleration_gain) / drawn, np.diag(found.acceleration_gain_deviation) / drawn
+        return np.diag(found.acceleration_gain) / drawn, np.diag(found.acceleration_gain_standard_error) / drawn
 
     @property
     def comb_gain(self) -> tuple[Array, Array] | None:
-        """(3,) comb gains relative to the stage file, if its mass is right, and their deviation; None without an
-        outside reference.
+        """(3,) comb gains relative to the stage file, if its mass is right, and their standard errors; None
+        without an outside reference.
         """
         if self.outside is None:
             return None
-        product, deviation = self.chain_gain
+        product, error = self.chain_gain
         gain, relative = (
             product / self.outside.sense_gain,
-            np.hypot(deviation / product, self.outside.deviation / self.outside.sense_gain),
+            np.hypot(error / product, self.outside.standard_error / self.outside.sense_gain),
         )
         return gain, gain * relative
 
@@ -81,7 +82,7 @@ class Identification:
         error = np.zeros(3) if known is None else np.array(known.sense_gain)
         if self.outside is None:
             return SenseGain(gain, error)
-        return SenseGain(gain * self.outside.sense_gain, gain * self.outside.deviation)
+        return SenseGain(gain * self.outside.sense_gain, gain * self.outside.standard_error)
 
     @property
     def sense_scale(self) -> SenseScale:
@@ -182,20 +183,20 @@ def as_json(found: Identification) -> dict[str, Any]:
         "modes": [
             {
                 "frequency_hz": float(modes.frequency_hz[i]),
-                "frequency_error_hz": float(modes.frequency_deviation_hz[i]),
+                "frequency_error_hz": float(modes.frequency_standard_error_hz[i]),
                 "drawn_hz": float(found.drawn_hz[i]),
                 "damping": float(modes.damping[i]),
-                "damping_error": float(modes.damping_deviation[i]),
+                "damping_error": float(modes.damping_standard_error[i]),
                 "quality_factor": float(0.5 / modes.damping[i]),
             }
             for i in range(MODES)
         ],
         "static_gain_count_per_v2": [_list(row) for row in modes.static_gain],
-        "static_gain_error_count_per_v2": [_list(row) for row in modes.static_gain_deviation],
+        "static_gain_error_count_per_v2": [_list(row) for row in modes.static_gain_standard_error],
         "sense_zero": {
             "offset_f": _list(zero.offset_f),
             "offset_count": _list(zero.offset_count),
-            "error_f": _list(zero.deviation_f),
+            "error_f": _list(zero.standard_error_f),
             "samples": zero.samples,
         },
         "fit": {
@@ -226,7 +227,7 @@ def _outside_data(found: Identification) -> dict[str, Any]:
         "residual_nm": outside.residual_m * 1e9,
         "origin_um": _list(outside.origin_m * 1e6),
         "sense_gain": _list(outside.sense_gain),
-        "sense_gain_error": _list(outside.deviation),
+        "sense_gain_error": _list(outside.standard_error),
         "sense_f_per_m": _list(stage.sense_gradient_f_per_m * outside.sense_gain),
         "comb_gain": _list(comb[0]),
         "comb_gain_error": _list(comb[1]),
@@ -267,14 +268,14 @@ def response_csv(found: Identification) -> str:
     """The measured response as a table: a line for each tone and entry."""
     r, fitted = found.response, found.modes.response(found.response.frequency_hz)
     lines = [
-        "frequency_hz,chain,comb,real_count_per_v2,imag_count_per_v2,deviation_count_per_v2,coherence,fit_real,fit_imag"
+        "frequency_hz,chain,comb,real_count_per_v2,imag_count_per_v2,standard_error_count_per_v2,coherence,fit_real,fit_imag"
     ]
     for k, f in enumerate(r.frequency_hz):
         for i in range(3):
             for j in range(3):
                 p, m = r.p[k, i, j], fitted[k, i, j]
                 lines.append(
-                    f"{f:.6g},{i + 1},{j + 1},{p.real:.8g},{p.imag:.8g},{r.deviation[k, i, j]:.4g},"
+                    f"{f:.6g},{i + 1},{j + 1},{p.real:.8g},{p.imag:.8g},{r.standard_error[k, i, j]:.4g},"
                     f"{r.coherence[k, i]:.6f},{m.real:.8g},{m.imag:.8g}"
                 )
     return "\n".join(lines) + "\n"

@@ -28,7 +28,7 @@ class OutsideScale:
 
     sense_gain: Array
     """(3,)"""
-    deviation: Array
+    standard_error: Array
     """(3,) standard errors, from what the points leave"""
     origin_m: Array
     """(3,) where the instrument saw the rest position"""
@@ -91,7 +91,7 @@ def outside_scale(stage: Stage, commanded_m: Array, seen_m: Array) -> OutsideSca
     covariance = np.linalg.inv(fit.jac.T @ fit.jac) * variance
     return OutsideScale(
         sense_gain=fit.x[:3],
-        deviation=np.sqrt(np.diag(covariance))[:3],
+        standard_error=np.sqrt(np.diag(covariance))[:3],
         origin_m=fit.x[3:] * 1e-6,
         residual_m=float(np.sqrt(np.mean(fit.fun**2))) * 1e-9,
         points=len(commanded_m),

@@ -36,7 +36,7 @@ class SenseZero:
     """(3,)"""
     offset_count: Array
     """(3,) the same in sense counts"""
-    deviation_f: Array
+    standard_error_f: Array
     """(3,) standard error, from the spread of the samples"""
     samples: int
 
@@ -73,8 +73,8 @@ class PlantResponse:
         return np.asarray(self.sense_count @ np.linalg.inv(self.drive_v2))
 
     @property
-    def deviation(self) -> Array:
-        """(k, 3, 3) standard deviation of the entries of ``p``, of their distance in the plane."""
+    def standard_error(self) -> Array:
+        """(k, 3, 3) standard error of the entries of ``p``, of their distance in the plane."""
         inverse = np.linalg.inv(self.drive_v2)
         return np.asarray(self.noise_count[:, :, None] * np.sqrt((np.abs(inverse) ** 2).sum(axis=1))[:, None, :])
 

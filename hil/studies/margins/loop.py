@@ -75,12 +75,12 @@ def over_changed_plants(
 
 @dataclass(frozen=True)
 class Agreement:
-    """Measured and computed S side by side. A measured entry has two degrees of freedom and its deviation was
-    estimated from m periods, so the squared distance in deviations is distributed as F(2, 2 m - 2).
+    """Measured and computed S side by side. A measured entry has two degrees of freedom; its standard error was
+    estimated from m periods, so the squared distance in standard errors is distributed as F(2, 2 m - 2).
     """
 
     largest: float
-    """distance in deviations, over all tones and entries"""
+    """distance in standard errors, over all tones and entries"""
     bound: float
     """that the largest stays below with ``CONFIDENCE`` if the loop is as computed"""
     mean_square: float
@@ -98,7 +98,7 @@ class Agreement:
 def agreement(measured: MeasuredLoop, computed: LoopResponse, periods: int) -> Agreement:
     """Compare S entry by entry, at the same frequencies. Needs three periods at least."""
     difference = np.abs(measured.s - computed.s)
-    distance = difference / measured.deviation
+    distance = difference / measured.standard_error
     each = CONFIDENCE ** (1.0 / distance.size)
     return Agreement(
         largest=float(distance.max()),

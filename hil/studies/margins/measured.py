@@ -33,13 +33,13 @@ class MeasurementError(RuntimeError):
 
 @dataclass(frozen=True)
 class MeasuredLoop:
-    """S at the tones of the excitation, and the standard deviation of each entry (of its distance in the plane)."""
+    """S at the tones of the excitation, and the standard error of each entry (of its distance in the plane)."""
 
     frequency_hz: Array
     """(k,)"""
     s: Complex
     """(k, 3, 3)"""
-    deviation: Array
+    standard_error: Array
     """(k, 3, 3)"""
     ticks: int
 
@@ -114,7 +114,7 @@ def _from_periods(excitation: Excitation, seen_m: Array, period_s: float) -> Mea
     n, m = excitation.period_ticks, excitation.periods
     bins = np.unique(np.concatenate([p.bins for p in excitation.passages]))
     s = np.zeros((len(bins), 3, 3), np.complex128)
-    deviation = np.zeros((len(bins), 3, 3))
+    standard_error = np.zeros((len(bins), 3, 3))
     for k, passage in enumerate(excitation.passages):
         rows = slice(excitation.measured_from(k), excitation.measured_from(k) + n * m)
         spectrum = np.fft.rfft(seen_m[rows].reshape(m, n, 3), axis=1)[:, passage.bins]  # (m, tones, 3)
@@ -123,5 +123,5 @@ def _from_periods(excitation: Excitation, seen_m: Array, period_s: float) -> Mea
         at = np.searchsorted(bins, passage.bins)
         s[at, :, passage.axis] = ratio.mean(axis=0)
         spread = np.abs(ratio - ratio.mean(axis=0)) ** 2
-        deviation[at, :, passage.axis] = np.sqrt(spread.sum(axis=0) / (m - 1) / m)
-    return MeasuredLoop(bins / (n * period_s), s, deviation, len(seen_m))
+        standard_error[at, :, passage.axis] = np.sqrt(spread.sum(axis=0) / (m - 1) / m)
+    return MeasuredLoop(bins / (n * period_s), s, standard_error, len(seen_m))

@@ -1,4 +1,4 @@
-"""Independent work, spread over the cores of this machine or over a Dask cluster, in as many pieces as there are hands.
+"""Independent work in pieces, spread over the cores of this machine or over a Dask cluster.
 
 The pieces are calls of one function with plain arguments; results come as they are done. Each process keeps to one
 thread, so that as many processes as cores don't get into each other's way.
@@ -27,7 +27,7 @@ def cores() -> int:
 
 
 @contextmanager
-def hands(workers: int, scheduler: str | None = None) -> Iterator[tuple[Executor, int]]:
+def worker_pool(workers: int, scheduler: str | None = None) -> Iterator[tuple[Executor, int]]:
     """An executor and how many pieces it can work at: processes here, or the threads of a Dask cluster whose scheduler
     has the address. Raises ``ConfigError`` for a scheduler that doesn't answer or has no workers.
     """
@@ -56,14 +56,14 @@ def hands(workers: int, scheduler: str | None = None) -> Iterator[tuple[Executor
         yield client.get_executor(pure=False), threads
 
 
-def given(function: Callable[[Any, Item], Result], constant: object) -> Callable[[Item], Result]:
+def with_constant(function: Callable[[Any, Item], Result], constant: object) -> Callable[[Item], Result]:
     """``function`` with its first argument, for ``as_done``: each process unpacks it once and keeps it, with all that
     it has worked out about it.
     """
-    return partial(_with_constant, function, pickle.dumps(constant))
+    return partial(_on_unpacked, function, pickle.dumps(constant))
 
 
-def _with_constant(function: Callable[[Any, Item], Result], packed: bytes, item: Item) -> Result:
+def _on_unpacked(function: Callable[[Any, Item], Result], packed: bytes, item: Item) -> Result:
     return function(_unpacked(packed), item)
 
 
@@ -75,10 +75,10 @@ def _unpacked(packed: bytes) -> object:
 def as_done(
     pool: Executor, width: int, function: Callable[[Item], Result], items: Iterable[Item], *, ahead: int = 0
 ) -> Iterator[tuple[Item, Result]]:
-    """(item, function(item)) in the order in which they are done. Items are taken from their iterator as hands get
-    free, so an iterator may look at the results so far. What a call raises is raised here.
+    """(item, function(item)) in the order in which they are done. Items are taken from their iterator as workers
+    get free, so an iterator may look at the results so far. What a call raises is raised here.
 
-    ``ahead``: how many items more are handed out than there are hands, so that none waits for this process; for
+    ``ahead``: how many items more are handed out than there are workers, so that none waits for this process; for
     iterators that don't look.
     """
     waiting: dict[Future[Result], Item] = {}

@@ -106,9 +106,9 @@ def minimax(
     enough: float = 0.97,
     steps: int = 200,
 ) -> tuple[AxisLaw, float]:
-    """The law, and the largest value over its bound; stops where that is ``enough``. Plants have one input; the first
-    is as drawn, and ``combined`` have a bound of their own. Raises ``LawError`` for a start that leaves one of them
-    unstable.
+    """The law, and the largest value over its bound; stops where that is ``enough``. Plants have
+    one input; the first is as drawn, and ``combined`` have a bound of their own. Raises
+    ``LawError`` for a start that leaves one of them unstable.
     """
     plants = [*drawn_and_changed, *combined]
     most = [bounds.peak_s_changed] * len(drawn_and_changed) + [bounds.peak_s_combined] * len(combined)

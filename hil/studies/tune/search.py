@@ -1,4 +1,4 @@
-"""What a tuning searches, as data, and what one choice of numbers is worth: margins first, runs only if they hold.
+"""What a tuning searches, as data, and how one choice of numbers is valued: margins first, runs only if they hold.
 
 >>> problem = load_problem("lqg")
 >>> evaluate(problem, {"regulator.force_n": 1e-6, ...})
@@ -125,8 +125,8 @@ class Problem:
 
 
 @dataclass(frozen=True)
-class Worth:
-    """What numbers are worth. Constraints are kept where they are 0 or less; without a value nothing was run."""
+class Evaluation:
+    """How good numbers are. Constraints are kept where they are 0 or less; without a value nothing was run."""
 
     constraints: dict[str, float]
     """each how far beyond its goal, as a share of the goal"""
@@ -167,27 +167,27 @@ def put(data: Any, key: str, value: float) -> None:
     data[last] = value
 
 
-def evaluate(problem: Problem, numbers: dict[str, float]) -> Worth:
+def evaluate(problem: Problem, numbers: dict[str, float]) -> Evaluation:
     """Margins and noise, and, where they keep the goals, the objective."""
     search = problem.search
     stage, bus = Stage.load(search.stage), config.load("buses", search.bus, BusConfig)
     try:
         controller = problem.with_numbers(numbers)
-        worth = _computed(search, stage, bus, controller)
+        evaluation = _computed(search, stage, bus, controller)
     except (ConfigError, DesignError, LawError) as error:
-        return Worth(dict.fromkeys(Goals.model_fields, UNUSABLE), {}, None, str(error))
-    missed = [name for name, value in worth.constraints.items() if value > 0.0]
+        return Evaluation(dict.fromkeys(Goals.model_fields, UNUSABLE), {}, None, str(error))
+    missed = [name for name, value in evaluation.constraints.items() if value > 0.0]
     if missed:
-        return Worth(worth.constraints, worth.figures, None, f"misses {', '.join(missed)}")
+        return Evaluation(evaluation.constraints, evaluation.figures, None, f"misses {', '.join(missed)}")
     if search.objective == "bandwidth_hz":
-        return Worth(worth.constraints, worth.figures, worth.figures["bandwidth_hz"])
+        return Evaluation(evaluation.constraints, evaluation.figures, evaluation.figures["bandwidth_hz"])
     errors = [_run(search, controller, plant) for plant in search.plants]
     if any(math.isnan(error) for error in errors):
-        return Worth(worth.constraints, worth.figures, None, "a run ended in a fault")
-    return Worth(worth.constraints, worth.figures, float(np.mean(errors)))
+        return Evaluation(evaluation.constraints, evaluation.figures, None, "a run ended in a fault")
+    return Evaluation(evaluation.constraints, evaluation.figures, float(np.mean(errors)))
 
 
-def _computed(search: SearchConfig, stage: Stage, bus: BusConfig, controller: ControllerConfig) -> Worth:
+def _computed(search: SearchConfig, stage: Stage, bus: BusConfig, controller: ControllerConfig) -> Evaluation:
     """Without a run. The cheap ones first: what is unstable as drawn is not looked at any further."""
     tolerances = config.load("tolerances", search.tolerances, Tolerances)
     law = design_law(stage, controller, bus, autostart=True)
@@ -218,7 +218,7 @@ def _computed(search: SearchConfig, stage: Stage, bus: BusConfig, controller: Co
         rest = [case for case in cases if not np.array_equal(case.strokes_m, middle)]
         figures["peak_s_changed"] = max(figures["peak_s_changed"], largest_peak(rest))
         beyond = _beyond(goals, figures)
-    return Worth(beyond, figures, None)
+    return Evaluation(beyond, figures, None)
 
 
 def _beyond(goals: Goals, figures: dict[str, float]) -> dict[str, float]:

@@ -1,5 +1,5 @@
-"""A search for the taps of the Youla filter: what is asked, as data, the plants that follow from it, and the file that
-comes out.
+"""A search for the taps of the Youla filter: what is asked, as data, the plants that
+follow from it, and the file that comes out.
 
 It is convex, so there is nothing to try: no trials, no database, the same taps every time.
 """

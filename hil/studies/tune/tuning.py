@@ -1,4 +1,4 @@
-"""A search by Optuna: numbers are asked for here, valued by many hands, and told back here; the study lives in a
+"""A search by Optuna: numbers are asked for here, valued by many workers, and told back here; the study lives in a
 database, so it can be continued, and shared by several machines.
 """
 
@@ -14,8 +14,8 @@ import numpy as np
 import optuna
 import tomlkit
 
-from hil.studies.spread.workers import as_done, given, hands
-from hil.studies.tune.search import Problem, Worth, evaluate, put
+from hil.studies.spread.workers import as_done, with_constant, worker_pool
+from hil.studies.tune.search import Evaluation, Problem, evaluate, put
 from pkxyz_ctrl.config.files import ConfigError
 from pkxyz_ctrl.config.refused import reason
 
@@ -90,10 +90,10 @@ def search(
             yield trial.number, _numbers(trial, problem)
 
     try:
-        with hands(workers, scheduler) as (pool, width):
-            valued = as_done(pool, width, given(_valued, problem), choices())
-            for done, ((number, _), worth) in enumerate(valued, start=1):
-                _tell(study, asked.pop(number), worth)
+        with worker_pool(workers, scheduler) as (pool, width):
+            valued = as_done(pool, width, with_constant(_valued, problem), choices())
+            for done, ((number, _), evaluation) in enumerate(valued, start=1):
+                _tell(study, asked.pop(number), evaluation)
                 on_progress(done, trials)
     finally:
         for trial in asked.values():
@@ -102,7 +102,7 @@ def search(
                 study.enqueue_trial(trial.params)  # the next run begins with what was not finished
 
 
-def _valued(problem: Problem, item: tuple[int, dict[str, float]]) -> Worth:
+def _valued(problem: Problem, item: tuple[int, dict[str, float]]) -> Evaluation:
     return evaluate(problem, item[1])
 
 
@@ -116,17 +116,17 @@ def rounded(value: float) -> float:
     return float(f"{value:.{_DIGITS - 1}e}")
 
 
-def _tell(study: optuna.Study, trial: optuna.Trial, worth: Worth) -> None:
-    for name, beyond in worth.constraints.items():
+def _tell(study: optuna.Study, trial: optuna.Trial, evaluation: Evaluation) -> None:
+    for name, beyond in evaluation.constraints.items():
         trial.set_constraint(name, beyond)
-    for name, value in worth.figures.items():
+    for name, value in evaluation.figures.items():
         trial.set_user_attr(name, value if np.isfinite(value) else None)
-    if worth.reason:
-        trial.set_user_attr("reason", worth.reason)
-    if worth.value is None:
+    if evaluation.reason:
+        trial.set_user_attr("reason", evaluation.reason)
+    if evaluation.value is None:
         study.tell(trial, state=_STATE.PRUNED)
     else:
-        study.tell(trial, worth.value)
+        study.tell(trial, evaluation.value)
 
 
 def best(study: optuna.Study, problem: Problem) -> Best | None:

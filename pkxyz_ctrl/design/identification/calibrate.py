@@ -98,7 +98,9 @@ def calibrate(
         comb_error = sense.error / sense.gain
     numbers = _numbers(unknown[:UNKNOWNS], sense.gain)
     springs = np.sqrt(np.diag(_SPRINGS @ covariance[:UNKNOWNS, :UNKNOWNS] @ _SPRINGS.T))
-    damping, damping_error = combined(modes.damping[modes.apart], np.diag(modes.damping_deviation[modes.apart] ** 2))
+    damping, damping_error = combined(
+        modes.damping[modes.apart], np.diag(modes.damping_standard_error[modes.apart] ** 2)
+    )
     amplifier_s = 0.5 / (math.pi * config.amplifier.bandwidth_hz)
     errors = StandardErrors(
         comb_gain=_triple(np.hypot(np.sqrt(np.diag(covariance)[:3]), comb_error) * np.array(numbers.comb_gain)),
@@ -108,7 +110,7 @@ def calibrate(
         crank_stiffness=_triple(springs[3:]),
         link_stiffness=float(np.sqrt(covariance[9, 9])),
         quality_factor=0.5 / damping**2 * damping_error,
-        sense_delay_s=modes.lag_deviation_s,
+        sense_delay_s=modes.lag_standard_error_s,
     )
     found = numbers.model_dump() | {
         "quality_factor": 0.5 / damping, "sense_delay_s": max(0.0, modes.lag_s - amplifier_s), "standard_error": errors,

@@ -2,15 +2,14 @@
 
     P(z) = sum over i of (B_i + C_i z^-1) z^-n / (1 - 2 Re(p_i) z^-1 + |p_i|^2 z^-2)  +  D z^-n,    p_i = exp(s_i T)
 
-n = d + 1: what is asked for at a sample acts d periods later and is seen at the sample after that. B_i, C_i and D
-(3, 3) are free real matrices: whatever amplifier, delays within a period and faster modes do to the
-stage's own modes is in them, and nothing needs to be assumed of it. The fit is of y to P u, output by output, each tone
-with the weight of the noise there; for given poles it is linear, so only frequencies and dampings are searched for
-(variable projection).
+n = d + 1: what is asked for at a sample acts d periods later and is seen at the sample after that. B_i, C_i and D (3,
+3) are free real matrices: whatever amplifier, delays within a period and faster modes do to the stage's own modes is in
+them, and nothing needs to be assumed of it. The fit is of y to P u, output by output, each tone with the weight of the
+noise there; for given poles it is linear, so only frequencies and dampings are searched for (variable projection).
 
-Two modes may coincide, as x and y of a stage as drawn do at mid-workspace: they move the chains in two patterns with
-one pair of poles, and a third pair would only fit noise. So two pairs are tried as well, and taken where a third
-explains nothing.
+Two modes may coincide, as x and y of a stage as drawn do at mid-workspace: they move the chains in
+two patterns with one pair of poles, and a third pair would only fit noise. So two pairs are tried as
+well, and taken where a third explains nothing.
 """
 
 import math
@@ -56,14 +55,14 @@ class ModalFit:
     """(3, 3) in counts/s^2 per V^2: how fast a step of V^2 sets the chains in motion, springs aside. The modes'
     numerators add up to M^-1, so that is the sense gains times J J^T over the mass times the comb gains.
     """
-    frequency_deviation_hz: Array
-    damping_deviation: Array
-    static_gain_deviation: Array
-    acceleration_gain_deviation: Array
-    """standard deviations, shapes as above"""
+    frequency_standard_error_hz: Array
+    damping_standard_error: Array
+    static_gain_standard_error: Array
+    acceleration_gain_standard_error: Array
+    """shapes as above"""
     lag_s: float
     """of the response beyond whole periods: amplifier and sense chain together, from all modes"""
-    lag_deviation_s: float
+    lag_standard_error_s: float
     gains_covariance: Array
     """(18, 18) of static and acceleration gain, row by row: both come from the same poles and residues"""
     chi_square: float
@@ -159,8 +158,8 @@ def fit_modes(
     values, values_covariance = _propagated(modes, theta, covariance, period_s, delay_periods)
     static, acceleration = values[:18].reshape(2, 3, 3)
     gains_covariance = values_covariance[:18, :18]
-    lag_s, lag_deviation_s = combined(values[18:], values_covariance[18:, 18:])
-    static_deviation, acceleration_deviation = np.sqrt(np.diag(gains_covariance)).reshape(2, 3, 3)
+    lag_s, lag_standard_error_s = combined(values[18:], values_covariance[18:, 18:])
+    static_standard_error, acceleration_standard_error = np.sqrt(np.diag(gains_covariance)).reshape(2, 3, 3)
     hz, ratio = (half[shared] for half in _halves(np.exp(modes)))
     of_hz, of_ratio = (half[shared] for half in _halves(np.sqrt(np.diag(covariance))[: len(modes)]))
     if not (hz.min() > low and hz.max() < high):
@@ -173,12 +172,12 @@ def fit_modes(
         damping=ratio,
         static_gain=static,
         acceleration_gain=acceleration,
-        frequency_deviation_hz=hz * of_hz,
-        damping_deviation=ratio * of_ratio,
-        static_gain_deviation=static_deviation,
-        acceleration_gain_deviation=acceleration_deviation,
+        frequency_standard_error_hz=hz * of_hz,
+        damping_standard_error=ratio * of_ratio,
+        static_gain_standard_error=static_standard_error,
+        acceleration_gain_standard_error=acceleration_standard_error,
         lag_s=lag_s,
-        lag_deviation_s=lag_deviation_s,
+        lag_standard_error_s=lag_standard_error_s,
         gains_covariance=gains_covariance,
         chi_square=chi_square,
         used_hz=(low, float(f.max())),
@@ -229,15 +228,15 @@ def _static_gain(modes: Array, theta: Array, period_s: float, delay_periods: int
 
 
 def combined(values: Array, covariance: Array) -> tuple[float, float]:
-    """The one number that (n,) values with a covariance (n, n) say together, and its standard deviation."""
+    """The one number that (n,) values with a covariance (n, n) say together, and its standard error."""
     weight = np.linalg.solve(covariance, np.ones(len(values)))
     return float(weight @ values / weight.sum()), float(weight.sum() ** -0.5)
 
 
 def _sudden(modes: Array, theta: Array, period_s: float, delay_periods: int) -> tuple[Array, Array]:
-    """Sum of the modes' numerators, (3, 3), from their residues, and the lag of amplifier and sense chain within a
-    period in s as each pair of poles (n,) shows it: it turns a mode's numerators by a common angle, which is taken
-    back.
+    """Sum of the modes' numerators, (3, 3), from their residues, and the lag of amplifier and
+    sense chain within a period in s as each pair of poles (n,) shows it: it turns a mode's
+    numerators by a common angle, which is taken back.
     """
     coefficients, total, lags_s = _per_input(theta), np.zeros((3, 3)), np.zeros(len(modes) // 2)
     for i, (hz, d) in enumerate(zip(*_halves(np.exp(modes)), strict=True)):

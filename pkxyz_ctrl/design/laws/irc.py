@@ -6,9 +6,9 @@ Aphale, Moheimani 2010). Without the feedthrough written apart it is a first-ord
 
     w = C_d(s) (e - v),   C_d = g / (s + g |D|),   v = k (t_i + 1/s) e
 
-so from e to force it is one law, w = -C_d (k t_i + k / s - 1) e. The integrator's gain g is taken from the root locus,
-as in that literature, but of the sampled, delayed plant: where the resonance is damped most. k is what the gain margin
-leaves.
+so from e to force it is one law, w = -C_d (k t_i + k / s - 1) e. The integrator's gain g is taken
+from the root locus, as in that literature, but of the sampled, delayed plant: where the resonance is
+damped most. k is what the gain margin leaves.
 """
 
 import math

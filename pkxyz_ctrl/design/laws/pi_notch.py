@@ -1,5 +1,5 @@
-"""The commercial baseline: on each axis an integrator with a proportional part behind two notches, one at each of the
-stage's frequencies.
+"""The commercial baseline: on each axis an integrator with a proportional part behind two
+notches, one at each of the stage's frequencies.
 
     K(s) = k (1/s + t_i) N(w_1) N(w_2),   N(w) = (s^2 + (w/Q) s + w^2) / (s^2 + 2 zeta w s + w^2)
 

@@ -15,9 +15,9 @@ Array = NDArray[np.float64]
 def regulator_gain(sampled: SampledStage, config: RegulatorConfig) -> tuple[Array, Array]:
     """K_x (3,3) in N/m and K_v (3,3) in N s/m of w = -K_x x - K_v v, for Bryson weights.
 
-    The regulator is designed for the state at the instant at which its force begins to act, which the filter
-    predicts, so the loop's delay needs no further states. Raises ``DesignError`` where scipy's solution or stability
-    says otherwise.
+    The regulator is designed for the state at the instant at which its force begins to act, which
+    the filter predicts, so the loop's delay needs no further states. Raises ``DesignError`` where
+    scipy's solution or stability says otherwise.
     """
     weights = (
         np.diag(np.repeat([config.position_error_m, config.velocity_error_m_per_s], 3) ** -2.0) * config.force_n**2

@@ -27,8 +27,7 @@ def user_law(
     ``system`` has 3 inputs and outputs (platform x, y, z), or one of each, which then serves every axis alike. A
     continuous one is sampled by ``method`` ("tustin" or "zoh"); a discrete one must have the plant's period (dt=True
     counts as that). The loop must be stable with ``delay_margin_s`` more delay than is known, by default a quarter of
-    a period.
-    Raises ``LawError``, and ``UnstableLawError`` where the loop would not be stable.
+    a period. Raises ``LawError``, and ``UnstableLawError`` where the loop would not be stable.
     """
     law = discrete_law(system, plant.period_s, method)
     return law, require_robust(law, plant, delay_margin_s)
@@ -72,8 +71,8 @@ def discrete_law(system: control.lti.LTI, period_s: float, method: str = "tustin
 
 
 def state_space(system: control.lti.LTI) -> control.StateSpace:
-    """A 3 x 3 system as state space, entry by entry, as python-control converts matrices of transfer functions only
-    with slycot.
+    """A 3 x 3 system as state space, entry by entry, as python-control converts matrices
+    of transfer functions only with slycot.
     """
     if isinstance(system, control.StateSpace):
         return system

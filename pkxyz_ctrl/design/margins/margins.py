@@ -253,8 +253,8 @@ def _mimo(grid_hz: Array, s: Complex, sensitivity: Callable[[Array], Complex]) -
 
 
 def _structured_peak(grid_hz: Array, matrices: Complex, function: Callable[[Array], Complex]) -> float:
-    """Largest structured norm: looked for where the plain norm, which is never below, could still pass the largest so
-    far.
+    """Largest structured norm: looked for where the plain norm, which is never
+    below, could still pass the largest so far.
     """
     plain = largest_singular_value(matrices)
     order = np.argsort(plain)[::-1]

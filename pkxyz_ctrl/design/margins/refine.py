@@ -53,9 +53,7 @@ def crossings(grid_hz: Array, values: Array, function: Function) -> Array:
 
 
 def first_above(grid_hz: Array, values: Array, function: Function, level: float) -> float:
-    """Where the function first reaches a level, from low frequencies; 0 if it starts above, the last if it never
-    does.
-    """
+    """Where the function first reaches a level, from low frequencies; 0 if it starts above, the last if never."""
     above = np.flatnonzero(values >= level)
     if len(above) == 0:
         return float(grid_hz[-1])

@@ -1,4 +1,4 @@
-"""How far devices may differ from the drawing, as data, and the plants that follow: at the ends, or drawn by a seed."""
+"""How far devices may differ from the drawing, as data; the plants that follow: at the ends, or sampled by a seed."""
 
 import itertools
 from dataclasses import dataclass
@@ -27,13 +27,13 @@ class Case:
 
 
 class ParasiticRange(FrozenModel):
-    """What a parasitic mode of a drawn device may be, each from least to greatest."""
+    """What a parasitic mode of a sampled device may be, each from least to greatest."""
 
     frequency_hz: tuple[Annotated[float, Field(gt=0)], Annotated[float, Field(gt=0)]]
     quality_factor: tuple[Annotated[float, Field(gt=0.5)], Annotated[float, Field(gt=0.5)]]
     compliance_share: tuple[Annotated[float, Field(ge=0, lt=1)], Annotated[float, Field(ge=0, lt=1)]]
 
-    def draw(self, rng: np.random.Generator) -> ParasiticMode:
+    def sample(self, rng: np.random.Generator) -> ParasiticMode:
         """One mode; frequency and quality factor evenly by ratio."""
         frequency_hz, quality_factor = (
             np.exp(rng.uniform(*np.log(r))) for r in (self.frequency_hz, self.quality_factor)
@@ -53,7 +53,7 @@ class Tolerances(FrozenModel):
     comb_gain: Relative
     """of each comb by itself"""
     delay_s: Annotated[float, Field(ge=0, lt=1e-3)] = 0.0
-    """between sample and action, more or less; of drawn devices, like all that follows"""
+    """between sample and action, more or less; of sampled devices, like all that follows"""
     amplifier_bandwidth: Relative = 0.0
     sense_bandwidth_hz: tuple[Annotated[float, Field(gt=0)], Annotated[float, Field(gt=0)]] | None = None
     """least and greatest corner of the sense chain"""
@@ -123,20 +123,20 @@ class Tolerances(FrozenModel):
                     found.append(Case(f"combined {len(found) + 1}", middle, change))
         return found
 
-    def draw(self, seed: int) -> Case:
-        """A plant drawn by a seed: everything at once, evenly within its range (the quality factor by ratio)."""
+    def sample(self, seed: int) -> Case:
+        """A plant sampled by a seed: everything at once, evenly within its range (the quality factor by ratio)."""
         rng = np.random.default_rng(seed)
         low, high = np.log(self.quality_factor)
         stiffness, mass = rng.uniform(-1, 1, 2) * (self.stiffness, self.mass)
         quality_factor = float(np.exp(rng.uniform(low, high)))
         comb = rng.uniform(-self.comb_gain, self.comb_gain, 3)
         strokes = rng.uniform(self.stroke_low_m, self.stroke_high_m, 3)
-        drawn = Perturbation(
+        sampled = Perturbation(
             float(stiffness), float(mass), quality_factor, (float(comb[0]), float(comb[1]), float(comb[2])),
             delay_s=float(rng.uniform(-self.delay_s, self.delay_s)),
             amplifier_bandwidth=float(rng.uniform(-self.amplifier_bandwidth, self.amplifier_bandwidth)),
             sense_bandwidth_hz=None if self.sense_bandwidth_hz is None
             else float(np.exp(rng.uniform(*np.log(self.sense_bandwidth_hz)))),
-            parasitic=tuple(mode.draw(rng) for mode in self.parasitic),
+            parasitic=tuple(mode.sample(rng) for mode in self.parasitic),
         )  # fmt: skip
-        return Case(f"seed {seed}", strokes, drawn)
+        return Case(f"seed {seed}", strokes, sampled)

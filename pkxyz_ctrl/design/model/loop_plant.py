@@ -112,8 +112,8 @@ def loop_plant(stage: Stage, bus: BusConfig, strokes_m: ArrayLike, perturbation:
 
 
 def held_force_softening(stage: Stage, position_m: Array, force_n: Array | None = None) -> Array:
-    """G (3,3) in N/m: sum of F_i times the second derivative of stroke i, by default for the forces that hold the
-    position.
+    """G (3,3) in N/m: sum of F_i times the second derivative of stroke i, by default
+    for the forces that hold the position.
 
     From q_i = p.e_i - sqrt(L2^2 - z^2) - sqrt(L1^2 - (p.n_i)^2) + const (the paper's Eq. 8 with its signs put right).
     """

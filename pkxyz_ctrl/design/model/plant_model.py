@@ -45,8 +45,8 @@ class LinearStage:
 
 
 def linearise(stage: Stage, strokes_m: Array) -> LinearStage:
-    """The stage about the position of given strokes. Damping is modal: every mode at rest has the stage's quality
-    factor.
+    """The stage about the position of given strokes. Damping is modal: every mode
+    at rest has the stage's quality factor.
 
     C = sqrt(m) K(0)^(1/2) / Q, which damps a mode of angular frequency omega by m omega / Q.
     """
@@ -63,9 +63,7 @@ def linearise(stage: Stage, strokes_m: Array) -> LinearStage:
 
 @dataclass(frozen=True)
 class SampledStage:
-    """s+ = Phi s + Gamma w + Gamma_lag (w_old - w) over one period, w held and approached through the amplifier's
-    pole.
-    """
+    """s+ = Phi s + Gamma w + Gamma_lag (w_old - w) over a period, w held, approached through the amplifier's pole."""
 
     period_s: float
     phi: Array  # (9,9)
@@ -74,8 +72,8 @@ class SampledStage:
 
 
 def sample(model: LinearStage, period_s: float, amplifier_time_constant_s: float) -> SampledStage:
-    """Exact sampling: the matrix exponential of [A B B; 0 0 0; 0 0 -1/tau], whose last block is the amplifier's
-    approach.
+    """Exact sampling: the matrix exponential of [A B B; 0 0 0; 0 0 -1/tau], whose
+    last block is the amplifier's approach.
     """
     augmented = np.zeros((15, 15))
     augmented[:9, :9] = model.a
