@@ -22,6 +22,7 @@ COMMANDS = {
     "run": ("hil.commands.run:run", "Control an amplifier at rate."),
     "plant": ("hil.commands.run:plant", "Serve amplifier and plant for run."),
     "check-amplifier": ("hil.commands.check_amplifier:check_amplifier", "May this amplifier be enabled?"),
+    "export": ("hil.commands.export:export", "The controller as C for a board."),
     "dbc": ("hil.commands.dbc:dbc", "The DBC of a bus, for CAN tools."),
     "latency": ("hil.commands.latency:latency", "How late this machine wakes up."),
     "paper": ("hil.commands.mechanics:paper", "The paper's numbers beside ours."),

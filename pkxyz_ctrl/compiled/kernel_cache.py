@@ -92,10 +92,24 @@ def _forget_empty(folder: Path) -> None:
                     os.unlink(file)
 
 
+def digest_of_kernels() -> str:
+    """SHA-256 over the sources of all kernels, by their places in the package: the same wherever that is installed."""
+    digest = hashlib.sha256()
+    root = Path(__file__).parents[2]
+    for path, source in _sources_of_kernels().items():
+        digest.update(f"{path.relative_to(root).as_posix()} {len(source)}\n".encode() + source)
+    return digest.hexdigest()
+
+
 def _digest_of_kernels() -> str:
-    """Over every file that holds a kernel and all of ours that these import: a
-    kernel freezes the constants that it uses.
-    """
+    digest = hashlib.sha256(sys.version.encode())
+    for path, source in _sources_of_kernels().items():
+        digest.update(str(path).encode() + source)
+    return digest.hexdigest()[:16]
+
+
+def _sources_of_kernels() -> dict[Path, bytes]:
+    """Every file that holds a kernel and all of ours that these import: a kernel freezes the constants that it uses."""
     root = Path(__file__).parents[2]
     sources = {path: path.read_bytes() for package in _PACKAGES for path in sorted((root / package).rglob("*.py"))}
     relevant: set[Path] = set()
@@ -107,10 +121,7 @@ def _digest_of_kernels() -> str:
             for module, names in _IMPORT.findall(sources[path].decode()):
                 folder = root / module.replace(".", "/")
                 waiting += [folder.with_suffix(".py"), *(folder / f"{name}.py" for name in re.findall(r"\w+", names))]
-    digest = hashlib.sha256(sys.version.encode())
-    for path in sorted(relevant):
-        digest.update(str(path).encode() + sources[path])
-    return digest.hexdigest()[:16]
+    return {path: sources[path] for path in sorted(relevant)}
 
 
 def _forget_old(home: Path) -> None:

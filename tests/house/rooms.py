@@ -42,6 +42,7 @@ HOUSE: Mapping[str, Room] = MappingProxyType({
     "pkxyz_ctrl.loop": Room(
         ("pkxyz_ctrl.can", "pkxyz_ctrl.safety", "pkxyz_ctrl.compiled", "pkxyz_ctrl.config", "pkxyz_ctrl.core")
     ),
+    "pkxyz_ctrl.export": Room(("pkxyz_ctrl.safety", "pkxyz_ctrl.compiled", "pkxyz_ctrl.core", "pkxyz_ctrl.loop")),
     # the device, and what is designed for it offline
     "pkxyz_ctrl.elements": Room(("pkxyz_ctrl.config",)),
     "pkxyz_ctrl": Room(("pkxyz_ctrl.compiled", "pkxyz_ctrl.config", "pkxyz_ctrl.core", "pkxyz_ctrl.elements")),

@@ -1,0 +1,39 @@
+"""``python -m pkxyz_ctrl.export.emit FILE``: write the kernels' unoptimised LLVM IR, below a line with their symbols.
+
+``kernels`` runs it, in the environment that it needs.
+"""
+
+import json
+import sys
+from pathlib import Path
+from typing import Any
+
+import llvmlite.binding as llvm
+from numba import from_dtype, types
+
+from pkxyz_ctrl.export.entries import ENTRIES, Entry
+
+
+def main(out: Path) -> None:
+    """Compile every entry and write one module."""
+    module, symbols = None, {}
+    for entry in ENTRIES:
+        overload = _compiled(entry)
+        symbols[entry.name] = overload.fndesc.llvm_func_name
+        part = llvm.parse_assembly(overload.library.get_llvm_str())
+        if module is None:
+            module = part
+        else:
+            module.link_in(part)
+    out.write_text(f"{json.dumps(symbols)}\n{module}", encoding="utf-8")
+
+
+def _compiled(entry: Entry) -> Any:
+    signature = tuple(types.Array(from_dtype(argument.dtype), 1, "C") for argument in entry.arguments)
+    kernel = entry.kernel
+    kernel.compile(signature)
+    return kernel.overloads[signature]
+
+
+if __name__ == "__main__":
+    main(Path(sys.argv[1]))

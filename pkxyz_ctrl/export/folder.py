@@ -1,0 +1,167 @@
+"""The folder of an export: everything that builds on a machine without Python, and says what it is."""
+
+import hashlib
+import json
+from importlib.metadata import version
+from pathlib import Path
+from string import Template
+from typing import Any, NamedTuple
+
+import llvmlite
+import llvmlite.binding as llvm
+import numba
+import numpy as np
+from numpy.typing import NDArray
+
+from pkxyz_ctrl.compiled.kernel_cache import digest_of_kernels
+from pkxyz_ctrl.core.tick import PREDICTIVE
+from pkxyz_ctrl.export.elf import loaded_bytes
+from pkxyz_ctrl.export.kernels import ExportError, kernels
+from pkxyz_ctrl.export.lowering import Lowered, lower
+from pkxyz_ctrl.export.selftest import BEGINS_IN, EVERY, SelfTest, self_test
+from pkxyz_ctrl.export.structs import header, struct_name
+from pkxyz_ctrl.export.targets import TARGETS, Target
+from pkxyz_ctrl.export.words import CANONICAL_NAN, FNV_OFFSET, FNV_PRIME, c_words, double_words, words_of
+from pkxyz_ctrl.loop import cycle as cycling
+from pkxyz_ctrl.loop.row import ROW
+
+Records = NDArray[np.void]
+
+PORT = Path(__file__).parent / "port"
+REFERENCE_MAX_BYTES = 2 << 20
+"""Of a microcontroller's flash; a board that streams its reference needs no more than some rows."""
+
+
+class Exported(NamedTuple):
+    """What is to be exported: the law (1,), the reference's rows (n,), inputs (m,) of a self-test, names for people."""
+
+    law: Records
+    reference: Records
+    inputs: Records
+    scenario: str
+    controller: str
+    config_digest: str
+
+
+def target_of(name: str) -> Target:
+    """Raises ``ExportError`` for a name that is none."""
+    if name not in TARGETS:
+        raise ExportError(f"--target: {name!r} is none; choose {', '.join(TARGETS)}")
+    return TARGETS[name]
+
+
+def require_exportable(law: Records, name: str) -> None:
+    """Raises ``ExportError`` for a law that does not go whole."""
+    if law["tick"]["kind"][0] == PREDICTIVE:
+        raise ExportError(
+            f"controller {name!r} solves a problem in the middle of a tick, and the solver does not go with it yet; "
+            "choose another one (--controller robust)"
+        )
+
+
+def write(out: Path, target_name: str, exported: Exported) -> dict[str, Any]:
+    """Write the folder, which must be empty or not there; returns its manifest. Raises ``ExportError``, ``OSError``."""
+    target = target_of(target_name)
+    require_exportable(exported.law, exported.controller)
+    size = exported.reference.nbytes
+    if not target.is_hosted and size > REFERENCE_MAX_BYTES:
+        rows = REFERENCE_MAX_BYTES // exported.reference.itemsize
+        raise ExportError(
+            f"the reference takes {size / 2**20:.1f} MiB, more than a board's flash; give --ticks {rows} or less, and "
+            "stream the rest"
+        )
+    test = self_test(exported.law, exported.reference, exported.inputs)
+    lowered = lower(kernels(), target)
+    files = _files(target_name, target, exported, test, lowered)
+    manifest = _manifest(target_name, target, exported, test, lowered, files)
+    files["manifest.json"] = (json.dumps(manifest, indent=2) + "\n").encode()
+    out.mkdir(parents=True, exist_ok=True)
+    if any(out.iterdir()):
+        raise ExportError(f"--out: {out}: is not empty, and nothing is overwritten; give a new folder, or empty it")
+    for name, content in sorted(files.items()):
+        (out / name).write_bytes(content)
+    return manifest
+
+
+def _files(name: str, target: Target, exported: Exported, test: SelfTest, lowered: Lowered) -> dict[str, bytes]:
+    values = {
+        "target": name, "about": target.about, "compiler": target.compiler, "flags": target.flags,
+        "scenario": exported.scenario, "controller": exported.controller,
+        "period_us": str(int(exported.law["period_us"][0])), "ticks": str(len(test.inputs)), "every": str(EVERY),
+        "last": f"{test.digests[-1]:016x}",
+        "code_bytes": str(loaded_bytes(lowered.code)), "law_bytes": str(exported.law.nbytes),
+        "memory_bytes": str(cycling.MEMORY.itemsize), "row_bytes": str(ROW.itemsize),
+        "reference_bytes": str(exported.reference.nbytes), "rows": str(len(exported.reference)),
+        "owed": ", ".join(lowered.owed) or "nothing",
+        "port": target.port,
+        "mode": str(int(BEGINS_IN)), "link": target.link,
+    }  # fmt: skip
+    files = {file: _filled(file, values) for file in ("main.c", "Makefile", "CMakeLists.txt", "README.md")}
+    files |= {
+        file: (PORT / file).read_bytes() for file in (target.port, *target.link.split()) if (PORT / file).is_file()
+    }
+    texts = {
+        "pkxyz.h": header(int(exported.law["period_us"][0])),
+        "pkxyz.s": lowered.assembly,
+        "law.c": _constant("pkxyz_law_words", exported.law, many=False),
+        "reference.c": _constant("pkxyz_path_words", exported.reference, many=True),
+        "selftest.c": _self_test_c(test),
+    }
+    return files | {file: text.encode() for file, text in texts.items()} | {"pkxyz.o": lowered.code}
+
+
+def _filled(file: str, values: dict[str, str]) -> bytes:
+    return Template((PORT / file).read_text(encoding="utf-8")).substitute(values).encode()
+
+
+def _constant(name: str, records: Records, *, many: bool) -> str:
+    kind, words = struct_name(records.dtype), words_of(records)
+    count = f"const int32_t {name}_count = {len(records)};\n" if many else ""
+    return (
+        f'#include "pkxyz.h"\n\n/* {len(records)} of {kind} */\n{count}'
+        f"const uint64_t {name}[{len(words)}] = {{\n{c_words(words)}}};\n"
+    )
+
+
+def _self_test_c(test: SelfTest) -> str:
+    tables = {"row": ROW, "memory": cycling.MEMORY}
+    flags = "".join(
+        f"const uint8_t pkxyz_{name}_is_double[{len(double_words(dtype))}] = "
+        f"{{{','.join(str(int(is_double)) for is_double in double_words(dtype))}}};\n"
+        for name, dtype in tables.items()
+    )
+    digests = "".join(f"    0x{value:016x},\n" for value in test.digests)
+    constants = (
+        f"const uint64_t pkxyz_hash_begin = 0x{FNV_OFFSET:016x}, pkxyz_hash_prime = 0x{FNV_PRIME:016x};\n"
+        f"const uint64_t pkxyz_nan = 0x{CANONICAL_NAN:016x};\n"
+    )
+    return (
+        f"{_constant('pkxyz_input_words', test.inputs, many=True)}\n{constants}{flags}"
+        f"const uint64_t pkxyz_digests[{len(test.digests)}] = {{\n{digests}}};\n"
+    )
+
+
+def _manifest(
+    name: str, target: Target, exported: Exported, test: SelfTest, lowered: Lowered, files: dict[str, bytes]
+) -> dict[str, Any]:
+    """What this is and what it was made of; the same for the same input."""
+    return {
+        "target": {"name": name, "triple": target.llvm_triple, "cpu": target.cpu, "features": target.features},
+        "scenario": exported.scenario,
+        "controller": exported.controller,
+        "digests": {
+            "config": exported.config_digest,
+            "kernels": digest_of_kernels(),
+            "files": {file: hashlib.sha256(content).hexdigest() for file, content in sorted(files.items())},
+        },
+        "self_test": {"ticks": len(test.inputs), "every": EVERY, "fnv1a_64": [f"{d:016x}" for d in test.digests]},
+        "bytes": {
+            "code": loaded_bytes(lowered.code), "law": exported.law.nbytes, "memory": cycling.MEMORY.itemsize,
+            "row": ROW.itemsize, "reference": exported.reference.nbytes,
+        },
+        "owed_symbols": list(lowered.owed),
+        "versions": {
+            "pkxyz-ctrl": version("pkxyz-ctrl"), "numba": numba.__version__, "llvmlite": llvmlite.__version__,
+            "llvm": ".".join(str(part) for part in llvm.llvm_version_info), "numpy": np.__version__,
+        },
+    }  # fmt: skip

@@ -1,0 +1,76 @@
+"""LLVM's view of the kernels before anything is optimised: made in a process of its own, and kept.
+
+What numba has optimised holds vectors and intrinsics of this machine's processor, hence ``NUMBA_OPT=0``; and it reads
+that setting once, when it is imported, hence the process. Its output and its mangled names are no stable interface:
+the versions are pinned, and a test compares bits.
+"""
+
+import hashlib
+import json
+import os
+import subprocess
+import sys
+import tempfile
+from pathlib import Path
+from typing import NamedTuple
+
+import llvmlite
+import numba
+
+
+class ExportError(ValueError):
+    """What is asked for can't be exported; the message says why and what to do."""
+
+
+class Kernels(NamedTuple):
+    """``ir``: one module with all of them. ``symbols``: names of the entries' functions in it."""
+
+    ir: str
+    symbols: dict[str, str]
+
+
+def kernels() -> Kernels:
+    """Those of ``entries.ENTRIES``, from the folder of compiled kernels if they lie there. Takes a minute if not."""
+    kept = _kept()
+    if kept is not None and kept.is_file():
+        text = kept.read_text(encoding="utf-8")
+    else:
+        text = _emitted()
+        if kept is not None:
+            beside = kept.with_suffix(f".{os.getpid()}")
+            beside.write_text(text, encoding="utf-8")
+            beside.replace(kept)
+    first, _, ir = text.partition("\n")
+    return Kernels(ir, json.loads(first))
+
+
+def _kept() -> Path | None:
+    """A file in numba's cache folder, which goes with the digest of every kernel's source."""
+    folder = os.environ.get("NUMBA_CACHE_DIR")
+    if folder is None or not Path(folder).is_dir():
+        return None
+    here = Path(__file__).parent
+    digest = hashlib.sha256(f"{numba.__version__} {llvmlite.__version__}".encode())
+    for name in ("entries.py", "emit.py"):
+        digest.update((here / name).read_bytes())
+    return Path(folder) / f"export-{digest.hexdigest()[:16]}.ll"
+
+
+def _emitted() -> str:
+    with tempfile.TemporaryDirectory(prefix="pkxyz-export-") as folder:
+        out = Path(folder) / "kernels.ll"
+        env = {
+            **os.environ,
+            "NUMBA_OPT": "0",
+            "NUMBA_CPU_NAME": "generic",
+            "NUMBA_CPU_FEATURES": "",
+            "NUMBA_CACHE_DIR": folder,
+            "NUMBA_DISABLE_JIT": "0",
+            "PYTHONPATH": os.pathsep.join(path for path in sys.path if path),
+        }
+        words = [sys.executable, "-W", "ignore", "-m", "pkxyz_ctrl.export.emit", str(out)]
+        done = subprocess.run(words, env=env, check=False, capture_output=True, text=True)
+        if done.returncode != 0:
+            last = (done.stderr.strip().splitlines() or ["it said nothing"])[-1]
+            raise ExportError(f"the kernels could not be compiled for export: {last}")
+        return out.read_text(encoding="utf-8")

@@ -1,0 +1,157 @@
+"""From the kernels' LLVM IR to an object for a target: wrappers dropped, a plain C entry each, LLVM's own passes."""
+
+import re
+from typing import NamedTuple
+
+import llvmlite.binding as llvm
+
+from pkxyz_ctrl.export import runtime
+from pkxyz_ctrl.export.elf import undefined
+from pkxyz_ctrl.export.entries import ENTRIES, Entry
+from pkxyz_ctrl.export.kernels import ExportError, Kernels
+from pkxyz_ctrl.export.targets import Target
+
+_SOFT_DOUBLE = re.compile(r"__aeabi_(d\w+|\w*2d|cd\w+|f2d)")
+_LIBRARY = re.compile(r"(__aeabi_)?mem(set|clr|cpy|move)[48]?")
+_ROUNDS = 2  # of the passes: what a callee turned out to return is known to its caller in the second
+
+
+class Lowered(NamedTuple):
+    """``code``: an ELF object. ``owed``: symbols that the port's libraries have to define."""
+
+    code: bytes
+    assembly: str
+    owed: tuple[str, ...]
+
+
+def lower(kernels: Kernels, target: Target) -> Lowered:
+    """Compile for a target. Raises ``ExportError`` if a kernel needs what no bare machine has: a heap, an exception."""
+    machine = target.machine
+    text = _prepared(kernels, target, machine)
+    module = _optimised(text, machine)
+    if not target.is_wide:
+        module = _optimised(_without_wide_conversions(str(module)), machine)
+    _name_plainly(module, kernels)
+    if not target.is_hosted:
+        module = _with_memory_functions(module, target, machine)
+    for function in module.functions:
+        if not function.is_declaration:
+            function.add_function_attribute("nounwind")
+    code = machine.emit_object(module)
+    owed = tuple(sorted(undefined(code)))
+    refused = [name for name in owed if not _may_be_owed(name, target)]
+    if refused:
+        raise ExportError(f"a kernel needs {', '.join(refused)}, which no board has: no heap, no exception, no libm")
+    return Lowered(code, machine.emit_assembly(module), owed)
+
+
+def _may_be_owed(name: str, target: Target) -> bool:
+    if target.is_hosted:
+        return _LIBRARY.fullmatch(name) is not None
+    return not target.has_double and _SOFT_DOUBLE.fullmatch(name) is not None
+
+
+def _prepared(kernels: Kernels, target: Target, machine: llvm.TargetMachine) -> str:
+    text = kernels.ir
+    for line, value in (("triple", target.llvm_triple), ("datalayout", machine.target_data)):
+        text = re.sub(rf'^target {line} = ".*"$', f'target {line} = "{value}"', text, count=1, flags=re.MULTILINE)
+    for name in ("NRT_incref", "NRT_decref"):  # of arrays that nobody allocated
+        text = _replaced(text, name, f"define internal void @{name}(ptr %0) alwaysinline {{ ret void }}")
+    text = re.sub(r"@(floor|llvm\.floor\.f64)\(", "@pkxyz.floor(", text)
+    text = re.sub(r"^declare .*@pkxyz\.floor\(.*$", "", text, flags=re.MULTILINE)
+    root, own_root = ("llvm.sqrt.f64", "") if target.has_double else ("pkxyz.sqrt", runtime.SQUARE_ROOT)
+    text = re.sub(r"@(sqrt|llvm\.sqrt\.f64)\(", f"@{root}(", text)
+    if own_root:
+        text = re.sub(r"^declare .*@pkxyz\.sqrt\(.*$", "", text, flags=re.MULTILINE)
+    return text + runtime.FLOOR + own_root + "".join(_c_entry(entry, kernels) for entry in ENTRIES)
+
+
+def _replaced(text: str, name: str, definition: str) -> str:
+    pattern = rf"^define [^\n]*@{re.escape(name)}\(.*?^}}$"
+    return re.sub(pattern, lambda _: definition, text, count=1, flags=re.MULTILINE | re.DOTALL)
+
+
+def _c_entry(entry: Entry, kernels: Kernels) -> str:
+    """A function of pointers and counts that builds what numba hands over for an array: owner, parent, items, bytes of
+    an item, data, shape, strides.
+    """
+    symbol = kernels.symbols[entry.name]
+    found = re.search(rf"^define [^\n]*@{re.escape(symbol)}\(([^\n]*)\)", kernels.ir, re.MULTILINE)
+    expected = 2 + 7 * len(entry.arguments)
+    if found is None or found[1].count("%") != expected:
+        raise ExportError(f"this version of numba hands arguments of {entry.name} over in another way: see constraints")
+    taken, counts, handed = [], [], ["ptr %result", "ptr %problem"]
+    for argument in entry.arguments:
+        taken.append(f"ptr %{argument.name}")
+        count = "1"
+        if argument.many:
+            taken.append(f"i32 %{argument.name}_count")
+            counts.append(f"  %{argument.name}_n = sext i32 %{argument.name}_count to i64\n")
+            count = f"%{argument.name}_n"
+        size = argument.dtype.itemsize
+        handed += ["ptr null", "ptr null", f"i64 {count}", f"i64 {size}", f"ptr %{argument.name}", f"i64 {count}"]
+        handed.append(f"i64 {size}")
+    return (
+        f"\ndefine i32 @{entry.name}({', '.join(taken)}) {{\n{''.join(counts)}"
+        f"  %result = alloca ptr\n  %problem = alloca ptr\n"
+        f"  %status = call i32 @{symbol}({', '.join(handed)})\n  ret i32 %status\n}}\n"
+    )
+
+
+def _optimised(text: str, machine: llvm.TargetMachine) -> llvm.ModuleRef:
+    """The module with nothing left that no entry calls, and nothing vectorised: order of operations is the source's."""
+    module = llvm.parse_assembly(text)
+    module.verify()
+    public = {entry.name for entry in ENTRIES}
+    for function in module.functions:
+        if not function.is_declaration:
+            function.linkage = "external" if function.name in public else "internal"
+    for variable in module.global_variables:
+        if not variable.is_declaration:
+            variable.linkage = "internal"
+    options = llvm.create_pipeline_tuning_options(speed_level=2)
+    options.slp_vectorization = options.loop_vectorization = False
+    builder = llvm.create_pass_builder(machine, options)
+    for _ in range(_ROUNDS):
+        builder.getModulePassManager().run(module, builder)
+    return module
+
+
+def _without_wide_conversions(text: str) -> str:
+    """Calls of our own in place of what would become a call of a helper."""
+    operand = r"([%@\w.$\"-]+)"
+    before = text
+    text = re.sub(rf"= sitofp i64 {operand} to double", r"= call double @pkxyz.from_i64(i64 \1)", text)
+    text = re.sub(rf"= uitofp (?:nneg )?i64 {operand} to double", r"= call double @pkxyz.from_u64(i64 \1)", text)
+    text = re.sub(rf"= fptosi double {operand} to i64", r"= call i64 @pkxyz.to_i64(double \1)", text)
+    if text == before:
+        return text
+    declared = "" if "@llvm.fabs.f64(" in text else "declare double @llvm.fabs.f64(double)\n"
+    return text + declared + runtime.CONVERSIONS
+
+
+def _name_plainly(module: llvm.ModuleRef, kernels: Kernels) -> None:
+    """Where each comes from, in place of numba's mangled names, which count what was compiled before."""
+    for function in module.functions:
+        parts = re.match(r"_ZN((?:\d+[A-Za-z_]\w*)+)", function.name)
+        if not function.is_declaration and parts:
+            function.name = ".".join(_components(function.name[3:]))
+    for number, variable in enumerate(module.global_variables):
+        if variable.name.startswith(".const"):
+            variable.name = f"table.{number}"
+
+
+def _components(mangled: str) -> list[str]:
+    """``11pkxyz_ctrl4core`` ... as [pkxyz_ctrl, core, ...]: names with their lengths before them."""
+    words = []
+    while match := re.match(r"\d+", mangled):
+        begin, length = match.end(), int(match[0])
+        words.append(mangled[begin : begin + length])
+        mangled = mangled[begin + length :]
+    return words
+
+
+def _with_memory_functions(module: llvm.ModuleRef, target: Target, machine: llvm.TargetMachine) -> llvm.ModuleRef:
+    needed = undefined(machine.emit_object(module))
+    added = runtime.memory_functions(needed, "i64" if target.is_wide else "i32")
+    return llvm.parse_assembly(str(module) + added) if added else module

@@ -1,0 +1,196 @@
+"""Records as C structs: the header, generated from the dtypes, with every offset and size asserted.
+
+A struct is named after where its dtype stands: ``ESTIMATE`` of ``core.estimator`` is ``pkxyz_estimator_estimate``. What
+is said of a field there, in the comment behind it, is said in C as well.
+"""
+
+import ast
+import io
+import re
+import sys
+import tokenize
+from collections.abc import Iterable
+from enum import IntEnum, IntFlag
+from functools import cache
+from pathlib import Path
+from types import MappingProxyType, ModuleType
+from typing import Any, NamedTuple
+
+import numpy as np
+
+from pkxyz_ctrl.export.entries import ENTRIES, Entry
+from pkxyz_ctrl.safety.modes import Event, Mode
+from pkxyz_ctrl.safety.monitors import NodeEvent, SenseStatus
+from pkxyz_ctrl.safety.trips import Trip
+
+_NUMBERS = (("MODE", Mode), ("EVENT", Event), ("SENSE", SenseStatus), ("NODE", NodeEvent), ("TRIP", Trip))
+_C_TYPE = MappingProxyType(
+    {"f8": "double", "i8": "int64_t", "i4": "int32_t", "i2": "int16_t", "i1": "int8_t", "u8": "uint64_t"}
+    | {"u4": "uint32_t", "u2": "uint16_t", "u1": "uint8_t"}
+)
+_UNITS = MappingProxyType(
+    {unit: unit for unit in ("m", "s", "us", "ms", "kg", "rad", "count", "ticks", "bit")}
+    | {"n": "N", "n2": "N^2", "v": "V", "v2": "V^2", "f": "F", "volt": "V", "metre": "m", "farad": "F"}
+)
+Dtype = np.dtype[Any]
+
+
+class _Place(NamedTuple):
+    """Where a dtype is defined: its module, the name there, and what is said about its fields."""
+
+    module: str
+    name: str
+    comments: dict[str, str]
+
+    @property
+    def c_name(self) -> str:
+        stem = self.module.rpartition(".")[2]
+        own = self.name.lower()
+        return f"pkxyz_{own}" if own == stem or stem in own.split("_") else f"pkxyz_{stem}_{own}"
+
+
+def header(period_us: int) -> str:
+    """``pkxyz.h``. ``period_us``: of the law that goes with it."""
+    places = {id(dtype): place for dtype, place in _defined()}
+    records = _in_order(argument.dtype for entry in ENTRIES for argument in entry.arguments)
+    names = {id(dtype): places[id(dtype)].c_name for dtype in records}
+    parts = [_HEAD.format(period_us=period_us)]
+    parts += [_enumeration(prefix, kind) for prefix, kind in _NUMBERS]
+    parts += [_struct(dtype, places[id(dtype)], names) for dtype in records]
+    for entry in ENTRIES:
+        parts.append(f"/* {entry.about}\n   Returns 0; anything else: 0 V, at once. */\n{_prototype(entry, names)};\n")
+    return "\n".join([*parts, _TAIL])
+
+
+def struct_name(dtype: Dtype) -> str:
+    """What C calls a record."""
+    return next(place.c_name for known, place in _defined() if known is dtype)
+
+
+def unit_of(field: str) -> str:
+    """``N s/m`` for ``velocity_gain_n_s_per_m``; empty for a field whose name carries none."""
+    words = field.split("_")
+    while words and words[0] not in (*_UNITS, "per"):
+        words.pop(0)
+    if not words or words[0] == "per" or any(word not in (*_UNITS, "per") for word in words):
+        return ""
+    if words == field.split("_") and "per" not in words:
+        return ""
+    above, _, below = " ".join(_UNITS.get(word, word) for word in words).partition(" per ")
+    return f"{above}/{below}" if below else above
+
+
+def _in_order(roots: Iterable[Dtype]) -> list[Dtype]:
+    """Records, those that others hold before them."""
+    found: dict[int, Dtype] = {}
+
+    def visit(dtype: Dtype) -> None:
+        for field, *_ in (dtype.fields or {}).values():
+            if field.base.fields:
+                visit(field.base)
+        found.setdefault(id(dtype), dtype)
+
+    for root in roots:
+        visit(root)
+    return list(found.values())
+
+
+def _enumeration(prefix: str, kind: type[IntEnum] | type[IntFlag]) -> str:
+    lines = [f"    PKXYZ_{prefix}_{member.name} = {int(member)}," for member in kind]
+    return f"enum {{ /* {kind.__name__} */\n" + "\n".join(lines) + "\n};\n"
+
+
+def _struct(dtype: Dtype, place: _Place, names: dict[int, str]) -> str:
+    name = place.c_name
+    lines = [f"/* {place.module.removeprefix('pkxyz_ctrl.')}.{place.name} */", "typedef struct {"]
+    asserts = []
+    for field, (kind, offset, *_) in (dtype.fields or {}).items():
+        base = kind.base
+        c_type = names[id(base)] if base.fields else _C_TYPE[base.str[1:]]
+        shape = "".join(f"[{length}]" for length in kind.shape)
+        said = ", ".join(text for text in (unit_of(field), place.comments.get(field, "")) if text)
+        lines.append(f"    {c_type} {field}{shape};" + (f" /* {said} */" if said else ""))
+        asserts.append(f"PKXYZ_ASSERT(offsetof({name}, {field}) == {offset});")
+    asserts.append(f"PKXYZ_ASSERT(sizeof({name}) == {dtype.itemsize});")
+    return "\n".join([*lines, f"}} {name};", *asserts, ""])
+
+
+def _prototype(entry: Entry, names: dict[int, str]) -> str:
+    taken = []
+    for argument in entry.arguments:
+        const = "const " if argument.is_const else ""
+        taken.append(f"{const}{names[id(argument.dtype)]} *{argument.name}")
+        taken += [f"int32_t {argument.name}_count"] if argument.many else []
+    return f"int32_t {entry.name}({', '.join(taken)})"
+
+
+@cache
+def _defined() -> tuple[tuple[Dtype, _Place], ...]:
+    """Every record of the modules that are loaded, with its place."""
+    found = []
+    for name, module in sorted(sys.modules.items()):
+        if name.startswith("pkxyz_ctrl.") and module.__file__ is not None:
+            found += _defined_in(name, module)
+    return tuple(found)
+
+
+def _defined_in(name: str, module: ModuleType) -> list[tuple[Dtype, _Place]]:
+    source = Path(str(module.__file__)).read_text(encoding="utf-8")
+    if "np.dtype(" not in source:
+        return []
+    comments = _comments(source)
+    found = []
+    for node in ast.parse(source).body:
+        target = node.targets[0] if isinstance(node, ast.Assign) else getattr(node, "target", None)
+        dtype = getattr(module, target.id, None) if isinstance(target, ast.Name) else None
+        if isinstance(target, ast.Name) and isinstance(dtype, np.dtype) and dtype.fields:
+            said = _said(node, comments)
+            missing = set(dtype.fields) - said.keys()  # a dtype that is put together from lists of fields
+            for other in ast.parse(source).body if missing else ():
+                said = {key: text for key, text in _said(other, comments).items() if key in missing} | said
+            found.append((dtype, _Place(name, target.id, said)))
+    return found
+
+
+def _said(node: ast.stmt, comments: dict[int, str]) -> dict[str, str]:
+    """Comments behind the fields of a list of them."""
+    found = {}
+    for part in ast.walk(node):
+        if isinstance(part, ast.Tuple) and part.elts and isinstance(part.elts[0], ast.Constant):
+            key = part.elts[0].value
+            if isinstance(key, str) and part.end_lineno in comments:
+                found[key] = comments[part.end_lineno]
+    return found
+
+
+def _comments(source: str) -> dict[int, str]:
+    """By line, with nothing in them that would end a comment in C."""
+    tokens = tokenize.generate_tokens(io.StringIO(source).readline)
+    return {t.start[0]: re.sub(r"\*/|/\*", "", t.string.lstrip("# ")) for t in tokens if t.type == tokenize.COMMENT}
+
+
+_HEAD = """/* Written by `pkxyz export`; see README.md. Do not edit: the object was compiled for these records. */
+#ifndef PKXYZ_H
+#define PKXYZ_H
+
+#include <stddef.h>
+#include <stdint.h>
+
+#ifdef __cplusplus
+#define PKXYZ_ASSERT(fact) static_assert(fact, #fact)
+extern "C" {{
+#else
+#define PKXYZ_ASSERT(fact) _Static_assert(fact, #fact)
+#endif
+
+PKXYZ_ASSERT(sizeof(double) == 8);
+
+#define PKXYZ_PERIOD_US {period_us} /* between two calls of pkxyz_cycle */
+"""
+
+_TAIL = """#ifdef __cplusplus
+}
+#endif
+
+#endif
+"""

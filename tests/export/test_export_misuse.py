@@ -1,0 +1,58 @@
+"""``pkxyz export`` asked for what it can't give: one line, exit code 2, nothing written and nothing overwritten."""
+
+import sys
+
+import pytest
+
+from hil import cli
+from hil.runs.scenario import load_scenario
+from pkxyz_ctrl.export.folder import Exported, write
+from pkxyz_ctrl.export.kernels import ExportError
+from pkxyz_ctrl.loop.cycle import INPUT
+
+
+def refused(capsys, monkeypatch, *words):
+    monkeypatch.setattr(sys, "argv", ["pkxyz", "export", *map(str, words)])
+    with pytest.raises(SystemExit) as ended:
+        cli.main()
+    shown = capsys.readouterr()
+    lines = [line for line in shown.err.splitlines() if not line.startswith("First run here")]
+    assert ended.value.code == 2
+    assert shown.out == ""
+    assert len(lines) == 1, shown.err
+    return lines[0]
+
+
+@pytest.mark.parametrize(
+    ("words", "says"),
+    [
+        (("--target", "z80"), "--target: 'z80' is none; choose host, cortex-m7"),
+        (("nowhere",), "nowhere"),
+        (("--controller", "mpc"), "controller 'mpc' solves a problem in the middle of a tick"),
+        (("--controller", "nope"), "nope"),
+        (("--ticks", "10"), "ticks"),
+    ],
+)
+def test_what_does_not_go_is_said_in_a_line(tmp_path, capsys, monkeypatch, words, says):
+    out = tmp_path / "out"
+    assert says in refused(capsys, monkeypatch, *words, "--out", out)
+    assert not out.exists()
+
+
+def test_nothing_of_the_users_is_overwritten(tmp_path, capsys, monkeypatch):
+    (tmp_path / "thesis.tex").write_text("years")
+    assert "is not empty, and nothing is overwritten" in refused(capsys, monkeypatch, "--out", tmp_path)
+    assert "is not empty" in refused(capsys, monkeypatch, "--out", tmp_path / "thesis.tex")
+    assert [item.name for item in tmp_path.iterdir()] == ["thesis.tex"]
+
+
+def test_a_path_that_no_board_holds_is_refused_with_what_it_takes(tmp_path):
+    import numpy as np
+
+    from pkxyz_ctrl.loop.reference import REFERENCE
+
+    law = load_scenario("raster").setup().law
+    exported = Exported(law, np.zeros(20_000, REFERENCE), np.zeros(100, INPUT), "raster", "youla", "")
+    with pytest.raises(ExportError, match=r"takes 2\.4 MiB.*give --ticks 16384 or less"):
+        write(tmp_path / "out", "cortex-m7", exported)
+    assert not (tmp_path / "out").exists()
