@@ -1,9 +1,10 @@
 """What someone may tune: the law's weights, limits, monitors. Gains are computed from these at start-up."""
 
-from typing import Annotated, Self
+from typing import Annotated, Literal, Self
 
 from pydantic import Field, model_validator
 
+from pkxyz_ctrl.config.adaptation import Adaptation
 from pkxyz_ctrl.config.files import FrozenModel, Name
 from pkxyz_ctrl.config.laws import LAWS, SECTIONS, Hinf, Irc, Linear, Mpc, PiNotch, Youla
 from pkxyz_ctrl.safety.thresholds import (
@@ -96,6 +97,9 @@ class ControllerConfig(FrozenModel):
     """How long the sense offsets are averaged at 0 V."""
     stop_s: Annotated[float, Field(gt=0, le=10)] = 0.004
     """How long the path takes to stop when it is held, and to be taken up again."""
+    learn: Literal["off", "online"] = "off"
+    """online: what this device differs in from its stage file is learnt while the loop works"""
+    adaptation: Adaptation = Adaptation()
     estimator: EstimatorConfig
     regulator: RegulatorConfig
     limits: DriveLimitsConfig

@@ -96,6 +96,15 @@ def energy_gradient(geometry: np.void, elasticity: np.void, position_m: Array, o
 
 
 @njit(cache=True, error_model="numpy")
+def link_force(geometry: np.void, elasticity: np.void, dz: float) -> float:
+    """Part of dV/dz in N that the out-of-plane hinges have at height ``dz`` above rest."""
+    _, delta, _ = link(geometry, dz)
+    tilt: float = _elevation_change(geometry, dz, delta)
+    force: float = elasticity["link_n_m_per_rad"] * tilt / delta
+    return force
+
+
+@njit(cache=True, error_model="numpy")
 def stiffness(geometry: np.void, elasticity: np.void, position_m: Array, out: Array) -> None:
     """d2V/dx2 (3,3) in N/m at ``position_m``; at rest it is Eq. 19."""
     j = np.empty((3, 3))

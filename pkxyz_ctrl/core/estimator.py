@@ -146,6 +146,7 @@ def predict_far(
     s: Array,
     force_n: Array,
     force_old_n: Array,
+    told_n: Array,
     scratch: np.void,
     out: Array,
 ) -> None:
@@ -166,7 +167,7 @@ def predict_far(
     net_input(geometry, elasticity, estimator, end, force_n, force_old_n, w_end, unused)
     for i in range(3):
         change = w_end[i] - w[i]
-        w[i] = (w[i] + 4.0 * w_middle[i] + w_end[i]) / 6.0
+        w[i] = (w[i] + 4.0 * w_middle[i] + w_end[i]) / 6.0 + told_n[i]
         w_end[i] = change
     predict(estimator, s, w, w_change, out)
     for i in range(3):

@@ -13,7 +13,7 @@ import numpy as np
 from numba import njit
 from numpy.typing import NDArray
 
-from pkxyz_ctrl.core import allocation, feedback, kinematics, linear_law, predictive, voltage, youla
+from pkxyz_ctrl.core import adaptation, allocation, feedback, kinematics, linear_law, predictive, voltage, youla
 from pkxyz_ctrl.core import estimator as filtering
 from pkxyz_ctrl.core.elasticity import ELASTICITY, energy_gradient
 from pkxyz_ctrl.core.linear3 import inverse3, multiply3_transposed
@@ -39,6 +39,7 @@ LAW = np.dtype(
         ("feedback", feedback.FEEDBACK),
         ("linear", linear_law.LINEAR_LAW),
         ("youla", youla.YOULA),
+        ("adaptation", adaptation.ADAPTATION),
         ("drive", voltage.DRIVE),
         ("predictive", predictive.PREDICTIVE),
         ("kind", "i4"),  # OPEN_LOOP, STATE_FEEDBACK, LINEAR or PREDICTIVE
@@ -88,6 +89,7 @@ MEMORY = np.dtype(
         ("seen_m", "f8", (3,)),  # the measurement, or the estimate in its place
         ("linear", linear_law.LINEAR_STATE),
         ("youla", youla.YOULA_STATE),
+        ("adaptation", adaptation.ADAPTATION_STATE),
         ("plan_n", "f8", (3,)),  # force at the platform that a plan adds to the feed-forward of this tick
         ("plan_known", "i4"),
         ("solver_iterations", "i4"),  # of this tick's plan; 0 without one, negative if it was not used
@@ -129,27 +131,39 @@ def measure(law: np.void, memory: np.void, sense_count: NDArray[np.int32]) -> No
 def estimate(law: np.void, memory: np.void, has_measurement: bool) -> None:
     """Filter the measurement, then predict to the next sample and on to when this tick's force begins to act."""
     estimator, state, drive, scratch = law["estimator"], memory["estimate"], law["drive"], memory["scratch"]
-    filtering.update(estimator, state, memory["measurement_m"], has_measurement)
+    learnt, delay, online = memory["adaptation"], law["delay_periods"], law["adaptation"]["on"] != 0
+    origin, seen = estimator["operating_point_m"], memory["seen_m"]
+    for i in range(3):
+        seen[i] = memory["measurement_m"][i]
+    if online:
+        adaptation.seen(law["adaptation"], learnt, memory["measurement_m"], delay, seen)
+    filtering.update(estimator, state, seen, has_measurement)
     youla.note(law["youla"], memory["youla"], state["innovation_m"])
+    if online:
+        adaptation.learn(
+            law["adaptation"], learnt, delay, origin, state["innovation_m"], state["filtered"], has_measurement
+        )
     position, w, w_change = scratch["position_m"], scratch["w_n"], scratch["w_change_n"]
     acting, acted, start = scratch["acting_n"], scratch["acted_n"], scratch["state"]
-    ahead = state["ahead"]
+    ahead, told = state["ahead"], learnt["told_n"]
     for i in range(9):
         start[i] = state["filtered"][i]
     for i in range(3):
-        estimated = estimator["operating_point_m"][i] + start[i]
-        memory["seen_m"][i] = memory["measurement_m"][i] if has_measurement else estimated
-    delay = law["delay_periods"]
+        seen[i] = seen[i] if has_measurement else origin[i] + start[i]
     for step in range(delay):
         age = delay - 1 - step
         voltage.forces_of_counts(drive, memory["count"][age], acting)
         voltage.forces_of_counts(drive, memory["count"][age + 1], acted)
         filtering.midway(estimator, start, position)
         filtering.net_input(law["geometry"], law["elasticity"], estimator, position, acting, acted, w, w_change)
+        if online:
+            adaptation.tell(learnt, age)
+            for i in range(3):
+                w[i] += told[i]
         filtering.predict(estimator, start, w, w_change, ahead)
         if filtering.goes_far(estimator, start, ahead):
             far = scratch["far"]
-            filtering.predict_far(law["geometry"], law["elasticity"], estimator, start, acting, acted, far, ahead)
+            filtering.predict_far(law["geometry"], law["elasticity"], estimator, start, acting, acted, told, far, ahead)
         for i in range(9):  # an assignment of whole arrays costs ten times as much: numba looks whether they overlap
             start[i] = ahead[i]
             if step == 0:
@@ -175,6 +189,12 @@ def act(law: np.void, memory: np.void, here: Array, now: Array, after: Array, la
     energy_gradient(geometry, law["elasticity"], row[0:3], demand)
     share = feedback.authority(gains, inverse, demand)
     feedback.add_motion(gains, row, demand)
+    learnt, online = memory["adaptation"], law["adaptation"]["on"] != 0
+    if online:
+        adaptation.note(
+            law["adaptation"], learnt, geometry, law["elasticity"], gains["damping_n_s_per_m"], now, row, inverse, j,
+            demand,
+        )  # fmt: skip
     last, before = memory["feedforward_n"], scratch["w_n"]
     known = memory["feedforward_known"] != 0
     for i in range(3):
@@ -184,6 +204,9 @@ def act(law: np.void, memory: np.void, here: Array, now: Array, after: Array, la
     feedback.sampled_target(gains, now, demand, before, row)
     memory["feedforward_known"] = 1
     feedback.add_held_share(last, before, following, share, demand)
+    if online:
+        for i in range(3):
+            demand[i] += learnt["added_n"][i]
     if gains["ripple_of_held"] != 0:
         held = memory["held_n"]
         for i in range(3):
@@ -211,6 +234,8 @@ def act(law: np.void, memory: np.void, here: Array, now: Array, after: Array, la
     multiply3_transposed(j, force, applied)
     for i in range(3):
         memory["slack_n"][i] = demand[i] - applied[i]
+    if memory["active_set_steps"] > 1:
+        adaptation.disturb(learnt)
     if kind == LINEAR:
         linear_law.advance(law["linear"], memory["linear"], memory["slack_n"], share)
     return memory["active_set_steps"] > 1
@@ -243,6 +268,7 @@ def release(memory: np.void) -> None:
     memory["feedforward_known"] = 0
     linear_law.clear(memory["linear"])
     youla.clear(memory["youla"])
+    adaptation.clear(memory["adaptation"])
 
 
 @njit(cache=True, error_model="numpy")
@@ -264,6 +290,7 @@ def set_position(law: np.void, memory: np.void, position_m: Array) -> None:
         memory["estimate"]["ahead"][i] = known
     for i in range(3):
         memory["estimate"]["innovation_m"][i] = 0.0
+    adaptation.clear(memory["adaptation"])
 
 
 @njit(cache=True, error_model="numpy")
@@ -288,7 +315,8 @@ def unexplained_force(law: np.void, memory: np.void, out_n: Array) -> None:
     ``act``; d is the estimated disturbance, which takes its time, and K_0 e what holds the stage
     where it is instead of where it was expected.
 
-    A comb that does not give the force of its voltage shows up in its own entry alone.
+    A comb that does not give the force of its voltage shows up in its own entry alone. What was learnt of the device
+    explains at most what there is to explain.
     """
     inverse, disturbance = memory["scratch"]["inverse"], memory["estimate"]["filtered"]
     innovation, stiffness = memory["estimate"]["innovation_m"], law["estimator"]["stiffness_n_per_m"]
@@ -297,6 +325,8 @@ def unexplained_force(law: np.void, memory: np.void, out_n: Array) -> None:
         for k in range(3):
             held = stiffness[k, 0] * innovation[0] + stiffness[k, 1] * innovation[1] + stiffness[k, 2] * innovation[2]
             out_n[i] += inverse[k, i] * (disturbance[6 + k] + held)
+    if law["adaptation"]["on"] != 0:
+        adaptation.discount(memory["adaptation"], inverse, out_n)
 
 
 @njit(cache=True, error_model="numpy")

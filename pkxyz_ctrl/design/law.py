@@ -12,6 +12,7 @@ from pkxyz_ctrl.config.controller import ControllerConfig, RegulatorConfig
 from pkxyz_ctrl.config.files import ConfigError
 from pkxyz_ctrl.config.laws import Mpc, Youla
 from pkxyz_ctrl.core.tick import LINEAR, OPEN_LOOP, PREDICTIVE, STATE_FEEDBACK
+from pkxyz_ctrl.design.adaptation import fill_adaptation
 from pkxyz_ctrl.design.drive_limits import count_max, slew_counts
 from pkxyz_ctrl.design.laws.chosen_law import chosen_law, unwinding
 from pkxyz_ctrl.design.laws.estimator_gain import kalman_gain, measurement_matrix, measurement_noise, process_noise
@@ -42,6 +43,7 @@ def design_law(stage: Stage, controller: ControllerConfig, bus: BusConfig, *, au
     _fill_estimator(law["tick"]["estimator"], stage, controller, bus, model, sampled)
     _fill_feedback(law["tick"]["feedback"], stage, controller, bus, model, sampled)
     _fill_drive(law["tick"]["drive"], stage, controller, bus)
+    fill_adaptation(law["tick"], stage, controller, bus, model, sampled)
     _fill_monitors(law["limits"], controller, bus)
     if controller.law in KINDS:
         law["tick"]["kind"] = KINDS[controller.law]

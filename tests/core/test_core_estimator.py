@@ -114,7 +114,7 @@ def test_far_ways_are_predicted_by_simpsons_rule(seed):
     filtering.predict(record, s, w, w_change, once)
     twice[:] = once
     room = np.zeros(1, filtering.FAR)[0]
-    filtering.predict_far(law["geometry"], law["elasticity"], record, s, force, old, room, twice)
+    filtering.predict_far(law["geometry"], law["elasticity"], record, s, force, old, np.zeros(3), room, twice)
     assert filtering.goes_far(record, s, once)
     worst = [np.abs((out[:6] - exact) / np.repeat([1e-9, 5e-6], 3)).max() for out in (once, twice)]  # 1 nm a period
     assert worst[1] < min(worst[0] / 3.0, 6.0)

@@ -15,7 +15,8 @@ from hil.lanes import in_process as lanes
 from hil.lanes.blocks import Blocks
 from hil.lanes.lockstep import LockstepRig
 from pkxyz_ctrl.can.frame import Frame
-from pkxyz_ctrl.config.files import ConfigError
+from pkxyz_ctrl.config.controller import ControllerConfig
+from pkxyz_ctrl.config.files import ConfigError, load
 from pkxyz_ctrl.loop.controller import StartUpError
 from pkxyz_ctrl.loop.row import ROW
 from pkxyz_ctrl.safety.gate import TransmitGate
@@ -54,6 +55,17 @@ def test_the_lanes_agree_for_as_long_as_one_likes():
     slow, over_bus = rows_of(long, "lockstep")
     assert over_bus.missed_ticks == 0
     assert first_difference(slow, fast) is None
+
+
+@pytest.mark.parametrize(("plant", "seed"), [("mild", 1), ("mild", 2), ("lab", 3)])
+def test_the_lanes_agree_under_the_default_law_while_it_learns(plant, seed):
+    """Fast and lockstep, with what is learnt at work: it changes the bits, and the same ones in both."""
+    learning = load("controllers", "youla", ControllerConfig).model_copy(update={"learn": "online"})
+    scan = dataclasses.replace(setup(plant, seed=seed), controller=learning, duration_s=0.6)
+    fast, _ = rows_of(scan, "fast")
+    assert first_difference(rows_of(scan, "lockstep")[0], fast) is None
+    alone = dataclasses.replace(scan, controller=learning.model_copy(update={"learn": "off"}))
+    assert first_difference(rows_of(alone, "fast")[0], fast) is not None
 
 
 def test_a_slow_adapter_is_the_same_in_both_lanes():

@@ -64,15 +64,28 @@ def kalman_gain(sampled: SampledStage, q: Array, h: Array, r: Array) -> Array:
     unless filterpy agrees.
     """
     scale = _UNITS
+    phi, q_scaled, h_scaled, r_scaled, predicted = _steady(sampled, q, h, r)
+    innovation = h_scaled @ predicted @ h_scaled.T + r_scaled
+    gain: Array = np.asarray(np.linalg.solve(innovation, h_scaled @ predicted).T, dtype=np.float64)
+    _agree_with_filterpy(phi, q_scaled, h_scaled, r_scaled, predicted, gain)
+    return gain * scale[:, None] / 1e-9
+
+
+def innovation_variance(sampled: SampledStage, q: Array, h: Array, r: Array) -> Array:
+    """(3,3) in m^2: covariance of the steady filter's innovations."""
+    _, _, h_scaled, r_scaled, predicted = _steady(sampled, q, h, r)
+    return np.asarray(h_scaled @ predicted @ h_scaled.T + r_scaled) * 1e-18
+
+
+def _steady(sampled: SampledStage, q: Array, h: Array, r: Array) -> tuple[Array, Array, Array, Array, Array]:
+    """Phi, Q, H and R in these units, and the covariance of the steady prediction."""
+    scale = _UNITS
     phi = sampled.phi * scale[None, :] / scale[:, None]
     q_scaled = q / np.outer(scale, scale)
     h_scaled = h * scale[None, :] / 1e-9
     r_scaled = r / 1e-18
-    predicted = scipy.linalg.solve_discrete_are(phi.T, h_scaled.T, q_scaled, r_scaled)
-    innovation = h_scaled @ predicted @ h_scaled.T + r_scaled
-    gain = np.linalg.solve(innovation, h_scaled @ predicted).T
-    _agree_with_filterpy(phi, q_scaled, h_scaled, r_scaled, predicted, gain)
-    return gain * scale[:, None] / 1e-9
+    predicted = np.asarray(scipy.linalg.solve_discrete_are(phi.T, h_scaled.T, q_scaled, r_scaled), dtype=np.float64)
+    return phi, q_scaled, h_scaled, r_scaled, predicted
 
 
 def _agree_with_filterpy(phi: Array, q: Array, h: Array, r: Array, predicted: Array, gain: Array) -> None:

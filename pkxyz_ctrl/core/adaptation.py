@@ -1,0 +1,359 @@
+"""Adaptation: what this device differs in from its model, learnt while the loop works. Compiled.
+
+The model lacks a force at the platform and shows a measurement otherwise, both linear in the errors theta of its
+numbers (``PARAMETERS``), each in units of its spread, which is how far devices differ beforehand::
+
+    m x'' + C x' + grad V = B^T F - phi(r) theta,    y = x - tau v + psi(r) theta
+
+phi and psi are taken along the reference r, not along the motion: they are known beforehand, and what is learnt acts as
+a feed-forward, outside the feedback loop. So no theta can make that loop unstable.
+
+The Kalman filter is told both. What it still does not expect shows in its innovations nu, which answer to an error of
+theta as the filter itself does (Friedland 1969): with U the change of the filter's state for each theta, ::
+
+    d nu = psi - H U,    U+ = U + K d nu,    U(next) = Phi U+ - Gamma phi
+
+Recursive least squares (a Kalman filter of numbers that drift slowly) works on nu with d nu, one axis a tick. Its
+covariance never exceeds what was known beforehand. It stands still where the reference does, where the stage is not
+where it should be, and after a comb was at a limit. What acts follows it within some milliseconds, and the filter's
+state moves along by U: then it is as if the filter had always known, and nothing kicks.
+
+Beside it stands what was known once, the base, and what innovations have said since against it: from that somebody
+with more time tells a spring that ages from noise.
+"""
+
+import numpy as np
+from numba import njit
+from numpy.typing import NDArray
+
+from pkxyz_ctrl.core import kinematics
+from pkxyz_ctrl.core.elasticity import arcsine, link_force
+
+Array = NDArray[np.float64]
+
+COMB, SLIDER, CRANK, LINK, FRINGE, LIFT, DAMPING, DELAY, BEND = 0, 3, 6, 9, 10, 11, 12, 13, 14
+PARAMETERS = 15
+"""Relative errors of each comb's pull, of each chain's sliders' and cranks' springs, and of the out-of-plane hinges;
+growth of the pull over ``fringe_m`` of stroke; lift by pull; relative error of the damping; sense delay in s, and by
+how many s^2 the acceleration shows in what is measured. The mass is taken as drawn: only ratios to it are seen.
+"""
+AGES = 2
+"""Intervals that are remembered: two periods of delay."""
+
+ADAPTATION = np.dtype(
+    [
+        ("transition", "f8", (3, 3, 3)),  # of each axis: the filter's x, v, d
+        ("input", "f8", (3, 3)),  # of each axis: what a force does to them in a period
+        ("gain", "f8", (3, 3)),  # of each axis: the filter's
+        ("sense_delay_s", "f8"),
+        ("variance_m2", "f8", (3,)),  # of the innovations, where the model is right
+        ("spread", "f8", (PARAMETERS,)),  # how far devices differ, one standard deviation, in units of the parameter
+        ("bound", "f8", (PARAMETERS,)),  # most that is learnt, in spreads
+        ("doubt", "f8"),  # share of an unexpected innovation's square that counts as noise
+        ("drift", "f8"),  # variance, in spreads squared, that an update loses
+        ("follow", "f8"),  # share by which what acts follows what is learnt, each tick
+        ("least", "f8"),  # an update has to tell so much: variance of its prediction over that of the noise
+        ("near_m", "f8"),  # how near the reference the stage has to be
+        ("fringe_m", "f8"),
+        ("forget", "f8"),  # share of what speaks against the base that an update forgets
+        ("calm_ticks", "i4"),  # for so long, and without a limit
+        ("base_updates", "i4"),  # after so many what is known becomes the base
+        ("on", "i4"),
+    ],
+    align=True,
+)
+
+ADAPTATION_STATE = np.dtype(
+    [
+        ("learnt", "f8", (PARAMETERS,)),  # theta in spreads
+        ("acting", "f8", (PARAMETERS,)),  # what feed-forward and filter reckon with
+        ("covariance", "f8", (PARAMETERS, PARAMETERS)),
+        ("sensitivity", "f8", (3, 3, PARAMETERS)),  # U: axis, then x, v, d of the prediction
+        ("shown", "f8", (3, PARAMETERS)),  # d nu
+        ("force_n", "f8", (AGES, 3, PARAMETERS)),  # phi of the last intervals, newest first
+        ("motion", "f8", (AGES, 9)),  # row of the reference at their beginnings
+        ("added_n", "f8", (3,)),  # what the feed-forward of this tick has more
+        ("told_n", "f8", (3,)),  # what the filter was told of the last interval that it went through
+        ("base", "f8", (PARAMETERS,)),
+        ("base_covariance", "f8", (PARAMETERS, PARAMETERS)),
+        ("evidence", "f8", (PARAMETERS, PARAMETERS)),  # information since, and ...
+        ("clue", "f8", (PARAMETERS,)),  # ... what it says of theta less the base
+        ("work", "f8", (PARAMETERS,)),
+        ("updates", "i8"),
+        ("begun", "i4"),  # 0: nothing is known yet, not even how little
+        ("based", "i4"),  # 1: there is a base
+        ("axis", "i4"),  # whose turn it is
+        ("calm", "i4"),  # ticks since something was not as it should be for learning
+    ],
+    align=True,
+)
+
+
+@njit(cache=True, error_model="numpy")
+def seen(adaptation: np.void, state: np.void, measured_m: Array, delay: int, out: Array) -> None:
+    """Write what was measured (3,), less psi theta, to ``out`` (3,): what the filter's model would have shown."""
+    row, acting, spread = state["motion"][delay - 1], state["acting"], adaptation["spread"]
+    late_s, bend_s2 = acting[DELAY] * spread[DELAY], acting[BEND] * spread[BEND]
+    for i in range(3):
+        out[i] = measured_m[i] + late_s * row[3 + i] - bend_s2 * row[6 + i]
+
+
+@njit(cache=True, error_model="numpy")
+def learn(
+    adaptation: np.void,
+    state: np.void,
+    delay: int,
+    origin_m: Array,
+    innovation_m: Array,
+    filtered: Array,
+    has_measurement: bool,
+) -> None:
+    """Take in the innovation (3,) of this sample, move the filter's state (9,) about ``origin_m`` along, and carry U to
+    the next sample.
+    """
+    if has_measurement:
+        _show(adaptation, state, state["motion"][delay - 1])
+    row, near = state["motion"][delay - 1], has_measurement
+    for i in range(3):
+        near = near and abs(origin_m[i] + filtered[i] - row[i]) < adaptation["near_m"]
+    state["calm"] = min(state["calm"] + 1, adaptation["calm_ticks"]) if near else 0
+    axis = state["axis"]
+    state["axis"] = axis + 1 if axis < 2 else 0
+    if near and state["calm"] >= adaptation["calm_ticks"]:
+        _update(adaptation, state, axis, innovation_m[axis])
+    change = state["work"]
+    for p in range(PARAMETERS):
+        change[p] = adaptation["follow"] * (state["learnt"][p] - state["acting"][p])
+        state["acting"][p] += change[p]
+    for i in range(3):
+        u, phi, gamma = state["sensitivity"][i], adaptation["transition"][i], adaptation["input"][i]
+        force = state["force_n"][delay - 1, i]
+        for s in range(3):
+            moved = 0.0
+            for p in range(PARAMETERS):
+                moved += u[s, p] * change[p]
+            filtered[3 * s + i] += moved
+        for p in range(PARAMETERS):
+            x, v, d, f = u[0, p], u[1, p], u[2, p], force[p]
+            u[0, p] = phi[0, 0] * x + phi[0, 1] * v + phi[0, 2] * d - gamma[0] * f
+            u[1, p] = phi[1, 0] * x + phi[1, 1] * v + phi[1, 2] * d - gamma[1] * f
+
+
+@njit(cache=True, error_model="numpy")
+def _show(adaptation: np.void, state: np.void, row: Array) -> None:
+    """d nu at this sample, where the reference is at ``row`` (9,), and what the filter's gain makes of it."""
+    tau, spread, shown = adaptation["sense_delay_s"], adaptation["spread"], state["shown"]
+    for i in range(3):
+        u, k = state["sensitivity"][i], adaptation["gain"][i]
+        for p in range(PARAMETERS):
+            shown[i, p] = tau * u[1, p] - u[0, p]
+        shown[i, DELAY] += spread[DELAY] * row[3 + i]
+        shown[i, BEND] -= spread[BEND] * row[6 + i]
+        for s in range(3):
+            for p in range(PARAMETERS):
+                u[s, p] += k[s] * shown[i, p]
+
+
+@njit(cache=True, error_model="numpy")
+def _update(adaptation: np.void, state: np.void, axis: int, innovation_m: float) -> None:
+    """One step of recursive least squares with the innovation of an axis: nu is -d nu times what theta still lacks."""
+    p, learnt, acting = state["covariance"], state["learnt"], state["acting"]
+    by, gain, base = state["shown"][axis], state["work"], state["base"]
+    if state["begun"] == 0:
+        begin(state)
+    told, missing, since = 0.0, innovation_m, innovation_m
+    for i in range(PARAMETERS):
+        total = 0.0
+        for k in range(PARAMETERS):
+            total += p[i, k] * by[k]
+        gain[i] = total
+        told += total * by[i]
+        missing += by[i] * (learnt[i] - acting[i])
+        since += by[i] * (base[i] - acting[i])
+    noise_m2 = adaptation["variance_m2"][axis] + adaptation["doubt"] * missing * missing
+    if not told > adaptation["least"] * noise_m2:
+        return
+    scale = 1.0 / (told + noise_m2)
+    for i in range(PARAMETERS):
+        weight = gain[i] * scale
+        learnt[i] -= weight * missing
+        for k in range(PARAMETERS):
+            p[i, k] -= weight * gain[k]
+    for i in range(PARAMETERS):
+        p[i, i] = min(p[i, i] + adaptation["drift"], 1.0)
+    _keep_within(adaptation["bound"], p, learnt)
+    state["updates"] += 1
+    if state["based"] != 0:
+        _weigh(state, by, since, 1.0 / adaptation["variance_m2"][axis], 1.0 - adaptation["forget"])
+    elif state["updates"] >= adaptation["base_updates"]:
+        set_base(state)
+
+
+@njit(cache=True, error_model="numpy")
+def begin(state: np.void) -> None:
+    """Know no more than the spreads."""
+    state["begun"] = 1
+    for i in range(PARAMETERS):
+        for k in range(PARAMETERS):
+            state["covariance"][i, k] = 1.0 if i == k else 0.0
+
+
+@njit(cache=True, error_model="numpy")
+def set_base(state: np.void) -> None:
+    """What is known now is what changes are counted from."""
+    state["based"] = 1
+    for i in range(PARAMETERS):
+        state["base"][i], state["clue"][i] = state["learnt"][i], 0.0
+        for k in range(PARAMETERS):
+            state["base_covariance"][i, k] = state["covariance"][i, k]
+            state["evidence"][i, k] = 0.0
+
+
+@njit(cache=True, error_model="numpy")
+def _weigh(state: np.void, by: Array, since_m: float, weight: float, keep: float) -> None:
+    """Note what an innovation, as it would have been with the base, says of it."""
+    evidence, clue = state["evidence"], state["clue"]
+    for i in range(PARAMETERS):
+        told = weight * by[i]
+        clue[i] = keep * clue[i] - told * since_m
+        for k in range(PARAMETERS):
+            evidence[i, k] = keep * evidence[i, k] + told * by[k]
+
+
+@njit(cache=True, error_model="numpy")
+def _keep_within(bound: Array, p: Array, learnt: Array) -> None:
+    """Take numbers back to their bounds, and the others along by as much as they depend on them."""
+    for i in range(PARAMETERS):
+        beyond = learnt[i] - min(max(learnt[i], -bound[i]), bound[i])
+        if beyond != 0.0:
+            share = beyond / p[i, i]
+            for k in range(PARAMETERS):
+                learnt[k] -= share * p[k, i]
+    for i in range(PARAMETERS):
+        learnt[i] = min(max(learnt[i], -bound[i]), bound[i])
+
+
+@njit(cache=True, error_model="numpy")
+def tell(state: np.void, age: int) -> None:
+    """Write -phi theta (3,) of the interval of the force that was decided ``age`` ticks ago to ``told_n``: what the
+    filter has to reckon with there.
+    """
+    acting, force, out = state["acting"], state["force_n"][age], state["told_n"]
+    for i in range(3):
+        total = 0.0
+        for p in range(PARAMETERS):
+            total += force[i, p] * acting[p]
+        out[i] = -total
+
+
+@njit(cache=True, error_model="numpy")
+def note(
+    adaptation: np.void,
+    state: np.void,
+    geometry: np.void,
+    elasticity: np.void,
+    damping: Array,
+    start: Array,
+    row: Array,
+    inverse: Array,
+    pulls: Array,
+    feedforward_n: Array,
+) -> None:
+    """Note phi at a row (9,) of the reference, in the middle of the interval that begins at the row ``start``, and
+    write phi theta, which the feed-forward lacks, to ``added_n``.
+
+    ``pulls`` (3,3) and its ``inverse`` are those of the row, ``feedforward_n`` (3,) is what the model needs there.
+    """
+    force, motion, added = state["force_n"], state["motion"], state["added_n"]
+    for age in range(AGES - 1, 0, -1):
+        for i in range(9):
+            motion[age, i] = motion[age - 1, i]
+        for i in range(3):
+            for p in range(PARAMETERS):
+                force[age, i, p] = force[age - 1, i, p]
+    for i in range(9):
+        motion[0, i] = start[i]
+    newest = force[0]
+    for i in range(3):
+        newest[i, FRINGE] = newest[i, LIFT] = 0.0
+        newest[i, DAMPING] = damping[i, 0] * row[3] + damping[i, 1] * row[4] + damping[i, 2] * row[5]
+    newest[2, LINK] = link_force(geometry, elasticity, row[2])
+    _, _, drop = kinematics.link(geometry, row[2])
+    for i in range(3):
+        pull = inverse[0, i] * feedforward_n[0] + inverse[1, i] * feedforward_n[1] + inverse[2, i] * feedforward_n[2]
+        _note_chain(adaptation["fringe_m"], geometry, elasticity, i, row, drop, pulls[i], pull, newest)
+    for i in range(3):
+        total = 0.0
+        for p in range(PARAMETERS):
+            newest[i, p] *= adaptation["spread"][p]
+            total += newest[i, p] * state["acting"][p]
+        added[i] = total
+
+
+@njit(cache=True, error_model="numpy")
+def _note_chain(
+    fringe_m: float,
+    geometry: np.void,
+    elasticity: np.void,
+    i: int,
+    row: Array,
+    drop: float,
+    along: Array,
+    pull_n: float,
+    out: Array,
+) -> None:
+    """What errors of chain i make the feed-forward lack, per unit: its comb's pull, springs, and its share of the rest.
+    ``along`` (3,) is where the comb pulls.
+    """
+    n = geometry["n"]
+    s, c = kinematics.crank(geometry, i, row[0], row[1])
+    q = kinematics.stroke(geometry, i, row[0], row[1], s, c, drop)
+    across = elasticity["crank_n_m_per_rad"][i] * arcsine(s / geometry["crank_m"]) / c
+    spring = elasticity["slider_n_per_m"][i] * q
+    grown = pull_n * q / fringe_m
+    for k in range(3):
+        out[k, COMB + i] = -pull_n * along[k]
+        out[k, SLIDER + i] = spring * (along[k] if k < 2 else along[k] - geometry["lift"])
+        out[k, CRANK + i] = across * n[i, k] if k < 2 else 0.0
+        out[k, FRINGE] -= grown * along[k]
+    out[2, LIFT] -= pull_n
+
+
+@njit(cache=True, error_model="numpy")
+def discount(state: np.void, inverse: Array, lack_n: Array) -> None:
+    """Of what each comb (3,) lacks beyond what was learnt, leave what it would lack without that, too.
+
+    So nothing that was learnt can look like a fault by itself. What breaks suddenly shows in both.
+    """
+    for i in range(3):
+        known = 0.0
+        for k in range(3):
+            known += inverse[k, i] * state["told_n"][k]
+        whole = lack_n[i] + known
+        if lack_n[i] > 0.0:
+            lack_n[i] = min(lack_n[i], max(whole, 0.0))
+        else:
+            lack_n[i] = max(lack_n[i], min(whole, 0.0))
+
+
+@njit(cache=True, error_model="numpy")
+def disturb(state: np.void) -> None:
+    """Something is not as it should be for learning: a limit was met."""
+    state["calm"] = 0
+
+
+@njit(cache=True, error_model="numpy")
+def clear(state: np.void) -> None:
+    """The loop is open, or the filter begins anew: forget the motion, keep what was learnt."""
+    for i in range(3):
+        state["added_n"][i] = state["told_n"][i] = 0.0
+        for p in range(PARAMETERS):
+            state["shown"][i, p] = 0.0
+            for k in range(3):
+                state["sensitivity"][i, k, p] = 0.0
+            for age in range(AGES):
+                state["force_n"][age, i, p] = 0.0
+    for age in range(AGES):
+        for i in range(9):
+            state["motion"][age, i] = 0.0
+    state["calm"] = 0

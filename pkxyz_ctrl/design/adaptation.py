@@ -1,0 +1,66 @@
+"""The numbers of the adaptation: the filter's axes, each by itself, and how far devices differ."""
+
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from pkxyz_ctrl.config.bus import BusConfig
+from pkxyz_ctrl.config.controller import ControllerConfig
+from pkxyz_ctrl.core import adaptation as learning
+from pkxyz_ctrl.design.laws.estimator_gain import (
+    innovation_variance,
+    measurement_matrix,
+    measurement_noise,
+    process_noise,
+)
+from pkxyz_ctrl.design.model.plant_model import LinearStage, SampledStage
+from pkxyz_ctrl.stage import Stage
+
+Array = NDArray[np.float64]
+
+FRINGE_M = 25e-6
+"""Stroke over which growth of a comb's pull is counted."""
+
+
+def fill_adaptation(
+    tick: Any, stage: Stage, controller: ControllerConfig, bus: BusConfig, model: LinearStage, sampled: SampledStage
+) -> None:
+    """Fill ``tick["adaptation"]``; ``tick["estimator"]`` is there already."""
+    record, filter_, config = tick["adaptation"][0], tick["estimator"][0], controller.adaptation
+    _, q = process_noise(model, controller.estimator, bus.period_s)
+    variance = innovation_variance(sampled, q, measurement_matrix(stage), measurement_noise(stage, model, bus))
+    phi, gamma = np.vstack([filter_["transition"], np.eye(9)[6:]]), np.vstack([filter_["input"], np.zeros((3, 3))])
+    for axis in range(3):
+        keep = slice(axis, None, 3)
+        record["transition"][axis], record["input"][axis] = phi[keep, keep], gamma[keep, axis]
+        record["gain"][axis], record["variance_m2"][axis] = filter_["gain"][keep, axis], variance[axis, axis]
+    record["sense_delay_s"] = filter_["sense_delay_s"]
+    record["spread"] = spreads(controller, stage)
+    most = np.full(learning.PARAMETERS, config.most_relative)
+    most[learning.DAMPING], most[learning.DELAY] = config.most_damping, config.most_delay_s
+    most[learning.BEND] = 4.0 * record["spread"][learning.BEND]
+    record["bound"], record["doubt"] = most / record["spread"], config.doubt
+    record["drift"] = config.drift_per_rts**2 * bus.period_s
+    record["follow"] = min(1.0, bus.period_s / config.follow_s)
+    record["least"] = config.least_told
+    record["near_m"] = config.near_m
+    record["calm_ticks"] = max(1, round(config.calm_s / bus.period_s))
+    record["fringe_m"] = FRINGE_M
+    record["base_updates"] = max(1, round(config.base_s / bus.period_s))
+    record["forget"] = min(1.0, bus.period_s / config.forget_s)
+    record["on"] = controller.learn == "online"
+
+
+def spreads(controller: ControllerConfig, stage: Stage) -> Array:
+    """(PARAMETERS,): one standard deviation of each number, in its unit. How a sense chain of a delay tau bends is
+    not known: tau^2 / 2 for a pure delay, tau^2 for a pole.
+    """
+    config = controller.adaptation
+    spread = np.empty(learning.PARAMETERS)
+    spread[learning.COMB : learning.SLIDER] = config.comb_gain
+    spread[learning.SLIDER : learning.FRINGE] = config.stiffness
+    spread[learning.FRINGE], spread[learning.LIFT] = config.fringe, config.lift
+    spread[learning.DAMPING], spread[learning.DELAY] = config.damping, config.sense_delay_s
+    spread[learning.BEND] = max(config.sense_delay_s, stage.sense_delay_s) ** 2
+    return spread

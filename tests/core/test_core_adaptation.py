@@ -1,0 +1,213 @@
+"""What the adaptation learns, against other ways to the same numbers; when it learns, and that nothing kicks."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from loop_rig import bus, rows_of, stage
+
+from hil.bench.rigs.motions import MIDDLE_M, setup_of
+from hil.lanes.fast import run_block
+from hil.lanes.setup import Setup
+from pkxyz_ctrl.config.calibration import Calibration
+from pkxyz_ctrl.config.controller import ControllerConfig
+from pkxyz_ctrl.config.files import load
+from pkxyz_ctrl.core import adaptation, tick
+from pkxyz_ctrl.core.linear3 import inverse3
+from pkxyz_ctrl.design.law import design_law
+from pkxyz_ctrl.loop.cycle import new_memory
+from pkxyz_ctrl.loop.reference import reference_rows
+from pkxyz_ctrl.loop.row import ROW
+from pkxyz_ctrl.safety.modes import Mode
+from pkxyz_ctrl.stage import Stage
+from pkxyz_ctrl.trajectory import Circle, Hold, Steps
+
+P = adaptation.PARAMETERS
+MIDDLE = np.array([0.0, 0.0, MIDDLE_M])
+
+
+def online(controller=None, **changes):
+    config = controller or load("controllers", "youla", ControllerConfig)
+    changed = config.adaptation.model_copy(update=changes)
+    return config.model_copy(update={"learn": "online", "adaptation": changed})
+
+
+def fresh(**changes):
+    """Law and memory of a tick, both to be written to; whatever is told, however little, counts."""
+    law = design_law(stage(), online(**changes), bus(), autostart=True)["tick"].copy()[0]
+    return law, np.zeros(1, tick.MEMORY)[0]
+
+
+def needed_n(device: Stage, row):
+    """Force at the platform that a device needs along a row, and the pulls (3,3) of its combs there."""
+    c = design_law(stage(), online(), bus(), autostart=True)["tick"]["feedback"][0]["damping_n_s_per_m"]
+    return device.energy_gradient(row[:3]) + c @ row[3:6] + device.mass_kg * row[6:9]
+
+
+@settings(max_examples=20, deadline=None)
+@given(st.integers(0, 2**32 - 1))
+def test_what_each_error_lacks_is_what_a_stage_with_that_error_would_need(seed):
+    """The oracle is ``Stage`` with a calibration, differentiated numerically."""
+    rng = np.random.default_rng(seed)
+    law, memory = fresh()
+    row = np.concatenate([MIDDLE + rng.uniform(-4e-6, 4e-6, 3), rng.uniform(-3e-3, 3e-3, 3), rng.uniform(-2, 2, 3)])
+    drawn = stage()
+    force, pulls, inverse = needed_n(drawn, row), drawn.pulls(row[:3]), np.empty((3, 3))
+    inverse3(pulls, inverse)
+    adaptation.note(
+        law["adaptation"], memory["adaptation"], law["geometry"], law["elasticity"],
+        law["feedback"]["damping_n_s_per_m"], row, row, inverse, pulls, force,
+    )  # fmt: skip
+    combs, spread = np.linalg.solve(pulls.T, force), law["adaptation"]["spread"]
+    found = memory["adaptation"]["force_n"][0] / spread
+
+    def lacks(by=1e-4, **calibration):
+        device = Stage(drawn.config.model_copy(update={"calibration": Calibration(**calibration)}))
+        gain = np.array(calibration.get("comb_gain", (1.0, 1.0, 1.0)))
+        return (needed_n(device, row) - device.pulls(row[:3]).T @ (gain * combs)) / by
+
+    each, firsts = (1.0 + 1e-4 * np.eye(3)).tolist(), (adaptation.COMB, adaptation.SLIDER, adaptation.CRANK)
+    for i in range(3):
+        for first, name in zip(firsts, ("comb_gain", "slider_stiffness", "crank_stiffness"), strict=True):
+            assert found[:, first + i] == pytest.approx(lacks(**{name: tuple(each[i])}), abs=1e-9)
+    assert found[:, adaptation.LINK] == pytest.approx(lacks(link_stiffness=1.0001), abs=1e-9)
+    assert found[:, adaptation.LIFT] == pytest.approx(lacks(lift=1e-4), abs=1e-9)
+    grown = combs * drawn.inverse_kinematics(row[:3]) / law["adaptation"]["fringe_m"]
+    assert found[:, adaptation.FRINGE] == pytest.approx(-pulls.T @ grown, abs=1e-12)
+    assert found[:, adaptation.DAMPING] == pytest.approx(law["feedback"]["damping_n_s_per_m"] @ row[3:6], abs=1e-12)
+
+
+@settings(max_examples=20, deadline=None)
+@given(st.integers(0, 2**32 - 1))
+def test_without_forgetting_it_is_least_squares_with_what_was_known_beforehand(seed):
+    """numpy solves the same from all of it at once."""
+    rng = np.random.default_rng(seed)
+    law, memory = fresh(doubt=0.0, least_told=1e-300, most_relative=0.5, most_damping=10.0)
+    record, state = law["adaptation"], memory["adaptation"]
+    record["drift"], record["bound"] = 0.0, 1e9
+    by, nu = rng.normal(size=(60, P)) * 1e-9, rng.normal(size=60) * 2e-9
+    for n in range(60):
+        state["shown"][n % 3] = by[n]
+        adaptation._update(record, state, n % 3, nu[n])
+    weight = 1.0 / record["variance_m2"][np.arange(60) % 3]
+    information = np.eye(P) + (by * weight[:, None]).T @ by
+    assert state["learnt"] == pytest.approx(-np.linalg.solve(information, by.T @ (weight * nu)), rel=1e-6, abs=1e-9)
+    assert state["covariance"] == pytest.approx(np.linalg.inv(information), rel=1e-6, abs=1e-9)
+
+
+def test_numbers_stay_within_their_bounds_and_take_the_others_along():
+    """Two numbers of which only the sum shows: where one has to stop, the other goes on."""
+    law, memory = fresh()
+    record, state = law["adaptation"], memory["adaptation"]
+    record["bound"], record["drift"], record["doubt"] = 5.0, 0.0, 0.0
+    record["bound"][0] = 1.0
+    for _ in range(2000):
+        state["shown"][0][:2] = 10e-9
+        missing = 6.0 - state["learnt"][:2].sum()
+        state["acting"][:] = state["learnt"]
+        adaptation._update(record, state, 0, -10e-9 * missing)
+    assert state["learnt"][:2] == pytest.approx([1.0, 5.0], abs=0.01)
+    assert np.abs(state["learnt"]).max() <= 5.0
+    assert np.linalg.eigvalsh(state["covariance"]).min() > 0.0
+
+
+# -- in the loop -------------------------------------------------------------------------------------------------------
+
+
+def closed(setup: Setup, ticks: int, memory, first=0, plant=None):
+    """So many ticks of the fast lane; rows, and the plant to go on with."""
+    plant = plant or setup.new_plant()
+    rows = np.zeros(ticks, ROW)
+    reference = reference_rows(setup.trajectory.sample(0, setup.ticks + 30, setup.bus.period_us))
+    sample_us = (first + np.arange(ticks, dtype=np.int64)) * setup.bus.period_us
+    run_block(setup.law, memory, reference, plant.params, plant.state, sample_us, rows, ticks)
+    return rows, plant
+
+
+def held(**changes):
+    setup, _ = setup_of([Hold(kind="hold", duration_s=0.3)], "youla", "mild", MIDDLE_M)
+    return replace(setup, controller=online(**changes))
+
+
+def test_what_is_learnt_comes_to_act_without_a_kick():
+    """In a hold every spring's estimate changes by 3 %, which is 375 nm of the 12.5 um: the filter moves along, and the
+    stage stays where it is. The same with the filter left alone pushes it away by some hundred nm.
+    """
+    setup = held(follow_s=0.005)
+    off_m = []
+    for along in (True, False):
+        memory = new_memory(Mode.IDLE)
+        _, plant = closed(setup, 1800, memory)
+        state = memory["tick"]["adaptation"][0]
+        state["learnt"][adaptation.SLIDER : adaptation.FRINGE] += 0.3
+        if not along:
+            state["acting"][adaptation.SLIDER : adaptation.FRINGE] += 0.3
+        rows, _ = closed(setup, 300, memory, 1800, plant)
+        assert (rows["mode"] == Mode.TRACKING).all()
+        off_m.append(np.abs(rows["position_m"] - rows["reference_m"]).max())
+    assert off_m[0] < 8e-9
+    assert off_m[1] > 100e-9
+
+
+def test_at_rest_nothing_is_learnt_and_nothing_is_forgotten():
+    setup = held()
+    memory = new_memory(Mode.IDLE)
+    _, plant = closed(setup, 1400, memory)
+    before = memory["tick"]["adaptation"][0].copy()
+    closed(setup, 500, memory, 1400, plant)
+    after = memory["tick"]["adaptation"][0]
+    assert before["updates"] > 100
+    assert after["updates"] == before["updates"]
+    assert np.array_equal(after["covariance"], before["covariance"])
+    assert np.array_equal(after["learnt"], before["learnt"])
+
+
+def test_a_jump_a_limit_and_a_missing_sample_teach_nothing():
+    """A jump of 1 um: until the stage is there, and 10 ms longer, no update; so after a limit, and without a sample."""
+    steps = Steps(kind="steps", by_m=(1e-6, 0.0, 0.0), count=1, dwell_s=0.05)
+    setup, _ = setup_of([Hold(kind="hold", duration_s=0.2), steps], "youla", "mild", MIDDLE_M)
+    setup = replace(setup, controller=online())
+    memory = new_memory(Mode.IDLE)
+    jump = setup.trajectory.segments[-1].jumps_us[0] // 200
+    _, plant = closed(setup, jump, memory)
+    while int(memory["reference_tick"][0]) < jump - 1:
+        closed(setup, 1, memory, int(memory["tick_index"][0]), plant)
+    state = memory["tick"]["adaptation"][0]
+    before = int(state["updates"])
+    rows, _ = closed(setup, 45, memory, int(memory["tick_index"][0]), plant)
+    assert np.abs(rows["estimate_m"] - rows["reference_m"]).max() > 0.5e-6
+    assert int(state["updates"]) == before
+    numbers, filtered = setup.law["tick"][0]["adaptation"], np.zeros(9)
+    for has_measurement, calm in ((True, 51), (False, 0)):
+        state["calm"] = 50
+        adaptation.learn(numbers, state, 1, state["motion"][0, :3].copy(), np.zeros(3), filtered, has_measurement)
+        assert state["calm"] == min(calm, numbers["calm_ticks"])
+    state["calm"] = 50
+    adaptation.disturb(state)
+    assert state["calm"] == 0
+
+
+def test_switched_off_it_touches_nothing():
+    setup = held()
+    setup = replace(setup, controller=setup.controller.model_copy(update={"learn": "off"}))
+    memory = new_memory(Mode.IDLE)
+    closed(setup, 1500, memory)
+    assert memory["tick"]["adaptation"].tobytes() == bytes(memory["tick"]["adaptation"].nbytes)
+
+
+def test_a_circle_on_the_mild_plant_is_within_a_thousandth_of_its_diameter():
+    """After 0.5 s already; without learning it is off by 38 nm in y."""
+    circle = Circle(kind="circle", radius_m=4e-6, frequency_hz=100.0, turns=100.0)
+    setup, _ = setup_of([circle], "youla", "mild", MIDDLE_M)
+    off_nm = []
+    for learn in ("online", "off"):
+        controller = online().model_copy(update={"learn": learn})
+        rows, result = rows_of(replace(setup, controller=controller), "fast")
+        assert not result.faults
+        rows = rows[rows["reference_tick"] * 200 > setup.trajectory.segments[-1].scan_us[0] + 500_000]
+        error = (rows["position_m"] - rows["reference_m"])[:-500, :2]
+        off_nm.append(float(np.sqrt((error**2).sum(axis=1).mean())) * 1e9)
+    assert 1.0 < off_nm[0] < 8.0
+    assert off_nm[1] > 30.0
