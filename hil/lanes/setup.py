@@ -47,6 +47,8 @@ class Setup:
     learning: LearningConfig | None = None
     stored: Stored | None = None
     """the correction of ``learning.file``"""
+    autostart: bool = True
+    """home, enable and track without being asked"""
 
     @property
     def ticks(self) -> int:
@@ -56,7 +58,7 @@ class Setup:
     @cached_property
     def law(self) -> NDArray[np.void]:
         """The numbers that the cycle runs on, designed and cross-checked."""
-        return law_of(self.stage, self.controller, self.bus, autostart=True)
+        return law_of(self.stage, self.controller, self.bus, autostart=self.autostart)
 
     @property
     def gate(self) -> GateConfig:
@@ -107,7 +109,9 @@ class Setup:
         )
 
 
-def bare_setup(stage: str, plant: str, controller: ControllerConfig, bus: BusConfig, seed: int) -> Setup:
+def bare_setup(
+    stage: str, plant: str, controller: ControllerConfig, bus: BusConfig, seed: int, *, autostart: bool = True
+) -> Setup:
     """A run at rest, of no length, for whoever puts a trajectory of their own into it; stage and plant by name or
     file. Raises ``ConfigError``.
     """
@@ -120,4 +124,5 @@ def bare_setup(stage: str, plant: str, controller: ControllerConfig, bus: BusCon
         trajectory=Trajectory([Hold(kind="hold", duration_s=bus.period_s)]),
         duration_s=bus.period_s,
         seed=seed,
+        autostart=autostart,
     )

@@ -2,7 +2,8 @@
 
 import dataclasses
 import time
-from typing import Any
+from collections.abc import Callable
+from typing import Any, Protocol
 
 import numpy as np
 
@@ -11,7 +12,6 @@ from hil.lanes.ending import Ending
 from hil.lanes.live_reference import LiveReference
 from hil.lanes.setup import Setup
 from hil.lanes.streamed_reference import StreamedReference
-from hil.recording.wall_recorder import WallRecorder
 from pkxyz_ctrl.can import cob_id
 from pkxyz_ctrl.can.frame import Frame
 from pkxyz_ctrl.config.bus import BusConfig, CanConfig
@@ -22,12 +22,13 @@ from pkxyz_ctrl.loop import cycle as cycling
 from pkxyz_ctrl.loop.controller import Controller, StartUpError
 from pkxyz_ctrl.loop.reference import standing_still
 from pkxyz_ctrl.loop.row import TRUTH_FIELDS
-from pkxyz_ctrl.loop.runtime import run, start
+from pkxyz_ctrl.loop.runtime import Reference, run, start
 from pkxyz_ctrl.safety.gate import GateConfig
 from pkxyz_ctrl.safety.modes import Mode
 
 _GUARDS_PER_PERIOD = 8
 _SILENT_US = 500_000  # after a fault, for so long without its heartbeat, the amplifier is gone
+_NO_END = 1 << 60  # ticks
 _LAST_FRAMES_S = 0.02  # 0 V and pre-operational leave even a slow adapter before it is closed
 
 
@@ -57,10 +58,24 @@ def wall_gate(gate: GateConfig) -> GateConfig:
     return dataclasses.replace(gate, spacing_min_us=gate.period_us // _GUARDS_PER_PERIOD)
 
 
+class TakesFrames(Protocol):
+    """Whoever takes note of what is sent and received."""
+
+    def frame(self, frame: Frame, t_us: int) -> None:
+        """A frame that was sent or received at ``t_us``."""
+
+
+class TakesTicks(TakesFrames, Protocol):
+    """... and of each tick."""
+
+    def row(self, row: memoryview) -> None:
+        """The bytes of a tick's record of ``ROW``."""
+
+
 class _LoggedPort:
     """A port whose frames go to the recorder, too. ``heartbeat_us``: when ``node_id`` said last that it is there."""
 
-    def __init__(self, port: CanPort, clock: WallClock, recorder: WallRecorder, node_id: int) -> None:
+    def __init__(self, port: CanPort, clock: WallClock, recorder: TakesFrames, node_id: int) -> None:
         self._port, self._clock, self._log = port, clock, recorder.frame
         self._heartbeat_id = cob_id.HEARTBEAT_BASE + node_id
         self.heartbeat_us = 0
@@ -82,7 +97,7 @@ class _LoggedPort:
 class WallRig:
     """Controller, clock and port of one run. ``close`` takes the combs to 0 V, whatever happened before."""
 
-    def __init__(self, setup: Setup, recorder: WallRecorder, ending: Ending) -> None:
+    def __init__(self, setup: Setup, recorder: TakesTicks, ending: Ending) -> None:
         self.setup = setup
         self._recorder = recorder
         self._ending = ending
@@ -123,14 +138,7 @@ class WallRig:
 
     def run(self) -> None:
         """Start the amplifier and run all ticks. Raises ``StartUpError``, ``AmplifierGoneError`` and ``Ended``."""
-        self._started = True
-        try:
-            start(self.clock, _Interruptible(self.port, self._ending), self.controller)
-        except StartUpError as error:
-            port = self.can_port
-            if not port.refused:
-                raise
-            raise StartUpError(f"{error}; {port.refusal}" if port.sent else port.refusal) from None
+        self._start()
         row, take = self.controller.row, self._recorder.row
         live, memory = self.live, self.controller.memory
         streamed = StreamedReference(self.setup.trajectory, self.setup.bus.period_us, memory)
@@ -155,6 +163,23 @@ class WallRig:
         else:
             rows = live.rows
             run(self.ticks, self.port, self.controller, lambda tick: rows, self.setup.ticks, record_and_learn)
+
+    def operate(self, reference: Reference, after: Callable[[int], object]) -> None:
+        """Start the amplifier and run until somebody ends it: set-points are handed in, and ``after`` is called after
+        each tick. Raises ``StartUpError`` and ``Ended``.
+        """
+        self._start()
+        run(self.ticks, self.port, self.controller, reference, _NO_END, after)
+
+    def _start(self) -> None:
+        self._started = True
+        try:
+            start(self.clock, _Interruptible(self.port, self._ending), self.controller)
+        except StartUpError as error:
+            port = self.can_port
+            if not port.refused:
+                raise
+            raise StartUpError(f"{error}; {port.refusal}" if port.sent else port.refusal) from None
 
     def close(self) -> None:
         """0 V, pre-operational, and off the bus."""

@@ -1,0 +1,55 @@
+"""``pkxyz operate``: the loop of a stage in operation, without a server."""
+
+import sys
+from typing import Annotated, Literal
+
+import typer
+
+from pkxyz_ctrl.config.files import ConfigError
+
+Name = Annotated[str, typer.Option(help="What the stage is called, where there are several.")]
+Stage = Annotated[str, typer.Option(help="Name or file of the stage.")]
+Controller = Annotated[str, typer.Option(help="Name or file of the controller.")]
+Silence = Annotated[
+    str, typer.Option(help="What becomes of a moving stage when the server falls silent: hold or park.")
+]
+
+
+def operate(
+    bus: Annotated[str, typer.Option(help="Name or file of the bus.")] = "unix_2k",
+    stage: Stage = "reconstructed",
+    controller: Controller = "youla",
+    name: Name = "stage",
+    on_silence: Silence = "hold",
+) -> None:
+    """Run the loop of a stage that `pkxyz serve` operates, until Ctrl-C or SIGTERM; at its end the combs are at 0 V."""
+    from hil.lanes.setup import bare_setup
+    from hil.operate.at_rate import operate as run_loop
+    from hil.operate.settings import Settings
+    from pkxyz_ctrl.config.bus import BusConfig
+    from pkxyz_ctrl.config.controller import ControllerConfig
+    from pkxyz_ctrl.config.files import load
+    from pkxyz_ctrl.loop.controller import StartUpError
+
+    settings = Settings(on_silence=_silence(on_silence))
+    setup = bare_setup(
+        stage, "nominal", load("controllers", controller, ControllerConfig), load("buses", bus, BusConfig), 1,
+        autostart=False,
+    )  # fmt: skip
+    try:
+        run_loop(setup, settings, name, _say)
+    except StartUpError as error:
+        print(f"pkxyz: {error}", file=sys.stderr)
+        raise typer.Exit(1) from None
+
+
+def _silence(value: str) -> Literal["hold", "park"]:
+    if value == "park":
+        return "park"
+    if value == "hold":
+        return "hold"
+    raise ConfigError(f"--on-silence: {value!r} is neither hold nor park")
+
+
+def _say(words: str) -> None:
+    print(words, file=sys.stderr, flush=True)

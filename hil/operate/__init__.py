@@ -1,0 +1,1 @@
+"""A stage in operation: a loop that runs until it is ended, the verbs it obeys, the memory in which both cross."""

@@ -1,0 +1,170 @@
+"""The loop of a stage in operation, at the machine's clock, in a process of its own.
+
+Commands and telemetry cross in shared memory; whatever becomes of those at its other end, no tick waits for them.
+"""
+
+import os
+import time
+from collections.abc import Callable
+
+import numpy as np
+
+from hil.lanes.ending import Ended, Ending
+from hil.lanes.setup import Setup
+from hil.lanes.wall import WallRig
+from hil.operate.commands import COMMAND, PATH_BLOCK, TICK, Verb, new_command
+from hil.operate.memory import StageMemory
+from hil.operate.path_stream import PathStream
+from hil.operate.reach import Reach
+from hil.operate.session import Session
+from hil.operate.setpoints import Setpoints
+from hil.operate.settings import Settings
+from pkxyz_ctrl.can.frame import Frame
+from pkxyz_ctrl.client import place
+from pkxyz_ctrl.io.realtime import go_real_time, leave_real_time, settle_memory
+from pkxyz_ctrl.loop.row import ROW
+from pkxyz_ctrl.stage import Stage
+from pkxyz_ctrl.trajectory.check import DriveLimits
+
+KEPT_S = 60.0
+"""Of telemetry that stays in the memory."""
+_COMMANDS_A_TICK = 4
+_COMPANY_S, _LOOK_S = 30.0, 0.02
+_FRAME_BITS = 47  # of a classic frame beside its data; an FD frame's data are faster, its head is not
+
+
+class _Counted:
+    """``TakesTicks`` that counts frames; the rows go to the memory."""
+
+    def __init__(self) -> None:
+        self.frames = 0
+        self.bits = 0
+
+    def frame(self, frame: Frame, t_us: int) -> None:
+        self.frames += 1
+        self.bits += _FRAME_BITS + 8 * len(frame.data)
+
+    def row(self, row: memoryview) -> None:
+        """Nobody's here."""
+
+
+class OperatedLoop:
+    """What joins a session to the memory, tick by tick."""
+
+    def __init__(self, session: Session, memory: StageMemory, counted: _Counted) -> None:
+        self._session, self._memory, self._counted = session, memory, counted
+        self._controller = session.stage.controller
+        self._ticks = memory.writer("ticks")
+        self._commands = memory.reader("commands")
+        self._path = memory.reader("path")
+        self._head = memory.head
+        self._stops = int(self._head["stop"][0])
+        self._tick = np.zeros(1, TICK)
+        self._tick_bytes = self._tick.view(np.uint8).data
+
+    def after(self, tick: int) -> None:
+        """A tick is over."""
+        session, controller = self._session, self._controller
+        row = controller.memory["row"][0]
+        session.server_says(int(self._head["server"][0]))
+        if session.wants_rows:
+            self._take_rows()
+        session.after(row, self._given())
+        state = session.state
+        state["frames"], state["frame_bits"] = self._counted.frames, self._counted.bits
+        self._tick_bytes[: ROW.itemsize] = controller.row
+        self._tick["session"] = state
+        self._ticks.write(self._tick_bytes)
+
+    def _given(self) -> list[np.void]:
+        """Commands that have come; a stop that anyone asked for is the first of them."""
+        given: list[np.void] = []
+        if (stops := int(self._head["stop"][0])) != self._stops:
+            self._stops = stops
+            given.append(new_command(Verb.STOP, 0)[0])
+        while len(given) < _COMMANDS_A_TICK and (command := self._commands.read()) is not None:
+            given.append(np.frombuffer(command, COMMAND)[0])
+        return given
+
+    def _take_rows(self) -> None:
+        block = self._path.read()
+        if block is not None:
+            rows = np.frombuffer(block, PATH_BLOCK)[0]
+            count = min(int(rows["count"]), len(rows["motion"]))
+            self._session.take_rows(int(rows["path"]), int(rows["first"]), rows["motion"][:count])
+
+
+def operate(setup: Setup, settings: Settings, name: str, say: Callable[[str], object]) -> int:
+    """Run the loop until SIGINT or SIGTERM; returns the signal. At its end the combs are at 0 V.
+
+    ``setup`` without automatic start. Raises ``ConfigError``, ``StartUpError``, and ``OSError`` for the memory.
+    """
+    with Ending() as ending:
+        counted = _Counted()
+        rig = WallRig(setup, counted, ending)
+        memory = StageMemory.made(name, round(KEPT_S / setup.bus.period_s))
+        try:
+            session = _session_of(setup, settings, rig, memory)
+            _wait_for_others(rig, say, ending)
+            place.write(name, "loop", _description(setup, settings, memory))
+            say(go_real_time())
+            settle_memory()
+            rig.operate(session.stage.setpoints, OperatedLoop(session, memory, counted).after)
+        except Ended as end:
+            return end.signal_number
+        finally:
+            try:
+                rig.close()
+            finally:
+                leave_real_time()
+                place.forget(name, "loop")
+                memory.remove()
+    return 0
+
+
+def _session_of(setup: Setup, settings: Settings, rig: WallRig, memory: StageMemory) -> Session:
+    limits = setup.controller.limits
+    drive = DriveLimits(limits.voltage_max_v, limits.slew_max_v_per_s, setup.bus.period_us)
+    reach = Reach(Stage(setup.stage), drive)
+    rehearse(reach, settings)
+    return Session(rig.controller, reach, settings, memory.writer("answers").write)
+
+
+def rehearse(reach: Reach, settings: Settings) -> None:
+    """Move, pause, follow and refuse once without a stage: what is loaded at its first use costs a tick some ms."""
+    setpoints = Setpoints(500, 1, 20)
+    start, near_m = np.zeros(3), np.array([0.0, 0.0, 1e-6])
+    for position in (near_m, np.full(3, 1.0), np.full(3, 1e-3)):
+        reach.target_refusal(position)
+    reach.farthest(near_m, 0, 1.0)
+    path = PathStream(1, 2, start, reach)
+    path.take(1, 0, np.zeros((2, 9)))
+    motion = setpoints.plan(near_m, settings.limits)
+    reach.motion_refusal(*setpoints.looked_at(motion))
+    steps: tuple[Callable[[], object], ...] = (
+        lambda: setpoints.go(motion, near_m), setpoints.stop_on_path, setpoints.go_on, setpoints.leave_path,
+        lambda: setpoints.brake(settings.limits), lambda: setpoints.follow(path, start),
+    )  # fmt: skip
+    for step in steps:
+        step()
+        for row in range(setpoints.row + 1, setpoints.row + 100):
+            setpoints.advance(row)
+
+
+def _wait_for_others(rig: WallRig, say: Callable[[str], object], ending: Ending) -> None:
+    end_s = time.monotonic() + _COMPANY_S
+    if rig.others == 0:
+        say(f"nobody else is on the bus yet: waiting {_COMPANY_S:g} s for the amplifier")
+    while rig.others == 0 and time.monotonic() < end_s:
+        ending.check()
+        time.sleep(_LOOK_S)
+
+
+def _description(setup: Setup, settings: Settings, memory: StageMemory) -> dict[str, object]:
+    """What others need to know of the loop."""
+    return {
+        "pid": os.getpid(), "memory": str(memory.path), "stage": setup.stage.name, "plant": setup.plant.name,
+        "controller": setup.controller.name, "bus": setup.bus.name, "period_us": setup.bus.period_us,
+        "voltage_max_v": setup.controller.limits.voltage_max_v, "on_silence": settings.on_silence,
+        "interface": setup.bus.can.interface if setup.bus.can is not None else "",
+    }  # fmt: skip

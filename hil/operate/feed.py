@@ -1,0 +1,72 @@
+"""Where on its path a set-point is, row by row: at the path's own speed, slowing down, standing, or starting again.
+
+The ramps are those of ``core.pace``, so a path that is paused is not left.
+"""
+
+from typing import NamedTuple
+
+import numpy as np
+from numba import njit
+from numpy.typing import NDArray
+
+from pkxyz_ctrl.core import pace
+
+Array = NDArray[np.float64]
+Records = NDArray[np.void]
+
+
+class Feed(NamedTuple):
+    """How path time passes with the loop's rows: ``direction`` is that of ``core.pace``, since row ``origin``."""
+
+    origin: int
+    """row of the loop at which the ramp, or the path, began"""
+    phase: float = 0.0
+    """row of the path there"""
+    direction: int = pace.STEADY
+    ramp: int = 2
+    """rows that a ramp takes, an even number"""
+
+    def at(self, row: int) -> float:
+        """Row of the path at a row of the loop."""
+        if self.direction == pace.STEADY:
+            return self.phase + (row - self.origin)
+        gone, _, _ = pace.advance(self.direction, row - self.origin, self.ramp)
+        return self.phase + float(gone)
+
+    def turned(self, direction: int, row: int) -> "Feed":
+        """Slowing down or starting from ``row`` on; in the middle of the other, from the speed that there is."""
+        if self.direction == direction:
+            return self
+        age = 0
+        if self.direction != pace.STEADY:
+            age = max(0, self.ramp - (row - self.origin))  # where the mirrored ramp has this speed
+        gone, _, _ = pace.advance(direction, age, self.ramp)
+        return Feed(row - age, self.at(row) - float(gone), direction, self.ramp)
+
+    @property
+    def is_plain(self) -> bool:
+        """Whether rows of the loop are rows of the path."""
+        return self.direction == pace.STEADY
+
+    def stands_at(self, row: int) -> bool:
+        """Whether the path has come to a stop by a row of the loop."""
+        return self.direction == pace.SLOWING and row - self.origin >= self.ramp
+
+
+@njit(cache=True)
+def fed_rows(
+    window: Records,
+    window_first: int,
+    first_age: int,
+    phase: float,
+    direction: int,
+    ramp: int,
+    period_s: float,
+    out: Array,
+) -> None:
+    """Rows (n, 9) of a path at the ages ``first_age``, +1, ... of a ramp. ``window`` (m,) has the path's rows as
+    ``motion`` from ``window_first`` on, as many as are needed.
+    """
+    for n in range(len(out)):
+        gone, speed, change = pace.advance(direction, first_age + n, ramp)
+        pace.sample(window, phase + gone - window_first, speed, change, period_s, out[n])

@@ -1,0 +1,58 @@
+"""A path whose rows come while it is followed: planned and sampled elsewhere, judged here block by block."""
+
+import numpy as np
+from numpy.typing import NDArray
+
+from hil.operate.commands import PATH_ROWS
+from hil.operate.reach import Reach
+
+Array = NDArray[np.float64]
+
+_KEPT_ROWS = 8192
+_STEP_MOST_M = 2e-6
+"""Between two rows: what no path that was planned within its limits does; a jump belongs into a move."""
+
+
+class PathStream:
+    """A ``setpoints.Source`` of ``rows`` rows. ``objection``: why what came can't be followed, once something can't."""
+
+    def __init__(self, number: int, rows: int, start_m: Array, reach: Reach) -> None:
+        self.number = number
+        self.rows = max(0, rows - 1)
+        """number of the last row, where the path is at rest"""
+        self.objection: str | None = None
+        self._reach = reach
+        self._kept = np.zeros((_KEPT_ROWS, 9))
+        self._known = 0
+        self._before = np.concatenate([start_m, np.zeros(6)])
+
+    @property
+    def wants(self) -> int:
+        """The row with which the next block has to begin."""
+        return self._known
+
+    def has_room(self, row: int) -> bool:
+        """Whether one more block would overwrite nothing that is still needed at ``row``."""
+        return self._known + PATH_ROWS - row < _KEPT_ROWS - PATH_ROWS
+
+    def take(self, number: int, first: int, motion: Array) -> None:
+        """A block (n, 9) of the rows from ``first`` on; one of another path, or out of turn, is left aside."""
+        if number != self.number or first != self._known or self.objection is not None or not len(motion):
+            return
+        rows = np.concatenate([self._before[None], motion])
+        if not np.isfinite(rows).all() or float(np.abs(np.diff(rows[:, 0:3], axis=0)).max()) > _STEP_MOST_M:
+            self.objection = f"row {first} of the path jumps, or is not a number"
+            return
+        self.objection = self._reach.motion_refusal(rows)
+        if self.objection is None:
+            self._kept[np.arange(first, first + len(motion)) % _KEPT_ROWS] = motion
+            self._before = motion[-1].copy()
+            self._known = first + len(motion)
+
+    def has(self, row: int) -> bool:
+        return min(row, self.rows) < self._known
+
+    def sample(self, first: int, count: int) -> Array:
+        last = min(self.rows, self._known - 1)
+        wanted = np.clip(np.arange(first, first + count), 0, max(last, 0))
+        return self._kept[wanted % _KEPT_ROWS]

@@ -1,0 +1,222 @@
+"""What the combs can hold and follow, asked between two ticks, before anything moves.
+
+Combs only pull, and only up to their voltage: the positions that can be held are a body that begins in a point at rest.
+The same forces as in ``trajectory.check``, compiled: a motion of a hundred rows takes some 50 us.
+"""
+
+import math
+
+import numpy as np
+from numba import njit
+from numpy.typing import NDArray
+
+from pkxyz_ctrl.core import elasticity, kinematics
+from pkxyz_ctrl.core.linear3 import inverse3
+from pkxyz_ctrl.stage import Stage
+from pkxyz_ctrl.trajectory.check import DriveLimits
+
+Array = NDArray[np.float64]
+Records = NDArray[np.void]
+
+_LIMITS = np.dtype(
+    [
+        ("stroke_min_m", "f8"),
+        ("stroke_max_m", "f8"),
+        ("force_max_n", "f8", (3,)),
+        ("gain_n_per_v2", "f8", (3,)),
+        ("slew_v", "f8"),  # most that a voltage may change in a period
+        ("damping_n_s_per_m", "f8", (3, 3)),
+        ("mass_kg", "f8"),
+    ],
+    align=True,
+)
+_FINE, _DOMAIN, _STROKE, _PUSH, _VOLTAGE, _SLEW = range(6)
+_ROUNDING_M, _ROUNDING_N = 1e-12, 1e-9
+_HALVINGS = 28
+_SPAN_STROKES, _PROBES = 2.5, 101
+_AXES = "xyz"
+
+
+class Reach:
+    """Asks for one stage and drive; what it answers is a sentence, or None where there is no objection."""
+
+    def __init__(self, stage: Stage, drive: DriveLimits) -> None:
+        self._stage = stage
+        self._limit_v = min(stage.voltage_max_v, drive.voltage_max_v)
+        limits = stage.config.limits
+        self._limits = np.zeros(1, _LIMITS)
+        numbers = self._limits[0]
+        numbers["stroke_min_m"], numbers["stroke_max_m"] = limits.stroke_min_m, limits.stroke_max_m
+        numbers["gain_n_per_v2"] = stage.force_gain_n_per_v2
+        numbers["force_max_n"] = stage.force_gain_n_per_v2 * self._limit_v**2
+        numbers["slew_v"] = drive.slew_max_v_per_s * drive.period_us * 1e-6
+        eigenvalue, mode = np.linalg.eigh(stage.stiffness(np.zeros(3)))
+        damping = math.sqrt(stage.mass_kg) / stage.quality_factor * (mode * np.sqrt(eigenvalue)) @ mode.T
+        numbers["damping_n_s_per_m"], numbers["mass_kg"] = damping, stage.mass_kg
+        self._span_m = _SPAN_STROKES * limits.stroke_max_m
+
+    def holds(self, position_m: Array) -> bool:
+        """Whether a position (3,) can be held."""
+        return self._look(self._at(position_m))[0] == _FINE
+
+    def target_refusal(self, position_m: Array) -> str | None:
+        """Why a position (3,) can't be held: axis, value, unit and limit."""
+        if not np.isfinite(position_m).all():
+            return "a target has to be finite"
+        code, comb, value = self._look(self._at(position_m))
+        if code == _FINE:
+            return None
+        return f"{_where(position_m)} can't be held: {self._words(code, comb, value)}{self._range_words(position_m)}"
+
+    def motion_refusal(self, rows: Array, periods: int = 1) -> str | None:
+        """Why rows (n, 9) of a motion, so many periods apart, can't be followed: where, comb, value, unit, limit."""
+        if not np.isfinite(rows).all():
+            return "a motion has to be finite"
+        at, code, comb, value = _first_beyond(
+            self._stage.geometry, self._stage.elasticity, self._limits, np.ascontiguousarray(rows), periods
+        )
+        if code == _FINE:
+            return None
+        return f"on the way, at {_where(rows[at, 0:3])}, {self._words(code, comb, value)}"
+
+    def farthest(self, position_m: Array, axis: int, direction: float) -> float:
+        """How far along an axis (0, 1, 2) one can go from a position that is held, in m; 0 where it isn't held."""
+        way = np.zeros(3)
+        way[axis] = math.copysign(self._span_m, direction)
+        geometry, elastic = self._stage.geometry, self._stage.elasticity
+        return float(_share(geometry, elastic, self._limits, np.ascontiguousarray(position_m), way)) * self._span_m
+
+    def range_along(self, position_m: Array, axis: int) -> tuple[float, float] | None:
+        """Least and greatest coordinate of an axis that can be held, the others as they are; None if none is found."""
+        geometry, elastic = self._stage.geometry, self._stage.elasticity
+        probe = np.array(position_m, dtype=np.float64)
+        if not _held_along(
+            geometry, elastic, self._limits, probe, axis, np.linspace(-self._span_m, self._span_m, _PROBES)
+        ):
+            return None
+        value = float(probe[axis])
+        return value - self.farthest(probe, axis, -1.0), value + self.farthest(probe, axis, 1.0)
+
+    def _at(self, position_m: Array) -> Array:
+        return np.concatenate([position_m, np.zeros(6)])
+
+    def _look(self, row: Array) -> tuple[int, int, float]:
+        code, comb, value = _objection(self._stage.geometry, self._stage.elasticity, self._limits, row, np.empty(3))
+        return int(code), int(comb), float(value)
+
+    def _range_words(self, position_m: Array) -> str:
+        """How far one can go along an axis instead, the others as they are asked for."""
+        for axis, name in enumerate(_AXES):
+            found = self.range_along(position_m, axis)
+            if found is not None and found[1] - found[0] > 1e-9:
+                others = ", ".join(f"{a} = {_um(v)}" for a, v in zip(_AXES, position_m, strict=True) if a != name)
+                low, high = found
+                asked = f"; {name} = {_um(position_m[axis])} um is asked for"
+                return f"{asked}, limits {_um(low)} to {_um(high)} um at {others} um"
+        return "; no single axis can mend that: go nearer to the middle of the workspace"
+
+    def _words(self, code: int, comb: int, value: float) -> str:
+        limits, name = self._limits[0], f"comb {comb + 1}"
+        if code == _DOMAIN:
+            return "the links can't reach it"
+        if code == _STROKE:
+            low, high = _um(limits["stroke_min_m"]), _um(limits["stroke_max_m"])
+            return f"stroke {comb + 1} would be {_um(value)} um, limits {low} to {high} um"
+        if code == _PUSH:
+            return f"{name} would have to push with {-value * 1e6:.3g} uN, and combs only pull"
+        if code == _VOLTAGE:
+            volts = math.sqrt(value / limits["gain_n_per_v2"][comb])
+            return f"{name} would need {volts:.1f} V, limit {self._limit_v:g} V"
+        return f"the voltage of {name} would change by {value:.3g} V in a period, limit {limits['slew_v']:.3g} V: go slower"
+
+
+def _um(metres: float) -> str:
+    return f"{round(metres * 1e6, 5) + 0.0:.4g}"
+
+
+def _where(position_m: Array) -> str:
+    return f"({', '.join(_um(v) for v in position_m)}) um"
+
+
+@njit(cache=True)
+def _objection(
+    geometry: Records, elastic: Records, limits: Records, row: Array, force: Array
+) -> tuple[int, int, float]:
+    """The limit that a row (9,) of a reference passes, the comb, and the value; ``force`` (3,): what the combs give."""
+    bounds = limits[0]
+    position, demand = row[0:3], np.empty(3)
+    if kinematics.in_domain(geometry[0], position) != 0:
+        return _DOMAIN, 0, 0.0
+    kinematics.strokes(geometry[0], position, force)
+    for i in range(3):
+        if force[i] < bounds["stroke_min_m"] - _ROUNDING_M or force[i] > bounds["stroke_max_m"] + _ROUNDING_M:
+            return _STROKE, i, force[i]
+    elasticity.energy_gradient(geometry[0], elastic[0], position, demand)
+    damping = bounds["damping_n_s_per_m"]
+    for i in range(3):
+        demand[i] += bounds["mass_kg"] * row[6 + i]
+        for k in range(3):
+            demand[i] += damping[i, k] * row[3 + k]
+    pulls, inverse = np.empty((3, 3)), np.empty((3, 3))
+    kinematics.pulls(geometry[0], position, pulls)
+    inverse3(pulls, inverse)
+    for i in range(3):
+        force[i] = inverse[0, i] * demand[0] + inverse[1, i] * demand[1] + inverse[2, i] * demand[2]
+    for i in range(3):
+        if force[i] < -_ROUNDING_N:
+            return _PUSH, i, force[i]
+        if force[i] > bounds["force_max_n"][i]:
+            return _VOLTAGE, i, force[i]
+    return _FINE, 0, 0.0
+
+
+@njit(cache=True)
+def _first_beyond(
+    geometry: Records, elastic: Records, limits: Records, rows: Array, periods: int
+) -> tuple[int, int, int, float]:
+    """Index of the first row (n, 9) that passes a limit, which, of which comb, and the value."""
+    force, before = np.empty(3), np.empty(3)
+    for n in range(len(rows)):
+        code, comb, value = _objection(geometry, elastic, limits, rows[n], force)
+        if code != _FINE:
+            return n, code, comb, value
+        for i in range(3):
+            volts = math.sqrt(max(force[i], 0.0) / limits[0]["gain_n_per_v2"][i])
+            if n > 0 and abs(volts - before[i]) > periods * limits[0]["slew_v"]:
+                return n, _SLEW, i, abs(volts - before[i]) / periods
+            before[i] = volts
+    return 0, _FINE, 0, 0.0
+
+
+@njit(cache=True)
+def _share(geometry: Records, elastic: Records, limits: Records, position_m: Array, way_m: Array) -> float:
+    """What share of a way (3,) from a position (3,) can be gone so that what is reached can be held, by bisection."""
+    row, force = np.zeros(9), np.empty(3)
+    low, high = 0.0, 1.0
+    for step in range(_HALVINGS + 1):
+        middle = 0.0 if step == 0 else (low + high) / 2
+        for i in range(3):
+            row[i] = position_m[i] + middle * way_m[i]
+        held = _objection(geometry, elastic, limits, row, force)[0] == _FINE
+        if step == 0 and not held:
+            return 0.0
+        if held:
+            low = middle
+        else:
+            high = middle
+    return low
+
+
+@njit(cache=True)
+def _held_along(
+    geometry: Records, elastic: Records, limits: Records, probe_m: Array, axis: int, coordinates_m: Array
+) -> bool:
+    """Move ``probe_m`` (3,) along an axis to the first of the coordinates that can be held; whether there is one."""
+    row, force = np.zeros(9), np.empty(3)
+    for i in range(3):
+        row[i] = probe_m[i]
+    for value in coordinates_m:
+        row[axis] = probe_m[axis] = value
+        if _objection(geometry, elastic, limits, row, force)[0] == _FINE:
+            return True
+    return False

@@ -1,0 +1,333 @@
+"""A stage in operation: takes commands, moves the set-points, answers. Time, commands and memory are handed in.
+
+Called once a tick, after it; what it decides begins to act in the next. It knows no process and no clock, so it runs in
+lockstep as at rate.
+"""
+
+from collections.abc import Callable, Iterable
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from hil.operate import procedures
+from hil.operate.commands import ANSWER, SESSION, Activity, State, Verb
+from hil.operate.path_stream import PathStream
+from hil.operate.procedures import AbortedError, Lease, Operated, RefusedError, Steps
+from hil.operate.reach import Reach
+from hil.operate.setpoints import Setpoints
+from hil.operate.settings import Settings
+from pkxyz_ctrl.loop.controller import Controller
+from pkxyz_ctrl.safety.modes import Mode
+from pkxyz_ctrl.safety.trips import Trip
+from pkxyz_ctrl.trajectory.segments import Limits
+
+Array = NDArray[np.float64]
+Say = Callable[[bytes], object]
+"""Takes an answer as bytes of ``ANSWER``."""
+
+_WORDS_BYTES = ANSWER["words"].itemsize
+_MODAL = frozenset({Verb.HOME, Verb.ENABLE, Verb.CLEAR, Verb.AUTO_ZERO, Verb.PATH})
+"""Begun only while nothing else runs."""
+_LEAST, _MOST = 1e-12, 1e6
+
+
+class _Job(NamedTuple):
+    """A command that takes time."""
+
+    id: int
+    verb: Verb
+    steps: Steps
+
+
+class Session:
+    """``stage`` is what it works on, ``say`` where answers go."""
+
+    def __init__(self, controller: Controller, reach: Reach, settings: Settings, say: Say) -> None:
+        law, period_us = controller.law, controller.period_us
+        delay = int(law["tick"]["delay_periods"][0])
+        setpoints = Setpoints(period_us, delay, int(law["pace_ticks"][0]))
+        self.stage = Operated(controller, setpoints, reach, settings, period_us * 1e-6)
+        self.settings = settings
+        self.state = np.zeros(1, SESSION)
+        self.now_us = 0
+        self._say = say
+        self._period_us = period_us
+        self._job: _Job | None = None
+        self._beside: _Job | None = None  # pause, resume: besides the job that they act on
+        self._lease: Lease | None = None
+        self._jog_id = -1
+        self._known_faults = len(controller.faults)
+        self._server_us: int | None = None
+        self._server_says = 0
+
+    # -- what is handed in -----------------------------------------------------------------------------------------------
+
+    def _begin(self, command: np.void) -> None:
+        """Begin a command, a record of ``COMMAND``, or refuse it."""
+        self.state["commands"] += 1
+        try:
+            verb = Verb(int(command["verb"]))
+        except ValueError:
+            self._answer(int(command["id"]), 0, State.REFUSED, f"there is no verb {int(command['verb'])}")
+            return
+        try:
+            self._take(int(command["id"]), verb, command)
+        except RefusedError as refused:
+            self._answer(int(command["id"]), verb, State.REFUSED, str(refused))
+
+    def take_rows(self, number: int, first: int, motion: Array) -> None:
+        """Rows (n, 9) of the path that is followed; others are left aside."""
+        if self.stage.path is not None:
+            self.stage.path.take(number, first, motion)
+
+    @property
+    def wants_rows(self) -> bool:
+        """Whether there is a path that one more block of rows fits into."""
+        path, setpoints = self.stage.path, self.stage.setpoints
+        return path is not None and path.has_room(int(setpoints.path_row) if self._is_on_path else 0)
+
+    def server_says(self, count: int) -> None:
+        """The server's sign of life: a number that is another one each time."""
+        if count != self._server_says:
+            self._server_says, self._server_us = count, self.now_us
+
+    # -- once a tick -----------------------------------------------------------------------------------------------------
+
+    def after(self, row: np.void, commands: Iterable[np.void] = ()) -> None:
+        """A tick is over, and this is its row of ``ROW``; ``commands``, records of ``COMMAND``, have come since the
+        last. On return the set-points of the next tick are ready.
+        """
+        stage, controller = self.stage, self.stage.controller
+        self.now_us += self._period_us * (1 + int(row["overrun"]))
+        if len(controller.faults) > self._known_faults:
+            self._note_fault("\n".join(controller.faults[self._known_faults :]))
+        self._look_at_position(row)
+        self._look_at_leases()
+        self._job = self._step(self._job)
+        self._beside = self._step(self._beside)
+        if stage.mode == Mode.TRACKING:
+            stage.setpoints.advance(int(controller.memory["reference_tick"][0]))
+        for command in commands:
+            self._begin(command)
+        self._tell(row)
+
+    # -- commands --------------------------------------------------------------------------------------------------------
+
+    def _take(self, command_id: int, verb: Verb, command: np.void) -> None:
+        running = self._job
+        if verb is Verb.RELEASE:
+            self.stage.controller.memory["input"]["trips"] |= int(Trip.OPERATOR)
+            self._answer(command_id, verb, State.DONE, "the combs go to 0 V in the next tick; clear when ready")
+            return
+        if verb in (Verb.SETTLE, Verb.LIMITS):
+            self._answer(command_id, verb, State.DONE, self._set(verb, command))
+            return
+        if verb is Verb.JOG and self._renewed(command):
+            return
+        if verb in _MODAL and running is not None:
+            raise RefusedError(f"{running.verb.name} (command {running.id}) is running: wait for it, or abort it first")
+        if verb in (Verb.MOVE, Verb.JOG) and running is not None and running.verb not in (Verb.MOVE, Verb.JOG):
+            raise RefusedError(f"{running.verb.name} (command {running.id}) is running: abort it, or wait for its end")
+        job = _Job(command_id, verb, self._steps_of(verb, command))
+        if verb in (Verb.PAUSE, Verb.RESUME):
+            self._beside = self._begun(job)
+            return
+        begun = self._begun(job)  # raises where it is refused: then what runs goes on
+        if running is not None:
+            self._end(running, f"{verb.name} (command {command_id}) has taken its place")
+        self._job = begun
+
+    def _steps_of(self, verb: Verb, command: np.void) -> Steps:
+        stage = self.stage
+        if verb is Verb.MOVE:
+            return procedures.move(stage, self._target(command), self._limits(command))
+        if verb is Verb.JOG:
+            direction = np.array(command["target_m"])
+            if not np.isfinite(direction).all() or np.count_nonzero(direction) != 1:
+                raise RefusedError("a jog goes along one axis: give a direction of +1 or -1 for it, 0 for the others")
+            self._lease = Lease(self.now_us + round(self.settings.lease_s * 1e6))
+            return procedures.jog(stage, direction, self._limits(command), self._lease)
+        if verb is Verb.PATH:
+            path = PathStream(int(command["path"]), int(command["rows"]), command["start_m"].copy(), stage.reach)
+            return procedures.follow(stage, path, command["start_m"].copy())
+        if verb in (Verb.STOP, Verb.ABORT):
+            return procedures.halt(stage, on_path=verb is Verb.ABORT)
+        plain = {
+            Verb.HOME: procedures.home, Verb.ENABLE: procedures.enable, Verb.DISABLE: procedures.disable,
+            Verb.PARK: procedures.park, Verb.CLEAR: procedures.clear, Verb.AUTO_ZERO: procedures.auto_zero,
+            Verb.PAUSE: procedures.pause, Verb.RESUME: procedures.resume,
+        }  # fmt: skip
+        return plain[verb](stage)
+
+    def _target(self, command: np.void) -> Array:
+        asked, target = command["target_m"], self.stage.setpoints.target_m
+        if command["relative"]:
+            return np.asarray(target + np.where(np.isnan(asked), 0.0, asked))
+        return np.asarray(np.where(np.isnan(asked), target, asked))
+
+    def _limits(self, command: np.void) -> Limits:
+        """Those of the command, else those in force."""
+        names = ("velocity_m_per_s", "acceleration_m_per_s2", "jerk_m_per_s3")
+        asked = [float(command[name]) for name in names]
+        for name, value in zip(names, asked, strict=True):
+            if value != 0.0 and not _LEAST <= value <= _MOST:
+                raise RefusedError(f"{name} is {value:g}, limits {_LEAST:g} to {_MOST:g}")
+        return Limits(*(a if a != 0.0 else own for a, own in zip(asked, self.settings.limits, strict=True)))
+
+    def _set(self, verb: Verb, command: np.void) -> str:
+        if verb is Verb.LIMITS:
+            self.settings.limits = self._limits(command)
+            v, a, j = self.settings.limits
+            return f"moves that name none: {v:g} m/s, {a:g} m/s2, {j:g} m/s3"
+        window_m, dwell_s = float(command["window_m"]), float(command["dwell_s"])
+        if not 0.1e-9 <= window_m <= 10e-6 or not 0.0 <= dwell_s <= 10.0:
+            raise RefusedError(f"window {window_m:g} m, limits 1e-10 to 1e-05 m; dwell {dwell_s:g} s, limits 0 to 10 s")
+        self.settings.window_m, self.settings.dwell_s = window_m, dwell_s
+        return f"in position within {window_m * 1e9:g} nm for {dwell_s * 1e3:g} ms"
+
+    def _renewed(self, command: np.void) -> bool:
+        """Whether this only says again, or ends, the jog that runs."""
+        job, lease = self._job, self._lease
+        direction = command["target_m"]
+        is_end = not direction.any()
+        is_again, self._jog_id = int(command["id"]) == self._jog_id, int(command["id"])
+        if job is None or job.verb is not Verb.JOG or lease is None:
+            if is_end:
+                self._answer(int(command["id"]), Verb.JOG, State.DONE, "no jog runs")
+            return is_end or is_again  # what has ended already is not begun again by being renewed
+        if is_end:
+            lease.end("the jog was ended")
+            self._answer(int(command["id"]), Verb.JOG, State.DONE, "the jog ends")
+            return True
+        if int(command["id"]) == job.id:
+            lease.until_us = self.now_us + round(self.settings.lease_s * 1e6)
+            return True
+        return False
+
+    # -- jobs ------------------------------------------------------------------------------------------------------------
+
+    def _begun(self, job: _Job) -> _Job | None:
+        """The job after its first step. Raises ``RefusedError``."""
+        try:
+            next(job.steps)
+        except StopIteration as end:
+            self._answer(job.id, job.verb, State.DONE, str(end.value))
+            return None
+        except AbortedError as error:
+            self._answer(job.id, job.verb, State.ABORTED, str(error))
+            return None
+        self._answer(job.id, job.verb, State.RUNNING, "")
+        return job
+
+    def _step(self, job: _Job | None) -> _Job | None:
+        if job is None:
+            return None
+        try:
+            next(job.steps)
+        except StopIteration as end:
+            self._answer(job.id, job.verb, State.DONE, str(end.value))
+        except (AbortedError, RefusedError) as error:
+            self._answer(job.id, job.verb, State.ABORTED, str(error))
+        else:
+            if self.stage.said:
+                self._answer(job.id, job.verb, State.RUNNING, self.stage.said)
+                self.stage.said = ""
+            return job
+        if job.verb is Verb.PATH:
+            self._forget_path()
+        return None
+
+    def _end(self, job: _Job, why: str) -> None:
+        job.steps.close()
+        self._answer(job.id, job.verb, State.ABORTED, why)
+        if job.verb is Verb.PATH:
+            self.stage.path = None
+
+    def _forget_path(self) -> None:
+        """A path that ended, or could not be followed: stand where it stands."""
+        self.stage.path = None
+        if self.stage.is_driven and self.stage.setpoints.stands_on_path:
+            self.stage.setpoints.leave_path()
+
+    # -- what is looked at -----------------------------------------------------------------------------------------------
+
+    def _note_fault(self, words: str) -> None:
+        self._known_faults = len(self.stage.controller.faults)
+        for job in (self._job, self._beside):
+            if job is not None and job.verb is not Verb.CLEAR:
+                self._end(job, words.splitlines()[0])
+        if self._job is None or self._job.verb is not Verb.CLEAR:
+            self._job = None
+        self._beside = None
+        self._answer(0, 0, State.ABORTED, words)
+
+    def _look_at_position(self, row: np.void) -> None:
+        stage = self.stage
+        error = np.abs(row["estimate_m"] - stage.setpoints.target_m)
+        inside = stage.is_driven and bool((error <= self.settings.window_m).all())
+        stage.ticks_in_position = stage.ticks_in_position + 1 if inside else 0
+
+    def _look_at_leases(self) -> None:
+        if self._lease is not None:
+            self._lease.look(self.now_us)
+        if self._server_us is None or self.now_us - self._server_us <= self.settings.silence_s * 1e6:
+            return
+        self._server_us = None  # once; its next sign of life makes it a server again
+        moving = not self.stage.setpoints.has_arrived or self._job is not None
+        if not self.stage.is_driven or not (moving or self.settings.on_silence == "park"):
+            return
+        if self._job is not None:
+            self._end(self._job, "the server has fallen silent")
+        self._beside = None
+        self._job = _Job(0, Verb.ABORT, self._halted_by_silence())
+
+    def _halted_by_silence(self) -> Steps:
+        words = yield from procedures.halt(self.stage, on_path=True)
+        if self.settings.on_silence == "park":
+            words = yield from procedures.park(self.stage)
+        return f"the server has fallen silent: {words}"
+
+    # -- what is told ----------------------------------------------------------------------------------------------------
+
+    @property
+    def _is_on_path(self) -> bool:
+        return self.stage.setpoints.follows(self.stage.path)
+
+    def _tell(self, row: np.void) -> None:
+        state, stage = self.state, self.stage
+        setpoints, path = stage.setpoints, stage.path
+        state["activity"] = int(self._activity())
+        state["in_position"] = stage.is_in_position and stage.is_driven
+        state["homed"], state["driven"] = stage.is_homed, stage.is_driven
+        state["running_id"] = self._job.id if self._job is not None else 0
+        state["target_m"] = setpoints.target_m
+        on_path = self._is_on_path
+        state["path_row"] = setpoints.path_row if on_path else 0.0
+        state["progress"] = setpoints.path_row / max(1, path.rows) if on_path and path is not None else 0.0
+        state["missed"] += int(row["overrun"]) + int(row["sense_status"] & 1)
+
+    def _activity(self) -> Activity:
+        stage, setpoints = self.stage, self.stage.setpoints
+        by_mode = {
+            Mode.BOOT: Activity.STARTING, Mode.PRE_OPERATIONAL: Activity.STARTING, Mode.IDLE: Activity.OFF,
+            Mode.HOMING: Activity.HOMING, Mode.FAULT: Activity.FAULT,
+        }  # fmt: skip
+        if stage.mode in by_mode:
+            return by_mode[stage.mode]
+        if setpoints.has_arrived:
+            return Activity.HOLDING
+        if setpoints.stands_on_path:
+            return Activity.PAUSED
+        verb = self._job.verb if self._job is not None else None
+        if setpoints.is_stopping or verb in (Verb.STOP, Verb.ABORT):
+            return Activity.STOPPING
+        if self._is_on_path:
+            return Activity.SCANNING
+        return Activity.JOGGING if verb is Verb.JOG else Activity.MOVING
+
+    def _answer(self, command_id: int, verb: int, state: State, words: str) -> None:
+        answer = np.zeros(1, ANSWER)
+        answer["id"], answer["verb"], answer["state"], answer["t_us"] = command_id, verb, state, self.now_us
+        answer["words"] = words.encode()[:_WORDS_BYTES]
+        self._say(answer.tobytes())

@@ -1,0 +1,1 @@
+"""The client of a stage in operation, for programs. Knows neither the controller nor the harness."""

@@ -1,0 +1,69 @@
+"""Plans from any state: they begin there, keep the limits and end at rest where they should."""
+
+import numpy as np
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from pkxyz_ctrl.trajectory.in_flight import to_rest, towards
+from pkxyz_ctrl.trajectory.segments import Limits
+
+LIMITS = Limits(0.5e-3, 0.5, 300.0)
+PERIOD_S = 1e-5
+
+
+def three(most: float) -> st.SearchStrategy[tuple[float, float, float]]:
+    one = st.floats(-most, most)
+    return st.tuples(one, one, one)
+
+
+states = st.tuples(three(10e-6), three(0.4e-3), three(0.1)).map(np.array)
+
+
+def sampled(motion):
+    return motion.sample(np.append(np.arange(0, motion.total_s, PERIOD_S), motion.total_s))
+
+
+@settings(max_examples=80, deadline=None)
+@given(states, three(10e-6).map(np.array))
+def test_a_new_target_is_reached_from_any_state_inside_the_limits(state, target):
+    motion = towards(state, target, LIMITS)
+    rows = sampled(motion)
+    assert np.allclose(rows[0].reshape(3, 3), state, rtol=1e-9, atol=[[1e-15], [1e-12], [1e-8]])
+    assert np.allclose(rows[-1, 0:3], target, atol=2e-13, rtol=0)
+    assert (rows[-1, 3:] == 0).all()
+    assert np.array_equal(motion.end(), [target, np.zeros(3), np.zeros(3)])
+    assert np.abs(rows[:, 3:6]).max() <= LIMITS.velocity_m_per_s * (1 + 1e-6)
+    assert np.abs(rows[:, 6:9]).max() <= LIMITS.acceleration_m_per_s2 * (1 + 1e-6)
+    jerk = np.abs(np.diff(rows[:-1, 6:9], axis=0)) / PERIOD_S
+    assert not len(jerk) or jerk.max() <= LIMITS.jerk_m_per_s3 * (1 + 1e-4)
+
+
+@settings(max_examples=60, deadline=None)
+@given(states)
+def test_a_stop_comes_to_rest_and_stays(state):
+    motion = to_rest(state, LIMITS)
+    rows = sampled(motion)
+    last = LIMITS.jerk_m_per_s3 * PERIOD_S**2 / 2  # a step before the end
+    assert np.allclose(rows[-2:, 3:6], 0, atol=last * 1.01)
+    assert np.allclose(rows[-1, 0:3], motion.end_m, atol=1e-15)
+    assert np.allclose(motion.sample(np.array([motion.total_s + 1.0])), rows[-1:], rtol=0, atol=1e-18)
+    assert motion.total_s <= 0.02
+
+
+@given(three(10e-6).map(np.array), three(10e-6).map(np.array))
+def test_from_rest_the_way_is_straight(start, target):
+    rows = sampled(towards(np.array([start, np.zeros(3), np.zeros(3)]), target, LIMITS))
+    way = target - start
+    if np.abs(way).max() < 1e-9:
+        return
+    share = (rows[:, 0:3] - start) @ way / (way @ way)
+    assert np.allclose(rows[:, 0:3], start + share[:, None] * way, atol=1e-12)
+
+
+def test_a_state_faster_than_the_limits_is_brought_inside_them():
+    slow = Limits(0.1e-3, 0.5, 300.0)
+    state = np.array([[0.0, 0.0, 0.0], [0.4e-3, 0.0, 0.0], [0.0, 0.0, 0.0]])
+    rows = sampled(towards(state, np.array([20e-6, 0.0, 0.0]), slow))
+    assert rows[:, 3].max() <= 0.4e-3 * (1 + 1e-9)
+    assert np.allclose(rows[-1, 0:3], [20e-6, 0, 0], atol=1e-12)
+    assert (rows[len(rows) // 2 :, 3] <= 0.1e-3 * (1 + 1e-6)).all()
