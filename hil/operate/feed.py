@@ -1,6 +1,6 @@
 """Where on its path a set-point is, row by row: at the path's own speed, slowing down, standing, or starting again.
 
-The ramps are those of ``core.pace``, so a path that is paused is not left.
+The ramps are those of ``core.feed_hold``, so a path that is paused is not left.
 """
 
 from typing import NamedTuple
@@ -9,28 +9,28 @@ import numpy as np
 from numba import njit
 from numpy.typing import NDArray
 
-from pkxyz_ctrl.core import pace
+from pkxyz_ctrl.core import feed_hold
 
 Array = NDArray[np.float64]
 Records = NDArray[np.void]
 
 
 class Feed(NamedTuple):
-    """How path time passes with the loop's rows: ``direction`` is that of ``core.pace``, since row ``origin``."""
+    """How path time passes with the loop's rows: ``direction`` is that of ``core.feed_hold``, since row ``origin``."""
 
     origin: int
     """row of the loop at which the ramp, or the path, began"""
     phase: float = 0.0
     """row of the path there"""
-    direction: int = pace.STEADY
+    direction: int = feed_hold.STEADY
     ramp: int = 2
     """rows that a ramp takes, an even number"""
 
     def at(self, row: int) -> float:
         """Row of the path at a row of the loop."""
-        if self.direction == pace.STEADY:
+        if self.direction == feed_hold.STEADY:
             return self.phase + (row - self.origin)
-        gone, _, _ = pace.advance(self.direction, row - self.origin, self.ramp)
+        gone, _, _ = feed_hold.advance(self.direction, row - self.origin, self.ramp)
         return self.phase + float(gone)
 
     def turned(self, direction: int, row: int) -> "Feed":
@@ -38,19 +38,19 @@ class Feed(NamedTuple):
         if self.direction == direction:
             return self
         age = 0
-        if self.direction != pace.STEADY:
+        if self.direction != feed_hold.STEADY:
             age = max(0, self.ramp - (row - self.origin))  # where the mirrored ramp has this speed
-        gone, _, _ = pace.advance(direction, age, self.ramp)
+        gone, _, _ = feed_hold.advance(direction, age, self.ramp)
         return Feed(row - age, self.at(row) - float(gone), direction, self.ramp)
 
     @property
     def is_plain(self) -> bool:
         """Whether rows of the loop are rows of the path."""
-        return self.direction == pace.STEADY
+        return self.direction == feed_hold.STEADY
 
     def stands_at(self, row: int) -> bool:
         """Whether the path has come to a stop by a row of the loop."""
-        return self.direction == pace.SLOWING and row - self.origin >= self.ramp
+        return self.direction == feed_hold.SLOWING and row - self.origin >= self.ramp
 
 
 @njit(cache=True)
@@ -68,5 +68,5 @@ def fed_rows(
     ``motion`` from ``window_first`` on, as many as are needed.
     """
     for n in range(len(out)):
-        gone, speed, change = pace.advance(direction, first_age + n, ramp)
-        pace.sample(window, phase + gone - window_first, speed, change, period_s, out[n])
+        gone, speed, change = feed_hold.advance(direction, first_age + n, ramp)
+        feed_hold.sample(window, phase + gone - window_first, speed, change, period_s, out[n])

@@ -99,7 +99,7 @@ def home(stage: Operated) -> Steps:
 
 def enable(stage: Operated) -> Steps:
     """Close the loop at rest, as soon as the combs have been at 0 V for long enough."""
-    if stage.mode == Mode.TRACKING:
+    if stage.is_in(Mode.TRACKING):
         return "the loop is closed already"
     if stage.mode not in (Mode.IDLE, Mode.ENABLED):
         raise RefusedError(_not_now(stage.mode, Event.ENABLE, "clear the fault first"))
@@ -115,7 +115,7 @@ def enable(stage: Operated) -> Steps:
     stage.setpoints.restart(_REST)
     stage.controller.request(Event.TRACK)
     yield
-    if stage.mode != Mode.TRACKING:
+    if not stage.is_in(Mode.TRACKING):
         raise AbortedError(f"the loop did not stay closed: {_mode_words(stage.mode)}")
     return "the loop is closed and holds the rest pose"
 

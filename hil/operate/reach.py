@@ -127,7 +127,8 @@ class Reach:
         if code == _VOLTAGE:
             volts = math.sqrt(value / limits["gain_n_per_v2"][comb])
             return f"{name} would need {volts:.1f} V, limit {self._limit_v:g} V"
-        return f"the voltage of {name} would change by {value:.3g} V in a period, limit {limits['slew_v']:.3g} V: go slower"
+        slew_v = limits["slew_v"]
+        return f"the voltage of {name} would change by {value:.3g} V in a period, limit {slew_v:.3g} V: go slower"
 
 
 def _um(metres: float) -> str:

@@ -46,7 +46,7 @@ class Session:
     def __init__(self, controller: Controller, reach: Reach, settings: Settings, say: Say) -> None:
         law, period_us = controller.law, controller.period_us
         delay = int(law["tick"]["delay_periods"][0])
-        setpoints = Setpoints(period_us, delay, int(law["pace_ticks"][0]))
+        setpoints = Setpoints(period_us, delay, int(law["feed_hold_ticks"][0]))
         self.stage = Operated(controller, setpoints, reach, settings, period_us * 1e-6)
         self.settings = settings
         self.state = np.zeros(1, SESSION)
@@ -61,7 +61,7 @@ class Session:
         self._server_us: int | None = None
         self._server_says = 0
 
-    # -- what is handed in -----------------------------------------------------------------------------------------------
+    # -- what is handed in ---------------------------------------------------------------------------------------------
 
     def _begin(self, command: np.void) -> None:
         """Begin a command, a record of ``COMMAND``, or refuse it."""
@@ -92,7 +92,7 @@ class Session:
         if count != self._server_says:
             self._server_says, self._server_us = count, self.now_us
 
-    # -- once a tick -----------------------------------------------------------------------------------------------------
+    # -- once a tick ---------------------------------------------------------------------------------------------------
 
     def after(self, row: np.void, commands: Iterable[np.void] = ()) -> None:
         """A tick is over, and this is its row of ``ROW``; ``commands``, records of ``COMMAND``, have come since the
@@ -112,7 +112,7 @@ class Session:
             self._begin(command)
         self._tell(row)
 
-    # -- commands --------------------------------------------------------------------------------------------------------
+    # -- commands ------------------------------------------------------------------------------------------------------
 
     def _take(self, command_id: int, verb: Verb, command: np.void) -> None:
         running = self._job
@@ -205,7 +205,7 @@ class Session:
             return True
         return False
 
-    # -- jobs ------------------------------------------------------------------------------------------------------------
+    # -- jobs ----------------------------------------------------------------------------------------------------------
 
     def _begun(self, job: _Job) -> _Job | None:
         """The job after its first step. Raises ``RefusedError``."""
@@ -250,7 +250,7 @@ class Session:
         if self.stage.is_driven and self.stage.setpoints.stands_on_path:
             self.stage.setpoints.leave_path()
 
-    # -- what is looked at -----------------------------------------------------------------------------------------------
+    # -- what is looked at ---------------------------------------------------------------------------------------------
 
     def _note_fault(self, words: str) -> None:
         self._known_faults = len(self.stage.controller.faults)
@@ -288,7 +288,7 @@ class Session:
             words = yield from procedures.park(self.stage)
         return f"the server has fallen silent: {words}"
 
-    # -- what is told ----------------------------------------------------------------------------------------------------
+    # -- what is told --------------------------------------------------------------------------------------------------
 
     @property
     def _is_on_path(self) -> bool:

@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 
 from hil.lanes.blocks import PREVIEW_ROWS
 from hil.operate.feed import Feed, fed_rows
-from pkxyz_ctrl.core import pace
+from pkxyz_ctrl.core import feed_hold
 from pkxyz_ctrl.loop.reference import REFERENCE, write_rows
 from pkxyz_ctrl.trajectory.in_flight import InFlight, to_rest, towards
 from pkxyz_ctrl.trajectory.segments import Limits
@@ -120,11 +120,11 @@ class Setpoints:
 
     def stop_on_path(self) -> None:
         """Slow down to a stop without leaving the path."""
-        self._turn(pace.SLOWING)
+        self._turn(feed_hold.SLOWING)
 
     def go_on(self) -> None:
         """Go on along the path."""
-        self._turn(pace.STARTING)
+        self._turn(feed_hold.STARTING)
 
     def leave_path(self) -> None:
         """Where the path has come to a stop, stand: it is not gone on with."""
@@ -165,7 +165,7 @@ class Setpoints:
     @property
     def is_stopping(self) -> bool:
         """Whether it slows down on its path, or stands on it."""
-        return self._feed.direction == pace.SLOWING
+        return self._feed.direction == feed_hold.SLOWING
 
     @property
     def runs_short(self) -> bool:

@@ -43,6 +43,7 @@ HOUSE: Mapping[str, Room] = MappingProxyType({
         ("pkxyz_ctrl.can", "pkxyz_ctrl.safety", "pkxyz_ctrl.compiled", "pkxyz_ctrl.config", "pkxyz_ctrl.core")
     ),
     "pkxyz_ctrl.export": Room(("pkxyz_ctrl.safety", "pkxyz_ctrl.compiled", "pkxyz_ctrl.core", "pkxyz_ctrl.loop")),
+    "pkxyz_ctrl.client": Room(),
     # the device, and what is designed for it offline
     "pkxyz_ctrl.elements": Room(("pkxyz_ctrl.config",)),
     "pkxyz_ctrl": Room(("pkxyz_ctrl.compiled", "pkxyz_ctrl.config", "pkxyz_ctrl.core", "pkxyz_ctrl.elements")),
@@ -70,9 +71,10 @@ HOUSE: Mapping[str, Room] = MappingProxyType({
     )),
     # a loop that is closed, once
     "hil.lanes": Room(
-        ("sim.config", "sim", "pkxyz_ctrl.*", "hil.bus", "hil.node", "hil.plant", "hil.recording", "hil.faults")
+        ("sim.config", "sim", "pkxyz_ctrl.*", "hil.bus", "hil.node", "hil.plant", "hil.faults")
     ),
     "hil.conformance": Room(("sim.config", "sim", "pkxyz_ctrl.*", "hil.bus", "hil.node", "hil.plant", "hil.lanes")),
+    "hil.operate": Room(("pkxyz_ctrl.*", "hil.lanes")),
     "hil.runs": Room(("sim.config", "pkxyz_ctrl.*", "hil.recording", "hil.faults", "hil.lanes")),
     # many times, for one question
     "hil.studies.spread": Room(("pkxyz_ctrl.*",)),
@@ -105,8 +107,8 @@ HOUSE: Mapping[str, Room] = MappingProxyType({
         "hil.api",
     )),
     "hil.commands": Room((
-        "pkxyz_ctrl.*", "hil.recording", "hil.faults", "hil.lanes", "hil.conformance", "hil.runs", "hil.studies",
-        "hil.pictures", "hil.screen", "hil.bench.rigs", "hil.bench",
+        "pkxyz_ctrl.*", "hil.recording", "hil.faults", "hil.lanes", "hil.conformance", "hil.operate", "hil.runs",
+        "hil.studies", "hil.pictures", "hil.screen", "hil.bench.rigs", "hil.bench",
     )),
     "hil": Room((
         "pkxyz_ctrl.*", "hil.lanes", "hil.runs", "hil.screen", "hil.api", "hil.commands.studies", "hil.commands",

@@ -69,7 +69,7 @@ def test_refusals_name_axis_value_unit_and_limit():
     assert words is not None
     for part in ("(20, 0, 18) um", "x = 20 um", "-13.51 to 13.51 um", "y = 0, z = 18 um"):
         assert part in words
-    words = REACH.target_refusal(np.array([0.0, 0.0, 36.99e-6]) + [0, 0, 1e-6])
+    words = REACH.target_refusal(np.array([0.0, 0.0, 37.99e-6]))
     assert words is not None
     assert "limits 0 to 36.99 um" in words
     low = Reach(stage(), DriveLimits(150.0, 100e3, 200)).target_refusal(np.array([0.0, 0.0, 30e-6]))

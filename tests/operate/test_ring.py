@@ -147,7 +147,7 @@ def test_memory_is_nobody_elses_and_not_made_over_a_link(tmp_path):
     memory.count_up("stop")
     assert int(StageMemory(path).head["stop"][0]) == 1
     (tmp_path / "link").symlink_to(path)
-    with pytest.raises(OSError):
+    with pytest.raises(OSError, match="link"):
         StageMemory(tmp_path / "link")
     memory.remove()
     memory.remove()

@@ -405,7 +405,7 @@ def test_random_commands_never_lose_the_stage():
         yield from rig.switched_on()
         for _ in range(150):
             verb = verbs[rng.integers(len(verbs))]
-            target = rng.uniform(-6e-6, 6e-6, 3) + (0, 0, 18e-6)
+            target = rng.uniform(-6e-6, 6e-6, 3) + np.array(MIDDLE_M)
             if verb is Verb.JOG:
                 target = np.eye(3)[rng.integers(3)] * rng.choice([-1.0, 1.0])
             fields = {"target_m": target, "relative": 0, "window_m": 20e-9, "dwell_s": 1e-3}
