@@ -1,9 +1,8 @@
-"""What README and docs show is executed: each page's blocks in order, in a folder of its own outside of the checkout.
+"""What README and docs show is executed, by the installed wheel: each page's blocks in order, in a folder of its own.
 
 A block that can't run here says why, and its commands and options are still checked.
 """
 
-import os
 import subprocess
 import sys
 import tomllib
@@ -12,6 +11,7 @@ from pathlib import Path
 import pytest
 from fenced_blocks import Block, blocks, commands_of, inline_commands
 from generated_pages import commands
+from installed_wheel import install
 
 ROOT = Path(__file__).parents[2]
 PAGES = [ROOT / "README.md", ROOT / "benchmarks" / "README.md", *sorted((ROOT / "docs").rglob("*.md"))]
@@ -23,26 +23,39 @@ def runs(page: Path) -> list[Block]:
     return [b for b in blocks(page) if b.language in ("sh", "python") and b.reason is None]
 
 
-@pytest.fixture
-def folder(tmp_path: Path) -> Path:
-    """An empty folder, with ``pkxyz`` of this checkout in a folder beside it, as if installed."""
-    (tmp_path / "bin").mkdir()
-    command = tmp_path / "bin" / "pkxyz"
-    command.write_text(f'#!/bin/sh\nexec {sys.executable} -m hil.cli "$@"\n', encoding="utf-8")
-    command.chmod(0o755)
-    (tmp_path / "work").mkdir()
-    return tmp_path / "work"
+@pytest.fixture(scope="module")
+def env(tmp_path_factory: pytest.TempPathFactory) -> dict[str, str]:
+    """The environment of a user who has installed the wheel."""
+    return install(tmp_path_factory.mktemp("user")) | {"COLUMNS": "120", "OPENBLAS_NUM_THREADS": "1"}
+
+
+@pytest.mark.slow
+def test_what_runs_is_the_wheel(env: dict[str, str], tmp_path: Path) -> None:
+    for module in ("hil", "pkxyz_ctrl", "sim"):
+        code = f"import {module}; print({module}.__file__)"
+        done = subprocess.run(
+            [sys.executable, "-c", code], cwd=tmp_path, env=env, capture_output=True, text=True, check=True
+        )
+        assert Path(done.stdout.strip()).is_relative_to(env["PYTHONPATH"])
+    done = subprocess.run(["pkxyz", "configs"], cwd=tmp_path, env=env, capture_output=True, text=True, check=True)
+    assert env["PYTHONPATH"] in done.stdout.replace("\n", "")
+    assert str(ROOT) not in done.stdout.replace("\n", "")
 
 
 @pytest.mark.slow
 @pytest.mark.parametrize("page", [p for p in PAGES if runs(p)], ids=lambda p: p.relative_to(ROOT).as_posix())
-def test_the_blocks_of_a_page_run_in_order(page: Path, folder: Path) -> None:
-    path = os.pathsep.join((str(folder.parent / "bin"), str(Path(sys.executable).parent), os.environ["PATH"]))
-    env = {**os.environ, "PATH": path, "PYTHONPATH": str(ROOT), "COLUMNS": "120", "OPENBLAS_NUM_THREADS": "1"}
+def test_the_blocks_of_a_page_run_in_order(page: Path, env: dict[str, str], tmp_path: Path) -> None:
     for block in runs(page):
         interpreter = [sys.executable, "-"] if block.language == "python" else ["bash", "-euo", "pipefail"]
         done = subprocess.run(
-            interpreter, input=block.text, cwd=folder, env=env, capture_output=True, text=True, check=False, timeout=300
+            interpreter,
+            input=block.text,
+            cwd=tmp_path,
+            env=env,
+            capture_output=True,
+            text=True,
+            check=False,
+            timeout=300,
         )
         where = f"{page.relative_to(ROOT)}:{block.line}"
         assert done.returncode == 0, f"{where}\n{block.text}\n{done.stdout[-2000:]}{done.stderr[-2000:]}"
