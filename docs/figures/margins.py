@@ -1,5 +1,5 @@
 """Writes docs/figures/margins.png and the table of margins.md: the shipped laws on ``fd_5k`` at mid-workspace, and
-over the changed and the random plants.
+over the changed and the sampled plants.
 """
 
 import math
@@ -59,7 +59,7 @@ def table(all_loops: dict[str, Loop]) -> str:
     lines = [
         "| law | Ms | disk margin | \\|S\\| < -3 dB to (Hz) | gain margin, x (dB) | hold noise (nm) "
         "| largest \\|K S\\| / k "
-        "| slowest pole (ms) | 135 changed plants: worst Ms | 200 random plants: 95 % of Ms, unstable |",
+        "| slowest pole (ms) | 135 changed plants: worst Ms | 200 sampled plants: 95 % of Ms, unstable |",
         f"|{' --- |' * 10}",
     ]
     for name, loop in all_loops.items():
