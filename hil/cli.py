@@ -16,6 +16,7 @@ COMMANDS = {
     "identify": ("hil.commands.studies.identify:identify", "Measure the stage in its running loop."),
     "tune": ("hil.commands.studies.tune:tune", "Better numbers for a controller file."),
     "montecarlo": ("hil.commands.studies.montecarlo:montecarlo", "A law against many sampled plants."),
+    "yield": ("hil.commands.studies.wafer_yield:wafer_yield", "Which share of a wafer works, and why."),
     "faults": ("hil.commands.studies.faults:faults", "Break everything once, under each law."),
     "soak": ("hil.commands.studies.soak:soak", "Half an hour under random faults."),
     "replay": ("hil.commands.replay:replay", "A recording once more through the tick."),

@@ -24,6 +24,7 @@ from pkxyz_ctrl.config.controller import ControllerConfig
 from pkxyz_ctrl.config.files import names
 from pkxyz_ctrl.config.stage import StageConfig
 from pkxyz_ctrl.design.margins.tolerances import Tolerances
+from pkxyz_ctrl.fabrication.process import Process
 from pkxyz_ctrl.loop import row
 from sim.config import PlantConfig
 
@@ -34,6 +35,7 @@ MODELS: dict[str, type[BaseModel]] = {
     "plants": PlantConfig,
     "buses": BusConfig,
     "tolerances": Tolerances,
+    "processes": Process,
     "searches": SearchConfig,
 }
 """The model of each folder of configs/."""

@@ -11,7 +11,7 @@ import typer
 from hil.screen.terminal import faint, plain_table, print_whole
 from pkxyz_ctrl.config.files import CONFIG_DIR, names
 
-KINDS = ("scenarios", "stages", "plants", "controllers", "buses", "tolerances", "searches")
+KINDS = ("scenarios", "stages", "plants", "controllers", "buses", "tolerances", "processes", "searches")
 """Folders of configs/, as ``pkxyz configs`` lists them."""
 
 

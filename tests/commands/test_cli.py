@@ -47,7 +47,16 @@ def test_configs_lists_every_shipped_file_with_a_line_about_it(tmp_path):
     for kind, entries in listed.items():
         assert set(entries) == {path.stem for path in (CONFIG_DIR / kind).glob("*.toml")}
         assert all(words and "\n" not in words for words in entries.values()), kind
-    assert set(listed) == {"scenarios", "stages", "plants", "controllers", "buses", "tolerances", "searches"}
+    assert set(listed) == {
+        "scenarios",
+        "stages",
+        "plants",
+        "controllers",
+        "buses",
+        "tolerances",
+        "processes",
+        "searches",
+    }
     shown = pkxyz("configs", cwd=tmp_path)
     assert shown.returncode == 0
     assert "reconstructed" in shown.stdout

@@ -69,7 +69,7 @@ def test_h_is_help(words, tmp_path):
 
 def test_configs_says_where_the_files_are(tmp_path):
     shown = pkxyz("configs", cwd=tmp_path).stdout
-    for kind in ("scenarios", "stages", "plants", "controllers", "buses", "tolerances", "searches"):
+    for kind in ("scenarios", "stages", "plants", "controllers", "buses", "tolerances", "processes", "searches"):
         assert f"{CONFIG_DIR / kind}/" in shown
 
 

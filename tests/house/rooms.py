@@ -47,6 +47,9 @@ HOUSE: Mapping[str, Room] = MappingProxyType({
     # the device, and what is designed for it offline
     "pkxyz_ctrl.elements": Room(("pkxyz_ctrl.config",)),
     "pkxyz_ctrl": Room(("pkxyz_ctrl.compiled", "pkxyz_ctrl.config", "pkxyz_ctrl.core", "pkxyz_ctrl.elements")),
+    "pkxyz_ctrl.fabrication": Room(
+        ("pkxyz_ctrl.config", "pkxyz_ctrl.elements"), ("math", "itertools", "pydantic", "numpy", *VALUES)
+    ),
     "pkxyz_ctrl.mechanics": Room(("pkxyz_ctrl.config", "pkxyz_ctrl.core", "pkxyz_ctrl.elements", "pkxyz_ctrl")),
     "pkxyz_ctrl.trajectory": Room(("pkxyz_ctrl.config", "pkxyz_ctrl")),
     "pkxyz_ctrl.learning": Room(("pkxyz_ctrl.safety", "pkxyz_ctrl.config", "pkxyz_ctrl.trajectory")),
@@ -78,6 +81,7 @@ HOUSE: Mapping[str, Room] = MappingProxyType({
     "hil.runs": Room(("sim.config", "pkxyz_ctrl.*", "hil.recording", "hil.faults", "hil.lanes")),
     # many times, for one question
     "hil.studies.spread": Room(("pkxyz_ctrl.*",)),
+    "hil.studies.wafer": Room(("pkxyz_ctrl.*", "hil.studies.spread")),
     "hil.studies.margins": Room(("pkxyz_ctrl.*", "hil.lanes")),
     "hil.studies.identify": Room(("pkxyz_ctrl.*", "hil.lanes", "hil.studies.margins")),
     "hil.studies.tune": Room(("pkxyz_ctrl.*", "hil.lanes", "hil.runs", "hil.studies.spread")),
@@ -91,6 +95,7 @@ HOUSE: Mapping[str, Room] = MappingProxyType({
         "pkxyz_ctrl.*", "hil.bus", "hil.recording", "hil.lanes", "hil.runs", "hil.studies.margins",
         "hil.studies.identify", "hil.studies.tune", "hil.studies.faults", "hil.studies",
     )),
+    "hil.pictures.wafer": Room(("pkxyz_ctrl.*", "hil.pictures", "hil.studies.wafer")),
     "hil.screen": Room(("pkxyz_ctrl.*", "hil.runs", "hil.studies.margins")),
     "hil.bench.rigs": Room(("sim.motion", "sim", "pkxyz_ctrl.*", "hil.lanes", "hil.runs")),
     "hil.bench": Room((
@@ -103,8 +108,8 @@ HOUSE: Mapping[str, Room] = MappingProxyType({
     )),
     "hil.commands.studies": Room((
         "pkxyz_ctrl.*", "hil.recording", "hil.lanes", "hil.runs", "hil.studies.spread", "hil.studies.margins",
-        "hil.studies.identify", "hil.studies.tune", "hil.studies.faults", "hil.studies", "hil.pictures", "hil.screen",
-        "hil.api",
+        "hil.studies.identify", "hil.studies.tune", "hil.studies.faults", "hil.studies.wafer", "hil.studies",
+        "hil.pictures", "hil.pictures.wafer", "hil.screen", "hil.api",
     )),
     "hil.commands": Room((
         "pkxyz_ctrl.*", "hil.recording", "hil.faults", "hil.lanes", "hil.conformance", "hil.operate", "hil.runs",

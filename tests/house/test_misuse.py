@@ -53,6 +53,8 @@ def refused(capsys, monkeypatch, *words):
         (("identify", "--out", "file"), "--out: file: file exists"),
         (("tune", "--out", "file"), "--out: file: file exists"),
         (("montecarlo", "--out", "file"), "--out: file: file exists"),
+        (("yield", "--out", "file"), "--out: file: file exists"),
+        (("yield", "oreo"), "no configuration named 'oreo'; did you mean 'oreo_drie'?"),
         (("faults", "--out", "file"), "--out: file: file exists"),
         (("soak", "--out", "file"), "--out: file: file exists"),
         (("check-amplifier", "--out", "file"), "--out: file: file exists"),

@@ -1,0 +1,1 @@
+"""Pictures of what a process makes of a drawing."""
