@@ -247,12 +247,12 @@ def draw(result: dict[str, Any], path: Path) -> None:
         label = f"since the warm-up, {name}"
         below.plot(t_min, kept - kept[result["warm_up_s"]], style, color=VERMILION, label=label)
     for n, second in enumerate(result["cleared_s"]):
-        below.axvline(second / 60.0, color=ORANGE, lw=0.8, zorder=0, label="a fault" if n == 0 else None)
+        below.axvline(second / 60.0, ymax=0.7, color=ORANGE, lw=0.8, zorder=0, label="a fault" if n == 0 else None)
     dress(below, "minutes; dashed: end of the warm-up", "blocks of Python")
     legend(below, "upper left", columns=2)
     for axes in (above, middle, below):
         axes.set_ylim(min(0.0, axes.get_ylim()[0]), 1.35 * axes.get_ylim()[1])
-        axes.axvline(result["warm_up_s"] / 60.0, color=MUTED, lw=0.8, ls="--")
+        axes.axvline(result["warm_up_s"] / 60.0, ymax=0.7, color=MUTED, lw=0.8, ls="--")
     save(figure, path)
 
 

@@ -139,7 +139,7 @@ def draw(passages: list[Passage], load: float) -> None:
             text,
             (t_us, 0),
             (t_us, -0.45 - 0.75 * (k % 2)),
-            ha="center",
+            ha="left" if t_us == drive.start_us else "center",
             va="top",
             arrowprops={"arrowstyle": "->"},
             fontsize=TINY_PT,

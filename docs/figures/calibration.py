@@ -1,4 +1,4 @@
-"""Writes docs/figures/calibration.png: the raster on the harsh plant, with the stage as drawn and as identified."""
+"""Draws docs/figures/calibration.png: the raster on the harsh plant, with the shipped stage file and the found one."""
 
 from pathlib import Path
 from tempfile import TemporaryDirectory
@@ -42,7 +42,7 @@ def main() -> None:
     with TemporaryDirectory() as folder:
         path = Path(folder) / "stage.toml"
         write_calibrated_stage(find("stages", "reconstructed"), found, "figure", path)
-        runs = [("as drawn", VERMILION, *errors_nm("reconstructed")), ("as identified", BLUE, *errors_nm(str(path)))]
+        runs = [("as shipped", VERMILION, *errors_nm("reconstructed")), ("as identified", BLUE, *errors_nm(str(path)))]
     figure = sheet(11.0, 6.6, "Raster on the harsh plant, lqg: true position less reference")
     for axis, plot in enumerate(figure.subplots(3, 1, sharex=True)):
         for name, colour, t_ms, error in runs:

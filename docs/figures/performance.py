@@ -99,7 +99,7 @@ def draw(figures: dict[str, Figure]) -> None:
     )
     axes.invert_yaxis()
     dress(axes, "us of processor time a tick of 200 us", grid="x")
-    legend(axes, "lower right", anchor=(0.9, 0.0))
+    legend(axes, "lower right", columns=3, anchor=(0.9, 0.08))
     save(picture, PICTURE)
 
 

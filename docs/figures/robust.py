@@ -16,7 +16,7 @@ from pkxyz_ctrl.stage import Stage
 
 
 def draw() -> Figure:
-    """Largest singular value of S: as drawn, and on each of the 135 plants."""
+    """Largest singular value of S: nominal, and on each of the 135 plants."""
     stage, bus = Stage.load("reconstructed"), load("buses", "fd_5k", BusConfig)
     cases = load("tolerances", "wide", Tolerances).cases()
     f = np.unique(np.r_[np.geomspace(10, 2490, 400), np.linspace(450, 950, 300)])
@@ -25,7 +25,7 @@ def draw() -> Figure:
         controller = load("controllers", name, ControllerConfig)
         loop = Loop(stage, bus, design_law(stage, controller, bus, autostart=True))
         for n, case in enumerate(cases[::-1]):
-            last = n == len(cases) - 1  # as drawn, at mid-workspace
+            last = n == len(cases) - 1  # nominal, at mid-workspace
             s = np.linalg.norm(loop.response(case.strokes_m, f, case.perturbation).s, 2, axis=(1, 2))
             axes.loglog(f, s, color=BLUE if last else FAINT, lw=1.8 if last else 0.5)
         for level, style, words in ((np.sqrt(0.5), "--", "-3 dB"), (2.0, ":", "2"), (3.0, "-.", "3")):
@@ -33,7 +33,7 @@ def draw() -> Figure:
         axes.axvline(200.0, color=MUTED, lw=0.8, ls="--")
         axes.set(xlim=(10, 2500), ylim=(0.03, 5))
         dress(axes, "frequency (Hz)", title=name)
-    figure.axes[0].set_ylabel("|S|, MIMO: as drawn, and 134 changed plants")
+    figure.axes[0].set_ylabel("|S|, MIMO: nominal (blue), 134 changed plants (grey)")
     return figure
 
 

@@ -48,7 +48,7 @@ def draw_design_space(stages: dict[str, Stage], out: Path) -> None:
     plot.contourf(elevation, link * 1e6, needed * 1e3, [0, 1.0], colors=[WASH], zorder=0)
     plot.clabel(lines, fmt=lambda mn: f"{mn:g} mN", fontsize=SMALL_PT, inline_spacing=4)
     plot.text(0.93, 1480, "lifts with less than 1 mN", fontsize=SMALL_PT, color=SERIES[0])
-    for (name, stage), mark, side in zip(stages.items(), ("o", "s"), ((8, 5), (-8, -14)), strict=False):
+    for (name, stage), mark, side in zip(stages.items(), ("o", "s"), ((8, -4), (-8, -14)), strict=False):
         at = (float(stage.geometry["elevation_rest_rad"][0]), float(stage.geometry["link_m"][0]) * 1e6)
         plot.plot(*at, mark, color=INK, markersize=6, markerfacecolor="white", markeredgewidth=1.4)
         plot.annotate(

@@ -171,8 +171,8 @@ def draw_edge_path(stage: Stage, out: Path) -> None:
     plot.plot(*(positions.T * 1e6), color=AXIS[1], linewidth=2.6)
     corners = stage.forward_kinematics(low + (high - low) * EDGE_PATH) * 1e6
     plot.plot(*corners.T, "o", color=AXIS[1], markersize=5)
-    for corner, words in zip(corners, ("rest", "furthest to the side", "", "highest"), strict=True):
-        plot.text(corner[0] + 2, corner[1], corner[2] + 1.5, words, fontsize=SMALL_PT, color=INK)
+    for corner, words in zip(corners, ("rest", "furthest out", "", "highest"), strict=True):
+        plot.text(corner[0] + 2, corner[1], corner[2] + 1.5, words, fontsize=SMALL_PT, color=INK, bbox=box())
     _dress_space(plot)
     travelled = np.concatenate([[0], np.cumsum(np.linalg.norm(np.diff(positions, axis=0), axis=1))]) * 1e6
     for row, (values, names) in enumerate(((strokes, ("q₁", "q₂", "q₃")), (positions, "xyz"))):
