@@ -53,7 +53,7 @@ def draw_response(found: Identification, path: Path) -> None:
         "size: measured (points), fit (lines)",
         "phase, own comb (deg)",
         "coherence",
-        "|measured - fit| / standard error",
+        "misfit (standard errors)",
     )
     for axes, title in zip(panels[0], titles, strict=True):
         axes.set_title(title, fontsize=LABEL_PT)

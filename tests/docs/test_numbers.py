@@ -11,15 +11,23 @@ import numpy as np
 import pytest
 
 import hil
+from hil.studies.montecarlo import Study, run_one
 from pkxyz_ctrl import Stage
+from pkxyz_ctrl.config.files import load
+from pkxyz_ctrl.design.margins.tolerances import Tolerances
 from pkxyz_ctrl.mechanics.modes import modes
 
 ROOT = Path(__file__).parents[2]
 
 
+def page_lines(name: str) -> str:
+    """The text of a page as it stands."""
+    return (ROOT / name).read_text(encoding="utf-8")
+
+
 def page(name: str) -> str:
     """The text of a page with its lines joined."""
-    return " ".join((ROOT / name).read_text(encoding="utf-8").split())
+    return " ".join(page_lines(name).split())
 
 
 @cache
@@ -145,3 +153,20 @@ def test_the_paper_s_ratio_and_the_band() -> None:
     k = np.diag(stage.stiffness([0.0, 0.0, 0.0]))
     assert f"is {math.sqrt(k[2] / k[0]):.5f} against the published 1.22321" in text
     assert all(500 < f < 1000 for f in modes(np.diag(k), stage.mass_kg).frequency_hz)
+
+
+@pytest.mark.parametrize("law", ["youla", "lqg", "robust"])
+def test_the_worst_sampled_plants_are_as_bad_as_told(law: str) -> None:
+    """``python docs/figures/montecarlo.py`` runs all 200; here the worst one of each law runs again."""
+    plants = page_lines("docs/do/tuning.md").partition("<!-- generated: plants -->")[2]
+    line = next(row for row in plants.splitlines() if row.startswith(f"| `{law}` |"))
+    cells = [cell.strip() for cell in line.split("|")[2:-1]]
+    study = Study(hil.load_scenario("raster", controller=law), load("tolerances", "wide", Tolerances))
+    found = run_one(study, int(cells[-1]))
+    assert f"{found.rms_error_nm:.0f}" == cells[0].split(", ")[2]
+    assert found.ok
+    assert cells[-2] == "none"
+    text = page("docs/do/tuning.md")
+    if law != "youla":
+        assert cells[2].split(", ")[2].startswith({"robust": "8.7", "lqg": "2.5"}[law])
+        assert "Ms is 8.7 on the worst of these plants, 2.5 for `lqg`" in text

@@ -2,7 +2,9 @@
 
 import dataclasses
 import json
+import re
 from functools import cache
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -13,14 +15,16 @@ from loop_rig import MIDDLE, bus, controller, stage
 from sim_truth import truth_about
 from typer.testing import CliRunner
 
+import hil
 from hil.cli import app
 from hil.lanes.excitation import Passage, excitation, tones
 from hil.lanes.setup import bare_setup
+from hil.studies.identify.calibrated_stage import write_calibrated_stage
 from hil.studies.identify.identification import as_json, exciting, identify, modes_hz
 from hil.studies.identify.outside_scale import outside_scale, read_points
 from hil.studies.identify.plant_response import _spectra, measure_plant
 from hil.studies.margins.measured import at_point
-from pkxyz_ctrl.config.files import ConfigError
+from pkxyz_ctrl.config.files import ConfigError, find
 from pkxyz_ctrl.design.identification.modal_fit import FitError, fit_modes
 from sim.motion.geometry import strokes
 
@@ -276,3 +280,44 @@ def test_no_frames_no_lockstep():
 def test_another_seed_is_another_digest():
     again = dataclasses.replace(found(), setup=dataclasses.replace(found().setup, seed=2))
     assert as_json(again)["digest"] != as_json(found())["digest"]
+
+
+# -- the page -------------------------------------------------------------------------------------------------------
+
+PAGE = Path(__file__).parents[2] / "docs" / "understand" / "identification.md"
+
+
+def row_of(start, column):
+    """The numbers in a cell of the page's table row that begins so; the first column is 0."""
+    line = next(line for line in PAGE.read_text(encoding="utf-8").splitlines() if line.startswith(f"| {start} |"))
+    return [float(n) for n in re.findall(r"\d+\.?\d*", line.split("|")[column + 1].partition(":")[0])]
+
+
+def test_the_page_tells_what_is_found():
+    modes, is_ = found().modes, truth()
+    for start, true, measured, digits in (
+        ("resonances (Hz)", is_.frequency_hz, modes.frequency_hz, 2),
+        ("damping ratios", is_.damping, modes.damping, 4),
+        (
+            "static gain of each chain (counts/V^2)",
+            is_.static_gain[CHAINS, CHAINS],
+            modes.static_gain[CHAINS, CHAINS],
+            4,
+        ),
+    ):
+        assert row_of(start, 1) == pytest.approx(true, rel=2e-4), start
+        assert row_of(start, 2) == [round(float(v), digits) for v in measured], start
+
+
+def test_the_page_tells_what_it_is_worth(tmp_path):
+    """True position less reference on the harsh plant, with the stage file as shipped and with the one found."""
+    write_calibrated_stage(find("stages", "reconstructed"), found(), "test", tmp_path / "stage.toml")
+    for column, file in ((1, "reconstructed"), (2, str(tmp_path / "stage.toml"))):
+        scenario = hil.load_scenario("raster_harsh", stage=file, controller="lqg")
+        run = hil.run(scenario)
+        tick = run["reference_tick"]
+        (scan_us,) = [s.scan_us for s in scenario.trajectory.segments if s.scan_us]
+        scan = (tick >= 0) & (tick * 200 >= scan_us[0]) & (tick * 200 < scan_us[1])
+        error_nm = [(run[f"position_{a}_m"] - run[f"reference_{a}_m"])[scan] * 1e9 for a in "xyz"]
+        assert row_of("harsh", column) == [round(float(np.sqrt(np.mean(e**2))), 1) for e in error_nm]
+        assert row_of("harsh, about its mean", column) == [round(float(np.std(e)), 1) for e in error_nm]
