@@ -44,11 +44,11 @@ def row_of(text: str, start: str) -> list[float]:
     return [float(n) for n in re.findall(r"\d+\.?\d*", found[1])]
 
 
-@pytest.mark.parametrize("script", ["readme", "mechanics"])
+@pytest.mark.parametrize("script", ["tables/readme.py", "figures/mechanics.py"])
 def test_generated_tables_are_those_of_today(script: str) -> None:
-    made = runpy.run_path(str(ROOT / "docs" / "figures" / f"{script}.py"))
+    made = runpy.run_path(str(ROOT / "docs" / script))
     text = made["PAGE"].read_text(encoding="utf-8")
-    assert made["filled_in"](text) == text, f"run: python docs/figures/{script}.py"
+    assert made["filled_in"](text) == text, f"run: python docs/{script}"
 
 
 @pytest.mark.parametrize("scenario", ["circle", "spiral", "lissajous", "sweep", "path"])
@@ -157,7 +157,7 @@ def test_the_paper_s_ratio_and_the_band() -> None:
 
 @pytest.mark.parametrize("law", ["youla", "lqg", "robust"])
 def test_the_worst_sampled_plants_are_as_bad_as_told(law: str) -> None:
-    """``python docs/figures/montecarlo.py`` runs all 200; here the worst one of each law runs again."""
+    """``python docs/tables/montecarlo.py`` runs all 200; here the worst one of each law runs again."""
     plants = page_lines("docs/do/tuning.md").partition("<!-- generated: plants -->")[2]
     line = next(row for row in plants.splitlines() if row.startswith(f"| `{law}` |"))
     cells = [cell.strip() for cell in line.split("|")[2:-1]]

@@ -16,7 +16,7 @@ DOCS = Path(__file__).parents[2] / "docs"
 
 @pytest.fixture(scope="module")
 def figures() -> ModuleType:
-    spec = importlib.util.spec_from_file_location("docs_figures_modes", DOCS / "figures" / "modes.py")
+    spec = importlib.util.spec_from_file_location("docs_figures_modes", DOCS / "tables" / "modes.py")
     assert spec is not None
     assert spec.loader is not None
     module = importlib.util.module_from_spec(spec)
@@ -27,7 +27,7 @@ def figures() -> ModuleType:
 def test_page_holds_the_current_tables(figures: ModuleType) -> None:
     page = (DOCS / "understand" / "safety.md").read_text(encoding="utf-8")
     assert all(f"<!-- generated: {part} -->" in page for part in figures.PARTS)
-    assert figures.filled_in(page) == page, "run: python docs/figures/modes.py"
+    assert figures.filled_in(page) == page, "run: python docs/tables/modes.py"
 
 
 def test_diagram_has_every_transition(figures: ModuleType) -> None:

@@ -1,6 +1,6 @@
 """Fills in the README's table of what is reached: the default scenario on each shipped plant, with three laws.
 
-python docs/figures/readme.py
+python docs/tables/readme.py
 """
 
 from collections.abc import Iterator, Mapping

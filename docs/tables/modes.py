@@ -1,6 +1,6 @@
 """Writes the generated parts of safety.md: the mode diagram and the tables, each from the data that the code runs.
 
-    python docs/figures/modes.py
+    python docs/tables/modes.py
 
 Each part stands between ``<!-- generated: NAME -->`` and ``<!-- end -->``; what is around them is written by hand.
 """

@@ -1,6 +1,6 @@
 """Fills in the table of 200 sampled plants on docs/do/tuning.md: three laws on the raster, seeds 1 to 200.
 
-python docs/figures/montecarlo.py
+python docs/tables/montecarlo.py
 """
 
 import re
