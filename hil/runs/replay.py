@@ -32,7 +32,7 @@ Rows = NDArray[np.void]
 
 _INPUTS = {  # of the cycle, by the row's name for them
     "request": "event", "sense_status": "sense_status", "node_events": "node_events", "overrun": "overrun",
-    "sense_count": "sense_count", "outside_trips": "trips",
+    "sense_count": "sense_count", "outside_trips": "trips", "quiet": "quiet",
 }  # fmt: skip
 _FOUND_OUT = int(SenseStatus.IMPLAUSIBLE)
 """Bits of the sense status that the tick itself adds."""

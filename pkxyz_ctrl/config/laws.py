@@ -147,6 +147,8 @@ class Youla(FrozenModel):
     """how much of the filter is left while a quiet hold is asked for: less noise, less rejection"""
     fade_s: Positive = 0.02
     """how long the filter takes to fade to that, and to come back"""
+    quiet_holds: bool = False
+    """every hold is a quiet one, without an operator who asks for it"""
 
     @model_validator(mode="after")
     def _one_for_each(self) -> Self:

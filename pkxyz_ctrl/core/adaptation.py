@@ -18,9 +18,11 @@ covariance never exceeds what was known beforehand. It stands still where the re
 where it should be, and after a comb was at a limit. What acts follows it within some milliseconds, and the filter's
 state moves along by U: then it is as if the filter had always known, and nothing kicks.
 
-Beside it stands what was known once, the base, and what innovations have said since against it: from that somebody
-with more time tells a spring that ages from noise.
+Beside it stands what was known once, the base. If one cause alone has changed since (a comb, a chain's springs, the
+hinges), one number makes the innovations that the base would leave as small as those that are left: it is a warning.
 """
+
+import math
 
 import numpy as np
 from numba import njit
@@ -37,6 +39,10 @@ PARAMETERS = 15
 growth of the pull over ``fringe_m`` of stroke; lift by pull; relative error of the damping; sense delay in s, and by
 how many s^2 the acceleration shows in what is measured. The mass is taken as drawn: only ratios to it are seen.
 """
+CAUSES = 7
+"""What may change by itself: each comb, the springs of each chain, the out-of-plane hinges."""
+LEAST_LOSS = 0.1
+"""By how much, in variances of the noise, innovations have to be worse with the base before something has changed."""
 AGES = 2
 """Intervals that are remembered: two periods of delay."""
 
@@ -56,6 +62,8 @@ ADAPTATION = np.dtype(
         ("near_m", "f8"),  # how near the reference the stage has to be
         ("fringe_m", "f8"),
         ("forget", "f8"),  # share of what speaks against the base that an update forgets
+        ("warn", "f8"),  # least change, relative, and ...
+        ("alone", "f8"),  # ... least share of what the base leaves that one cause has to explain
         ("calm_ticks", "i4"),  # for so long, and without a limit
         ("base_updates", "i4"),  # after so many what is known becomes the base
         ("on", "i4"),
@@ -75,14 +83,17 @@ ADAPTATION_STATE = np.dtype(
         ("added_n", "f8", (3,)),  # what the feed-forward of this tick has more
         ("told_n", "f8", (3,)),  # what the filter was told of the last interval that it went through
         ("base", "f8", (PARAMETERS,)),
-        ("base_covariance", "f8", (PARAMETERS, PARAMETERS)),
-        ("evidence", "f8", (PARAMETERS, PARAMETERS)),  # information since, and ...
-        ("clue", "f8", (PARAMETERS,)),  # ... what it says of theta less the base
+        ("answer", "f8", (CAUSES,)),  # to each cause: mean square of what it shows, over that of the noise, ...
+        ("clue", "f8", (CAUSES,)),  # ... and its product with what the base leaves
+        ("left_by_base", "f8"),  # mean square innovation with the base, and ...
+        ("left", "f8"),  # ... with what is learnt, over that of the noise
+        ("change", "f8"),  # relative, of the cause that is warned of
         ("work", "f8", (PARAMETERS,)),
         ("updates", "i8"),
         ("begun", "i4"),  # 0: nothing is known yet, not even how little
         ("based", "i4"),  # 1: there is a base
         ("axis", "i4"),  # whose turn it is
+        ("cause", "i4"),  # 0: no warning; else 1 + a cause
         ("calm", "i4"),  # ticks since something was not as it should be for learning
     ],
     align=True,
@@ -184,7 +195,8 @@ def _update(adaptation: np.void, state: np.void, axis: int, innovation_m: float)
     _keep_within(adaptation["bound"], p, learnt)
     state["updates"] += 1
     if state["based"] != 0:
-        _weigh(state, by, since, 1.0 / adaptation["variance_m2"][axis], 1.0 - adaptation["forget"])
+        scale = 1.0 / math.sqrt(adaptation["variance_m2"][axis])
+        _compare(adaptation, state, by, scale * since, scale * missing, scale)
     elif state["updates"] >= adaptation["base_updates"]:
         set_base(state)
 
@@ -202,22 +214,39 @@ def begin(state: np.void) -> None:
 def set_base(state: np.void) -> None:
     """What is known now is what changes are counted from."""
     state["based"] = 1
+    state["left_by_base"] = state["left"] = 0.0
+    state["cause"], state["change"] = 0, 0.0
     for i in range(PARAMETERS):
-        state["base"][i], state["clue"][i] = state["learnt"][i], 0.0
-        for k in range(PARAMETERS):
-            state["base_covariance"][i, k] = state["covariance"][i, k]
-            state["evidence"][i, k] = 0.0
+        state["base"][i] = state["learnt"][i]
+    for c in range(CAUSES):
+        state["answer"][c] = state["clue"][c] = 0.0
 
 
 @njit(cache=True, error_model="numpy")
-def _weigh(state: np.void, by: Array, since_m: float, weight: float, keep: float) -> None:
-    """Note what an innovation, as it would have been with the base, says of it."""
-    evidence, clue = state["evidence"], state["clue"]
-    for i in range(PARAMETERS):
-        told = weight * by[i]
-        clue[i] = keep * clue[i] - told * since_m
-        for k in range(PARAMETERS):
-            evidence[i, k] = keep * evidence[i, k] + told * by[k]
+def _compare(adaptation: np.void, state: np.void, by: Array, since: float, missing: float, scale: float) -> None:
+    """Note what an innovation says of the base, in standard deviations of its noise, and name what has changed."""
+    spread, forget = adaptation["spread"], adaptation["forget"]
+    state["left_by_base"] += forget * (since * since - state["left_by_base"])
+    state["left"] += forget * (missing * missing - state["left"])
+    best, most, change = 0, 0.0, 0.0
+    for c in range(CAUSES):
+        if c < 3:
+            shown = by[COMB + c] / spread[COMB + c]
+        elif c < 6:
+            shown = by[SLIDER + c - 3] / spread[SLIDER] + by[CRANK + c - 3] / spread[CRANK]
+        else:
+            shown = by[LINK] / spread[LINK]
+        shown *= scale
+        state["answer"][c] += forget * (shown * shown - state["answer"][c])
+        state["clue"][c] += forget * (-shown * since - state["clue"][c])
+        explained = state["clue"][c] * state["clue"][c]
+        if explained > most * state["answer"][c]:
+            best, most, change = c + 1, explained / state["answer"][c], state["clue"][c] / state["answer"][c]
+    lost = state["left_by_base"] - state["left"]
+    if most > adaptation["alone"] * lost and lost > LEAST_LOSS and abs(change) >= adaptation["warn"]:
+        state["cause"], state["change"] = best, change
+    else:
+        state["cause"], state["change"] = 0, 0.0
 
 
 @njit(cache=True, error_model="numpy")

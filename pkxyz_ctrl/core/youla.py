@@ -37,6 +37,14 @@ YOULA_STATE = np.dtype(
 
 
 @njit(cache=True, error_model="numpy")
+def ask(state: np.void, wanted: bool, here: Array, later: Array) -> None:
+    """Ask for a quiet hold, or no longer: only while the set-point stands still, by its rows (9,) here and later."""
+    for i in range(3):
+        wanted = wanted and here[i] == later[i] and here[3 + i] == 0.0 and later[3 + i] == 0.0
+    state["quiet"] = 1 if wanted else 0
+
+
+@njit(cache=True, error_model="numpy")
 def note(youla: np.void, state: np.void, innovation_m: Array) -> None:
     """Take in the innovation (3,) of this sample, and fade a tick further towards what is asked."""
     if youla["taps"] == 0:

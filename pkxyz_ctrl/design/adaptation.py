@@ -48,6 +48,7 @@ def fill_adaptation(
     record["calm_ticks"] = max(1, round(config.calm_s / bus.period_s))
     record["fringe_m"] = FRINGE_M
     record["base_updates"] = max(1, round(config.base_s / bus.period_s))
+    record["warn"], record["alone"] = config.warn_relative, config.alone
     record["forget"] = min(1.0, bus.period_s / config.forget_s)
     record["on"] = controller.learn == "online"
 

@@ -52,6 +52,7 @@ def design_law(stage: Stage, controller: ControllerConfig, bus: BusConfig, *, au
         _fill_linear(law["tick"]["linear"], stage, controller, bus)
     if controller.youla is not None:
         _fill_youla(law["tick"]["youla"], controller.youla, bus)
+        law["quiet_holds"] = controller.youla.quiet_holds
     if controller.mpc is not None:
         _fill_predictive(law["tick"], controller.mpc, controller.regulator)
     law["tick"]["delay_periods"] = bus.delay_periods

@@ -112,6 +112,10 @@ class Controller:
         """Ask for an event at the next tick: HOME, ENABLE, TRACK, HOLD, DISABLE."""
         self._event = int(event)
 
+    def hold_quietly(self, quiet: bool) -> None:
+        """Ask for quiet holds, or no longer: less noise and less rejection while the set-point stands still."""
+        self.memory["input"]["quiet"] = quiet
+
     def clear(self) -> None:
         """Ask to forget the fault. Once the combs have been at 0 V for long enough, gate, driver and node start anew,
         tick by tick, while the loop goes on; where that failed, it is tried again. Without a fault nothing happens.

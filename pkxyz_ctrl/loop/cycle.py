@@ -11,7 +11,7 @@ import numpy as np
 from numba import njit
 from numpy.typing import NDArray
 
-from pkxyz_ctrl.core import feed_hold, tick
+from pkxyz_ctrl.core import feed_hold, tick, youla
 from pkxyz_ctrl.loop.row import ROW
 from pkxyz_ctrl.safety.modes import (
     LOOP_CLOSED,
@@ -37,6 +37,7 @@ INPUT = np.dtype(
         ("overrun", "i4"),
         ("sense_count", "i4", (3,)),
         ("trips", "i8"),  # Trip bits raised outside: a frame that the gate blocked, an operator's stop
+        ("quiet", "i4"),  # 1: an operator asks for quiet holds, until it is 0 again
     ],
     align=True,
 )
@@ -49,6 +50,7 @@ LAW = np.dtype(
         ("homing_ticks", "i4"),
         ("feed_hold_ticks", "i4"),  # even: how long the path takes to stop, and to be taken up again
         ("autostart", "i4"),  # 1: home, enable and track by itself, as a scenario wants it
+        ("quiet_holds", "i4"),  # 1: holds are quiet without being asked for
     ],
     align=True,
 )
@@ -142,6 +144,8 @@ def observe(law_array: Records, memory_array: Records, reference: Records) -> No
     reference_row(law, memory, reference, delay, memory["now"])
     reference_row(law, memory, reference, delay + 1, memory["after"])
     reference_row(law, memory, reference, delay + 2, memory["later"])
+    quiet = law["quiet_holds"] != 0 or memory["input"]["quiet"] != 0
+    youla.ask(memory["tick"]["youla"], quiet, memory["here"], memory["later"])
 
 
 @njit(cache=True, error_model="numpy")
@@ -170,17 +174,9 @@ def respond(law_array: Records, memory_array: Records) -> None:
 
 @njit(cache=True, error_model="numpy")
 def cycle_on(
-    law_array: Records,
-    memory_array: Records,
-    reference: Records,
-    event: int,
-    sense_status: int,
-    node_events: int,
-    overrun: int,
-    count_1: int,
-    count_2: int,
-    count_3: int,
-) -> tuple[int, int, int, int]:
+    law_array: Records, memory_array: Records, reference: Records,
+    event: int, sense_status: int, node_events: int, overrun: int, count_1: int, count_2: int, count_3: int,
+) -> tuple[int, int, int, int]:  # fmt: skip
     """``cycle`` with its ``INPUT`` handed in, trips excepted. Returns the mode and the drive counts.
 
     A call from Python for all that passes between the two: each number costs less than a look into the memory.
@@ -384,6 +380,8 @@ def _write_row(law: np.void, memory: np.void, trips: int, saturated: int) -> Non
     row["node_events"], row["overrun"], row["saturated"] = seen["node_events"], seen["overrun"], saturated
     row["active_set_steps"] = state["active_set_steps"]
     row["solver_iterations"] = state["solver_iterations"]
+    row["quiet"] = seen["quiet"]
+    row["warning"], row["warning_share"] = state["adaptation"]["cause"], state["adaptation"]["change"]
     for i in range(3):
         row["sense_count"][i] = seen["sense_count"][i]
         row["drive_count"][i] = state["count"][0, i]
@@ -393,6 +391,7 @@ def _write_row(law: np.void, memory: np.void, trips: int, saturated: int) -> Non
         row["estimate_m_per_s"][i] = estimate["filtered"][3 + i]
         row["disturbance_n"][i] = estimate["filtered"][6 + i]
         row["innovation_m"][i] = estimate["innovation_m"][i]
+        row["learnt_n"][i] = state["adaptation"]["added_n"][i]
         row["demand_n"][i] = state["demand_n"][i]
         row["slack_n"][i] = state["slack_n"][i]
         row["force_n"][i] = state["force_n"][i]

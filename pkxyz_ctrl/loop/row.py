@@ -23,6 +23,9 @@ CONTROLLER_FIELDS = [
     ("saturated", "i4"),  # 1 where a comb force met a bound
     ("active_set_steps", "i4"),  # active sets that the allocation tried; 1: no limit met, 0: no allocation
     ("solver_iterations", "i4"),  # of the predictive law's solver; 0 without one, negative if its answer was not used
+    ("quiet", "i4"),  # 1: quiet holds are asked for
+    ("warning", "i4"),  # 0, or what has changed since it was learnt: 1 to 3 a comb, 4 to 6 a chain's springs, 7 hinges
+    ("warning_share", "f8"),  # by how much, relative
     ("sense_count", "i4", (3,)),  # of the sense frame, as it was believed
     ("drive_count", "i4", (3,)),  # goes to the combs at the next SYNC
     ("reference_m", *_VECTOR),  # set-point at the sample of this tick
@@ -31,6 +34,7 @@ CONTROLLER_FIELDS = [
     ("estimate_m_per_s", *_VECTOR),  # filtered velocity at the sample of this tick
     ("disturbance_n", *_VECTOR),  # estimated disturbance force at the platform
     ("innovation_m", *_VECTOR),  # measurement less its prediction
+    ("learnt_n", *_VECTOR),  # what the feed-forward has more by what was learnt of the device
     ("demand_n", *_VECTOR),  # force at the platform that the law asks for
     ("slack_n", *_VECTOR),  # demand less what the combs will give
     ("force_n", *_VECTOR),  # comb forces commanded
