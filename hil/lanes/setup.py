@@ -78,6 +78,8 @@ class Setup:
             protection=driver.protection,
             fd=driver.fd,
             heartbeat_timeout_max_ms=OUR_TIMEOUT_MAX_MS,
+            drive_pdo=driver.drive_pdo,
+            drive_channels=driver.drive_channels,
         )
 
     def new_learner(self) -> Learner | None:

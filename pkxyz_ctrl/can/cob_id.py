@@ -7,6 +7,8 @@ SYNC = 0x080
 EMCY_BASE = 0x080  # plus node id
 SENSE_BASE = 0x280  # TPDO2: analogue inputs (CiA 401)
 DRIVE_BASE = 0x300  # RPDO2: analogue outputs (CiA 401)
+PDO_STEP = 0x100  # from one PDO of the predefined connection set to the next
+USUAL_PDO = 2
 SDO_RESPONSE_BASE = 0x580  # server to client
 SDO_REQUEST_BASE = 0x600  # client to server
 HEARTBEAT_BASE = 0x700
@@ -35,3 +37,13 @@ class NmtState(IntEnum):
     STOPPED = 0x04
     OPERATIONAL = 0x05
     PRE_OPERATIONAL = 0x7F
+
+
+def drive(node_id: int, pdo: int) -> int:
+    """Identifier of RPDO ``pdo``, 1 to 4, in the predefined connection set (CiA 301, 7.3.5)."""
+    return DRIVE_BASE + (pdo - USUAL_PDO) * PDO_STEP + node_id
+
+
+def sense(node_id: int, pdo: int) -> int:
+    """Identifier of TPDO ``pdo``, 1 to 4."""
+    return SENSE_BASE + (pdo - USUAL_PDO) * PDO_STEP + node_id

@@ -5,7 +5,6 @@ No clock, no socket, no thread. The start-up dialogue is driven by ``start``, ``
 """
 
 from collections import deque
-from enum import Enum, auto
 
 from . import cob_id
 from .cob_id import NmtCommand, NmtState
@@ -13,9 +12,8 @@ from .codec import Counts, ProcessCodec
 from .driver_config import DriverConfig
 from .emergency import Emergency, decode_emergency
 from .frame import FD_FAST, UNUSUAL, Frame
-from .sdo import SdoDialogue
 from .sense_input import SenseInput
-from .startup import configuration_steps, identity_steps
+from .start_sequence import DriverState, Messages, StartSequence, state_name
 
 NODE_HEARTBEAT_LOST = 1
 NODE_NOT_OPERATIONAL = 2
@@ -29,21 +27,19 @@ _NOTHING: Frames = ()
 _NEVER_US = 1 << 62
 _HEARTBEATS_APART_US = 1000  # some ticks; where a tick is longer, both fit into it
 _EMERGENCIES_KEPT = 64
+_STARTING_UP = frozenset(
+    (
+        DriverState.RESETTING,
+        DriverState.IDENTIFYING,
+        DriverState.CONFIGURING,
+        DriverState.STARTING,
+        DriverState.TRYING,
+    )
+)
+_SPOKEN_FOR = _STARTING_UP - {DriverState.RESETTING, DriverState.IDENTIFYING} | {DriverState.OPERATIONAL}
+_TRIAL = (DriverState.TRYING, DriverState.STARTING)
+_HEARTBEAT_ERROR = 0x8130  # EMCY: what the node has to say in the trial
 _new_tuple = tuple.__new__  # a Frame without its keyword defaults: 0.2 us less in every tick
-
-
-class DriverState(Enum):
-    """Where the connection to the amplifier is."""
-
-    OFF = auto()
-    RESETTING = auto()
-    IDENTIFYING = auto()
-    CONFIGURING = auto()
-    STARTING = auto()
-    OPERATIONAL = auto()
-    FAILED = auto()
-    RELEASING = auto()
-    RELEASED = auto()
 
 
 class AmplifierDriver:
@@ -53,22 +49,23 @@ class AmplifierDriver:
     ``node_events`` (NODE_... bits) are latched: EMERGENCY until ``acknowledge``, the others until ``start``, because a
     node that was silent, left the operational state or restarted has to be configured again, and so has one to which
     somebody else spoke in our name (FOREIGN_FRAME; ``foreign`` tells the first such frame). ``emergencies`` holds
-    the last 64. ``sense`` holds this tick's sense values. ``count_step_max``: the node's own limit of a step at a SYNC,
-    in drive counts. All times are integer microseconds of the caller's one clock and never run backwards.
+    the last 64. ``lost`` tells which protections this node does not give, and what stands in for them. ``sense`` holds
+    this tick's sense values. ``count_step_max``: the node's own limit of a step at a SYNC, in drive counts. All times
+    are integer microseconds of the caller's one clock and never run backwards.
     """
 
     def __init__(self, config: DriverConfig, count_step_max: int = 32767) -> None:
         self.config = config
-        self._count_step_max = count_step_max
+        self._start_up = StartSequence(config, count_step_max)
         self.state = DriverState.OFF
         self.failure = ""
         self.node_events = 0
         self.node_state: int | None = None  # as its last heartbeat said
         self.foreign = ""
+        self.lost: tuple[str, ...] = ()
         self.emergencies: deque[Emergency] = deque(maxlen=_EMERGENCIES_KEPT)
-        self._sense_id = cob_id.SENSE_BASE + config.node_id
-        self._drive_id = cob_id.DRIVE_BASE + config.node_id
-        self._sdo_request_id = cob_id.SDO_REQUEST_BASE + config.node_id
+        self._sense_id = cob_id.sense(config.node_id, config.sense_pdo)
+        self.drive_id = self._drive_id = cob_id.drive(config.node_id, config.drive_pdo)
         self._sdo_response_id = cob_id.SDO_RESPONSE_BASE + config.node_id
         self._emergency_id = cob_id.EMCY_BASE + config.node_id
         self._node_heartbeat_id = cob_id.HEARTBEAT_BASE + config.node_id
@@ -79,13 +76,13 @@ class AmplifierDriver:
             cob_id.NMT: "an NMT command",
             cob_id.SYNC: "a SYNC",
             self._drive_id: "a drive PDO",
-            self._sdo_request_id: "an SDO request",
+            cob_id.SDO_REQUEST_BASE + config.node_id: "an SDO request",
             cob_id.HEARTBEAT_BASE + config.controller_node_id: "a controller's heartbeat",
         }
         self._flags = FD_FAST if config.fd else 0
-        self._sync_frames = tuple(
-            self._frame(cob_id.SYNC, bytes((count,))) for count in range(1, cob_id.SYNC_COUNTER_OVERFLOW + 1)
-        )
+        self._sync_frames: Frames = (self._frame(cob_id.SYNC, b""),)
+        self._sync_index = 0
+        self._count_syncs_to(cob_id.SYNC_COUNTER_OVERFLOW)
         self._heartbeat_frame = self._frame(
             cob_id.HEARTBEAT_BASE + config.controller_node_id, bytes((NmtState.OPERATIONAL,))
         )
@@ -95,11 +92,7 @@ class AmplifierDriver:
         self._node_heartbeat_us = 0  # the last
         self._node_deadline_us = _NEVER_US
         self._heartbeat_next_us = _NEVER_US
-        self._sync_index = 0
         self._drive_counter = 0
-        self._dialogue = SdoDialogue((), 0, 0)
-        self._deadline_us = _NEVER_US
-        self._repeats_left = 0
 
     # -- start and stop ---------------------------------------------------------------------------------------------
 
@@ -115,8 +108,7 @@ class AmplifierDriver:
         self._drive_counter = 0
         self._node_deadline_us = _NEVER_US
         self._heartbeat_next_us = _NEVER_US
-        self._repeats_left = self.config.retries
-        return self._reset_node(t_us)
+        return self._go_on(self._start_up.begin(t_us), t_us)
 
     def poll(self, t_us: int) -> Frames:
         """Time-outs and repetitions of the start-up dialogue; our heartbeat while no loop sends it.
@@ -125,12 +117,8 @@ class AmplifierDriver:
         supervises the node, and ``heartbeat_due`` lets the loop choose the place of the heartbeat.
         """
         frames = _NOTHING
-        if self.state is DriverState.RESETTING and t_us >= self._deadline_us:
-            frames = self._boot_timed_out(t_us)
-        elif self.state in (DriverState.IDENTIFYING, DriverState.CONFIGURING):
-            frames = self._advance(self._dialogue.poll(t_us), t_us)
-        elif self.state is DriverState.STARTING and t_us >= self._deadline_us:
-            frames = self._start_timed_out(t_us)
+        if self.state in _STARTING_UP:
+            frames = self._go_on(self._start_up.poll(t_us), t_us)
         if t_us > self._node_deadline_us:
             self._node_lost(t_us)
         heartbeat = self.heartbeat_due(t_us)
@@ -174,8 +162,9 @@ class AmplifierDriver:
             self._node_lost(t_us)
         self.sense.on_sync()
         index = self._sync_index
-        self._sync_index = index + 1 if index < cob_id.SYNC_COUNTER_OVERFLOW - 1 else 0
-        return self._sync_frames[index]
+        frames = self._sync_frames
+        self._sync_index = index + 1 if index < len(frames) - 1 else 0
+        return frames[index]
 
     def receive(self, frame: Frame, t_us: int) -> Frames:
         """Takes any frame from the bus and returns what is to be sent at once (SDO requests during the start)."""
@@ -187,8 +176,7 @@ class AmplifierDriver:
         elif received_id == self._node_heartbeat_id:
             return self._on_heartbeat(data, t_us)
         elif received_id == self._sdo_response_id:
-            if self.state in (DriverState.IDENTIFYING, DriverState.CONFIGURING):
-                return self._advance(self._dialogue.receive(data, t_us), t_us)
+            return self._go_on(self._start_up.answer(data, t_us), t_us) if self.state in _STARTING_UP else _NOTHING
         elif received_id == self._emergency_id:
             self._on_emergency(data, t_us)
         elif received_id in self._ours:
@@ -218,7 +206,7 @@ class AmplifierDriver:
         if t_us >= self._heartbeat_next_us:
             missed = (t_us - self._heartbeat_next_us) // self._heartbeat_period_us
             self._heartbeat_next_us += (missed + 1) * self._heartbeat_period_us
-            self._keep_away()
+            self._keep_away(t_us)
 
     # -- what the node says -----------------------------------------------------------------------------------------
 
@@ -230,21 +218,22 @@ class AmplifierDriver:
         if self.state in (DriverState.RELEASING, DriverState.RELEASED):
             self._on_heartbeat_after_release(node_state, t_us)
             return _NOTHING
-        if node_state == NmtState.BOOT_UP:
-            return self._on_boot_up(t_us)
-        if self.state is DriverState.STARTING and node_state == NmtState.OPERATIONAL:
-            self.state = DriverState.OPERATIONAL
+        frames = _NOTHING
+        if self.state in _STARTING_UP:
+            frames = self._go_on(self._start_up.heartbeat(node_state, t_us), t_us)
+        elif node_state == NmtState.BOOT_UP:
+            self._on_boot_up()
         if self.state is DriverState.OPERATIONAL:
             self._node_deadline_us = t_us + self._node_timeout_us
             self._node_heartbeat_us = t_us
-            self._keep_away()
+            self._keep_away(t_us)
             if node_state != NmtState.OPERATIONAL:
                 self.node_events |= NODE_NOT_OPERATIONAL
                 self._fail(
                     f"amplifier (node {self.config.node_id}) left the operational state: its heartbeat says "
-                    f"{_state_name(node_state)}; look at its emergencies, then start it again"
+                    f"{state_name(node_state)}; look at its emergencies, then start it again"
                 )
-        return _NOTHING
+        return frames
 
     def _on_heartbeat_after_release(self, node_state: int, t_us: int) -> None:
         if node_state == NmtState.OPERATIONAL:  # not yet, or somebody has started it again
@@ -254,36 +243,27 @@ class AmplifierDriver:
             self.state = DriverState.RELEASED
             self._heartbeat_next_us = t_us
 
-    def _keep_away(self) -> None:
-        """A tick has room for one heartbeat: where ours would meet one of the node's, it goes out a little earlier."""
+    def _keep_away(self, t_us: int) -> None:
+        """A tick has room for one heartbeat: where ours would meet one of the node's, it goes out a little earlier, but
+        not now, where the node's has just come.
+        """
         if self.state is DriverState.OPERATIONAL:
             after_us = (self._heartbeat_next_us - self._node_heartbeat_us + _HEARTBEATS_APART_US) % self._node_period_us
-            if after_us < 2 * _HEARTBEATS_APART_US < self._node_period_us:
+            is_near = after_us < 2 * _HEARTBEATS_APART_US < self._node_period_us
+            if is_near and self._heartbeat_next_us - after_us > t_us:
                 self._heartbeat_next_us -= after_us
 
-    def _on_boot_up(self, t_us: int) -> Frames:
-        if self.state is DriverState.RESETTING:
-            return self._begin(DriverState.IDENTIFYING, t_us)
-        if self.state in (DriverState.IDENTIFYING, DriverState.CONFIGURING, DriverState.STARTING):
-            if self._repeats_left > 0:  # late answer to a repeated reset: what was written is lost
-                self._repeats_left -= 1
-                self._fall_silent()
-                return self._begin(DriverState.IDENTIFYING, t_us)
-            self._fail(
-                f"amplifier (node {self.config.node_id}) restarts again and again while it is configured; "
-                "check its power supply"
-            )
-        elif self.state in (DriverState.OPERATIONAL, DriverState.FAILED):
+    def _on_boot_up(self) -> None:
+        if self.state in (DriverState.OPERATIONAL, DriverState.FAILED):
             self.node_events |= NODE_REBOOTED | NODE_NOT_OPERATIONAL
             self._fail(
                 f"amplifier (node {self.config.node_id}) restarted by itself (boot-up message while operational); "
                 "check its power supply, then start it again"
             )
-        return _NOTHING
 
     def _on_emergency(self, data: bytes, t_us: int) -> None:
         emergency = decode_emergency(data, t_us)
-        if emergency is not None:
+        if emergency is not None and not (emergency.code == _HEARTBEAT_ERROR and self.state in _TRIAL):
             self.emergencies.append(emergency)
             if not emergency.is_reset:
                 self.node_events |= NODE_EMERGENCY
@@ -293,7 +273,7 @@ class AmplifierDriver:
 
         What comes before the node is configured, a predecessor's last heartbeat perhaps, the configuration undoes.
         """
-        if self.state not in (DriverState.CONFIGURING, DriverState.STARTING, DriverState.OPERATIONAL):
+        if self.state not in _SPOKEN_FOR:
             return
         if received_id == cob_id.NMT and data[1:] not in (b"\0", bytes((self.config.node_id,))):
             return  # to another node
@@ -311,59 +291,23 @@ class AmplifierDriver:
             f"{self.config.node_heartbeat_period_ms} ms; check cable and power, then start it again"
         )
 
-    # -- start-up dialogue ------------------------------------------------------------------------------------------
-
-    def _reset_node(self, t_us: int) -> Frames:
-        self.state = DriverState.RESETTING
-        self._deadline_us = t_us + self.config.boot_timeout_us
-        return (self._nmt(NmtCommand.RESET_NODE),)
-
-    def _boot_timed_out(self, t_us: int) -> Frames:
-        if self._repeats_left > 0:
-            self._repeats_left -= 1
-            return self._reset_node(t_us)
-        self._fail(
-            f"amplifier (node {self.config.node_id}) sent no boot-up message 0x{self._node_heartbeat_id:03X} within "
-            f"{self.config.boot_timeout_us / 1000:g} ms of NMT reset, {self.config.retries + 1} times; "
-            "check node id, power, wiring and bit rates"
-        )
-        return _NOTHING
-
-    def _begin(self, state: DriverState, t_us: int) -> Frames:
-        self.state = state
-        config = self.config
-        identifying = state is DriverState.IDENTIFYING
-        steps = identity_steps(config) if identifying else configuration_steps(config, self._count_step_max)
-        self._dialogue = SdoDialogue(steps, config.sdo_timeout_us, config.retries)
-        return self._sdo(self._dialogue.begin(t_us))
-
-    def _advance(self, requests: tuple[bytes, ...], t_us: int) -> Frames:
-        if self._dialogue.failure:
-            self._fail(f"amplifier (node {self.config.node_id}): {self._dialogue.failure}")
-        elif self._dialogue.done:
-            if self.state is DriverState.IDENTIFYING:
-                return self._begin(DriverState.CONFIGURING, t_us)
-            self._repeats_left = self.config.retries
-            self._heartbeat_next_us = t_us + self._heartbeat_period_us
-            return (self._heartbeat_frame, *self._start_node(t_us))
-        return self._sdo(requests)
-
-    def _start_node(self, t_us: int) -> Frames:
-        self.state = DriverState.STARTING
-        self._deadline_us = t_us + self.config.start_timeout_us
-        return (self._nmt(NmtCommand.START),)
-
-    def _start_timed_out(self, t_us: int) -> Frames:
-        if self._repeats_left > 0:
-            self._repeats_left -= 1
-            return self._start_node(t_us)
-        heard = "no heartbeat came" if self.node_state is None else f"its heartbeat says {_state_name(self.node_state)}"
-        self._fail(
-            f"amplifier (node {self.config.node_id}) did not become operational within "
-            f"{self.config.start_timeout_us / 1000:g} ms of NMT start, {self.config.retries + 1} times: {heard}; "
-            "look at its emergencies"
-        )
-        return (self._nmt(NmtCommand.PRE_OPERATIONAL),)
+    def _go_on(self, messages: Messages, t_us: int) -> Frames:
+        """Send what the start-up says, and take over where it stands: our heartbeat runs while the node is starting,
+        and stays away while its loss is tried.
+        """
+        start_up, was = self._start_up, self.state
+        self.state = state = start_up.state
+        self.lost = start_up.lost
+        if state is not was:
+            self._fall_silent()
+            if state is DriverState.STARTING:
+                self._heartbeat_next_us = t_us + self._heartbeat_period_us
+                self._count_syncs_to(start_up.sync_overflow)
+            elif state is DriverState.OPERATIONAL:  # the loop's first tick has the node's heartbeat in it
+                self._heartbeat_next_us = t_us + 2 * _HEARTBEATS_APART_US
+            elif state is DriverState.FAILED:
+                self._fail(start_up.failure)
+        return tuple(self._frame(*message) for message in messages)
 
     # -- small things -----------------------------------------------------------------------------------------------
 
@@ -374,7 +318,6 @@ class AmplifierDriver:
 
     def _fall_silent(self) -> None:
         self._node_deadline_us = _NEVER_US
-        self._deadline_us = _NEVER_US
         self._heartbeat_next_us = _NEVER_US
 
     def _frame(self, frame_id: int, data: bytes) -> Frame:
@@ -383,12 +326,9 @@ class AmplifierDriver:
     def _nmt(self, command: NmtCommand) -> Frame:
         return self._frame(cob_id.NMT, bytes((command, self.config.node_id)))
 
-    def _sdo(self, requests: tuple[bytes, ...]) -> Frames:
-        return tuple(self._frame(self._sdo_request_id, data) for data in requests)
-
-
-def _state_name(node_state: int) -> str:
-    try:
-        return NmtState(node_state).name.lower().replace("_", "-")
-    except ValueError:
-        return f"unknown state 0x{node_state:02X}"
+    def _count_syncs_to(self, overflow: int) -> None:
+        """SYNC counters run from 1 to ``overflow``; 0: a SYNC has none."""
+        if len(self._sync_frames) != max(1, overflow) or bool(self._sync_frames[0].data) != (overflow > 0):
+            counters = [bytes((count,)) for count in range(1, overflow + 1)] or [b""]
+            self._sync_frames = tuple(self._frame(cob_id.SYNC, counter) for counter in counters)
+            self._sync_index = 0

@@ -2,12 +2,44 @@
 
 from typing import Annotated, Self
 
-from pydantic import BaseModel, ConfigDict, Field, model_validator
+from pydantic import BaseModel, BeforeValidator, ConfigDict, Field, PlainSerializer, model_validator
+
+ANY = "any"
 
 Unsigned32 = Annotated[int, Field(ge=0, le=0xFFFFFFFF)]
+Identity = Annotated[
+    Unsigned32 | None,
+    BeforeValidator(lambda value: None if value == ANY else value),
+    PlainSerializer(lambda value: ANY if value is None else value),
+]
+"""A number that is compared, or "any" (None), which is not."""
+Pdo = Annotated[int, Field(ge=1, le=4)]
+Channels = tuple[
+    Annotated[int, Field(ge=1, le=254)], Annotated[int, Field(ge=1, le=254)], Annotated[int, Field(ge=1, le=254)]
+]
 HeartbeatMs = Annotated[int, Field(ge=1, le=0xFFFF)]  # 0x1016 and 0x1017 are UNSIGNED16 in milliseconds
 OUR_TIMEOUT_MAX_MS = 1000
 """Longest that combs may keep their voltage after the controller fell silent; the gate lets no longer one pass."""
+
+
+class ProvenModule(BaseModel):
+    """A report of ``pkxyz check-amplifier`` on one very module, as far as the start-up counts on it."""
+
+    model_config = ConfigDict(frozen=True, extra="forbid")
+
+    vendor_id: Unsigned32
+    product_code: Unsigned32
+    revision: Unsigned32
+    serial: Unsigned32
+    lines: tuple[str, ...]
+    """Names of the lines that passed."""
+    digest: Annotated[str, Field(pattern="^sha256:[0-9a-f]{64}$")]
+    """Of the report."""
+
+    @property
+    def identity(self) -> tuple[int, int, int, int]:
+        """As 0x1018 has it, sub-indices 1 to 4."""
+        return self.vendor_id, self.product_code, self.revision, self.serial
 
 
 class DriverConfig(BaseModel):
@@ -20,9 +52,15 @@ class DriverConfig(BaseModel):
     fd: bool = Field(default=True, description="send FD frames with bit-rate switch; both formats are received")
     protection: bool = Field(default=True, description="process PDOs carry an alive counter and a CRC-8")
 
-    device_type: Unsigned32 | None = Field(default=0x000C0191, description="0x1000; None accepts any")
-    vendor_id: Unsigned32 | None = Field(default=0x7078797A, description="0x1018:1; None accepts any")
-    product_code: Unsigned32 | None = Field(default=0x00000003, description="0x1018:2; None accepts any")
+    device_type: Identity = Field(default=0x000C0191, description='0x1000; "any" takes any')
+    vendor_id: Identity = Field(default=0x7078797A, description='0x1018:1; "any" takes any')
+    product_code: Identity = Field(default=0x00000003, description='0x1018:2; "any" takes any')
+    proven: ProvenModule | None = Field(default=None, description="what a report on this very module has shown")
+
+    drive_pdo: Pdo = Field(default=2, description="number of the RPDO that carries the drive counts")
+    sense_pdo: Pdo = Field(default=2, description="number of the TPDO that carries the sense counts")
+    drive_channels: Channels = Field(default=(1, 2, 3), description="sub-indices of 0x6411, comb by comb")
+    sense_channels: Channels = Field(default=(1, 2, 3), description="sub-indices of 0x6401, comb by comb")
 
     # One lost heartbeat is survived; the second time-out, 50 ms, bounds how long the combs keep their voltage after
     # the controller fell silent.
@@ -42,6 +80,10 @@ class DriverConfig(BaseModel):
     def _consistent(self) -> Self:
         if self.node_id == self.controller_node_id:
             raise ValueError(f"node_id and controller_node_id are both {self.node_id}; give them different ids")
+        for name in ("drive_channels", "sense_channels"):
+            channels = getattr(self, name)
+            if len(set(channels)) != len(channels):
+                raise ValueError(f"{name} = {list(channels)}: three different channels, one for each comb")
         for who in ("controller", "node"):
             period_ms = getattr(self, f"{who}_heartbeat_period_ms")
             timeout_ms = getattr(self, f"{who}_heartbeat_timeout_ms")

@@ -3,6 +3,7 @@
 from collections import Counter
 
 from . import cob_id
+from .driver_config import DriverConfig
 from .frame import Frame
 
 _FLOOD_FRAMES = 5  # fewer say nothing
@@ -12,9 +13,10 @@ _FLOOD_PER_S = 2000  # more than this, on average, since the amplifier was last 
 class OtherTraffic:
     """Who else talks, since the amplifier's last sense frame or since the start-up began."""
 
-    def __init__(self, node_id: int) -> None:
-        bases = (cob_id.EMCY_BASE, cob_id.SENSE_BASE, cob_id.SDO_RESPONSE_BASE, cob_id.HEARTBEAT_BASE)
-        self._of_the_amplifier = frozenset(base + node_id for base in bases)
+    def __init__(self, config: DriverConfig) -> None:
+        node_id = config.node_id
+        services = (base + node_id for base in (cob_id.EMCY_BASE, cob_id.SDO_RESPONSE_BASE, cob_id.HEARTBEAT_BASE))
+        self._of_the_amplifier = frozenset((cob_id.sense(node_id, config.sense_pdo), *services))
         self._frames: Counter[int] = Counter()
         self._since_us = self._last_us = 0
 

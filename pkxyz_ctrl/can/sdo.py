@@ -44,6 +44,9 @@ ABORT_TEXT = {  # CiA 301, table "SDO abort codes"
     0x08000024: "no data available",
 }
 
+NO_SUCH_OBJECT = (0x06020000, 0x06090011)
+"""The node has no such object, or no such part of it."""
+
 _REQUEST = struct.Struct("<BHBI")
 _UPLOAD_REQUEST = 0x40
 _DOWNLOAD_REPLY = 0x60
@@ -54,7 +57,8 @@ _ABORT = 0x80
 class SdoStep:
     """One transfer. ``write``: ``value`` is written; otherwise it is what must be read, or None for anything.
 
-    ``size`` is 1, 2 or 4 bytes, values are unsigned. ``what`` and ``remedy`` end up in the failure text.
+    ``size`` is 1, 2 or 4 bytes, values are unsigned. ``what`` and ``remedy`` end up in the failure text. ``optional``:
+    a refusal is an answer, too. ``alike``: bits in which what is read may differ.
     """
 
     index: int
@@ -64,6 +68,8 @@ class SdoStep:
     write: bool
     what: str
     remedy: str
+    optional: bool = False
+    alike: int = 0
 
     @property
     def name(self) -> str:
@@ -140,7 +146,13 @@ class SdoDialogue:
         self._tries = 0
         self._deadline_us = 0
         self.failure = ""
-        self.values: dict[tuple[int, int], int] = {}  # what was read, by index and sub-index
+        self.values: dict[tuple[int, int], int | None] = {}
+        """What was read, by index and sub-index; None where there is no such object."""
+
+    @property
+    def is_begun(self) -> bool:
+        """Whether anything was answered."""
+        return self._position > 0
 
     @property
     def done(self) -> bool:
@@ -172,9 +184,13 @@ class SdoDialogue:
         step = self._steps[self._position]
         if (reply.object_index, reply.subindex) != (step.index, step.subindex):
             return ()
+        if reply.kind is ReplyKind.ABORT and reply.value == TIMEOUT_ABORT:
+            return ()  # the server has lost a transfer, too: our own time-out repeats it
+        if step.optional and (reply.kind is ReplyKind.ABORT or (reply.kind is ReplyKind.OTHER and not step.write)):
+            if reply.kind is ReplyKind.ABORT and reply.value in NO_SUCH_OBJECT:
+                self.values[step.index, step.subindex] = None
+            return self._next(t_us)
         if reply.kind is ReplyKind.ABORT:
-            if reply.value == TIMEOUT_ABORT:
-                return ()  # the server has lost a transfer, too: our own time-out repeats it
             verb = "writing" if step.write else "reading"
             self.failure = f"{verb} {step.name} was refused: {abort_text(reply.value)}; {step.remedy}"
             return ()
@@ -185,6 +201,9 @@ class SdoDialogue:
             return ()
         if not step.write and not self._accept(step, reply):
             return ()
+        return self._next(t_us)
+
+    def _next(self, t_us: int) -> tuple[bytes, ...]:
         self._position += 1
         self._tries = 0
         return () if self.done else self._ask(t_us)
@@ -194,7 +213,7 @@ class SdoDialogue:
         digits = 2 * step.size
         if reply.size not in (0, step.size):
             self.failure = f"{step.name} has {reply.size} bytes instead of {step.size}; {step.remedy}"
-        elif step.value is not None and reply.value & ((1 << 8 * step.size) - 1) != step.value:
+        elif step.value is not None and (reply.value ^ step.value) & ((1 << 8 * step.size) - 1) & ~step.alike:
             self.failure = (
                 f"{step.name} is 0x{reply.value:0{digits}X}, expected 0x{step.value:0{digits}X}; {step.remedy}"
             )

@@ -66,7 +66,7 @@ class Controller:
         self._restarting = False
         self._blocked = 0
         self._sense = self.driver.sense
-        self._others = OtherTraffic(bus.can.driver.node_id)
+        self._others = OtherTraffic(bus.can.driver)
         self._begun_us = 0
         self._reference = standing_still()  # the latest that was handed in
         self._drive_counts = (0, 0, 0)
@@ -189,7 +189,7 @@ class Controller:
             return
         self.faults.append(reason)
         self._blocked = int(Trip.GATE_BLOCKED)
-        if frame.can_id == 0x300 + self.can.driver.node_id:
+        if frame.can_id == self.driver.drive_id:
             self.driver.revoke_drive()
             discharged = self.driver.drive((0, 0, 0), t_us)
             if self.gate.check(discharged, self.mode, t_us) is None:

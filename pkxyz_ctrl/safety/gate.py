@@ -11,7 +11,7 @@ from typing import Final
 
 from pkxyz_ctrl.can.frame import FD, FD_FAST, UNUSUAL, Frame
 from pkxyz_ctrl.safety.modes import Mode
-from pkxyz_ctrl.safety.sdo_rules import is_read, write_refusal
+from pkxyz_ctrl.safety.sdo_rules import WriteContext, is_read, write_refusal
 
 
 class FrameKind(IntFlag):
@@ -108,7 +108,8 @@ class GateConfig:
     ``count_max`` and ``count_slew_max`` are drive counts (the scale of the wire, INTEGER16; 0 counts = 0 V), the latter
     per drive frame. ``spacing_min_us`` is the shortest time between two drive frames; None: half a period, so that
     jitter passes and a second frame in the same tick does not. ``fd``: the bus can carry FD frames. Time-outs that are
-    written to the node may be at most ``heartbeat_timeout_max_ms``. Raises ValueError if a value is out of range.
+    written to the node may be at most ``heartbeat_timeout_max_ms``. The drive frame is that of RPDO ``drive_pdo``, and
+    carries channels ``drive_channels`` of 0x6411. Raises ValueError if a value is out of range.
     """
 
     count_max: int
@@ -120,6 +121,8 @@ class GateConfig:
     fd: bool = True
     spacing_min_us: int | None = None
     heartbeat_timeout_max_ms: int = 1000
+    drive_pdo: int = 2
+    drive_channels: tuple[int, int, int] = (1, 2, 3)
 
     def __post_init__(self) -> None:
         ranges = {
@@ -129,6 +132,7 @@ class GateConfig:
             "node_id": (1, 127),
             "controller_node_id": (1, 127),
             "heartbeat_timeout_max_ms": (1, 65535),
+            "drive_pdo": (1, 4),
         }
         for name, (low, high) in ranges.items():
             value = getattr(self, name)
@@ -158,9 +162,18 @@ class TransmitGate:
         self._rows = {int(mode): int(kinds) for mode, kinds in PERMITTED.items()}
         self._mask = _EVERY_KIND
         self._formats = (0, FD, FD_FAST) if config.fd else (0,)
-        self._drive_id = 0x300 + config.node_id
+        self._drive_id = 0x100 + 0x100 * config.drive_pdo + config.node_id  # predefined connection set
         self._sdo_id = 0x600 + config.node_id
         self._heartbeat_id = 0x700 + config.controller_node_id
+        self._written = WriteContext(
+            node_id=config.node_id,
+            controller_node_id=config.controller_node_id,
+            heartbeat_timeout_max_ms=config.heartbeat_timeout_max_ms,
+            count_slew_max=config.count_slew_max,
+            drive_index=0x1400 + config.drive_pdo - 1,
+            drive_id=self._drive_id,
+            drive_channels=config.drive_channels,
+        )
         self._drive_length = _PROTECTED_LENGTH if config.protection else 6
         # Initial value 0xFF and the data id (the identifier, low byte first), seen through seven bytes; final xor 0xFF.
         data_id = _CRC[_CRC[0xFF ^ self._drive_id & 0xFF] ^ self._drive_id >> 8]
@@ -185,10 +198,10 @@ class TransmitGate:
         elif can_id == self._drive_id:
             reason = self._judge_drive(data, row, t_us)
         elif can_id == SYNC_ID:
-            if row & _SYNC and len(data) == 1 and 1 <= data[0] <= 240:
+            if row & _SYNC and (len(data) == 0 or (len(data) == 1 and 1 <= data[0] <= 240)):
                 self._syncs = 1 if self._syncs == 0 else 2
                 return None
-            reason = "SYNC must be one byte, 1..240" if row & _SYNC else _not_now(FrameKind.SYNC)
+            reason = "SYNC must be empty, or one byte, 1..240" if row & _SYNC else _not_now(FrameKind.SYNC)
         else:
             reason = self._judge_service(can_id, data, row)
         return None if reason is None else self._block(frame, mode, reason)
@@ -290,9 +303,7 @@ class TransmitGate:
             return None if row & FrameKind.SDO_READ else _not_now(FrameKind.SDO_READ)
         if not row & FrameKind.SDO_WRITE:
             return _not_now(FrameKind.SDO_WRITE)
-        config = self.config
-        limits = config.heartbeat_timeout_max_ms, config.count_slew_max
-        return write_refusal(data, config.node_id, config.controller_node_id, *limits)
+        return write_refusal(data, self._written)
 
 
 def _refusal(flags: int) -> str:

@@ -18,13 +18,19 @@ _COB_ID_MASK: Final = 0x3FFFFFFF  # without "off" (bit 31) and "no remote frame"
 
 
 class WriteContext(NamedTuple):
-    """What the values are compared with. ``object_index`` is what is being written."""
+    """What the values are compared with. ``object_index``, ``subindex``: what is being written; ``drive_index``: the
+    communication parameter of the drive PDO, ``drive_id`` its identifier, ``drive_channels`` the sub-indices of 0x6411.
+    """
 
-    object_index: int
     node_id: int
     controller_node_id: int
     heartbeat_timeout_max_ms: int
     count_slew_max: int
+    drive_index: int
+    drive_id: int
+    drive_channels: tuple[int, int, int]
+    object_index: int = 0
+    subindex: int = 0
 
 
 @dataclass(frozen=True, slots=True)
@@ -70,9 +76,23 @@ def _step(value: int, context: WriteContext) -> bool:
 
 
 def _drive_or_off(value: int, context: WriteContext) -> bool:
-    if context.object_index == 0x1401 and value & _COB_ID_MASK == 0x300 + context.node_id:
+    if context.object_index == context.drive_index and value & _COB_ID_MASK == context.drive_id:
         return True
     return bool(value & _COB_ID_OFF)
+
+
+def _of_a_comb(only: int) -> Callable[[int, WriteContext], bool]:
+    return lambda value, context: value == only and context.subindex in context.drive_channels
+
+
+def _every_sync(value: int, context: WriteContext) -> bool:
+    return context.object_index == context.drive_index and value == 1
+
+
+def _drive_field(value: int, context: WriteContext) -> bool:
+    """All that a PDO may write: three counts, alive counter, CRC. Never 0x6444, 0x2010 or 0x1016."""
+    counts = (0x6411_0010 | channel << 8 for channel in context.drive_channels)
+    return value in (0, *counts, 0x2000_0108, 0x2000_0208)
 
 
 def _own_or_off(value: int, context: WriteContext) -> bool:
@@ -80,19 +100,16 @@ def _own_or_off(value: int, context: WriteContext) -> bool:
     return bool(value & _COB_ID_OFF) or value & _COB_ID_MASK in own
 
 
-_DRIVE_FIELDS: Final = (0x64110110, 0x64110210, 0x64110310, 0x20000108, 0x20000208)
-"""All that a PDO may write: three counts, alive counter, CRC. Never 0x6444, 0x2010 or 0x1016."""
-
 WRITE_RULES: Final = (
     WriteRule(0x1005, 0x1005, 0, 0, 4, "identifier of SYNC", "0x080, the node not its producer", _is(0x80)),
     WriteRule(0x1016, 0x1016, 1, 1, 4, "consumer of our heartbeat", "our node id, 1 ms to the limit", _our_heartbeat),
     WriteRule(0x1017, 0x1017, 0, 0, 2, "the node's heartbeat", "1 ms or more, never off", _not_zero),
     WriteRule(0x1019, 0x1019, 0, 0, 1, "overflow of the SYNC counter", "240", _is(240)),
     WriteRule(0x1029, 0x1029, 1, 1, 1, "behaviour on communication error", "0 or 2, never 'carry on'", _is(0, 2)),
-    WriteRule(0x1400, 0x15FF, 1, 1, 4, "identifier of a receive PDO", "0x1401: the drive PDO's; or off", _drive_or_off),
-    WriteRule(0x1401, 0x1401, 2, 2, 1, "drive PDO: transmission type", "1, applied on every SYNC", _is(1)),
+    WriteRule(0x1400, 0x15FF, 1, 1, 4, "identifier of a receive PDO", "drive PDO: its own; or off", _drive_or_off),
+    WriteRule(0x1400, 0x15FF, 2, 2, 1, "receive PDO: transmission type", "drive PDO: 1, every SYNC", _every_sync),
     WriteRule(0x1600, 0x17FF, 0, 0, 1, "receive mapping: number of entries", "0 to 5", _is(*range(6))),
-    WriteRule(0x1600, 0x17FF, 1, 64, 4, "receive mapping: entry", "0x6411, 0x2000, none", _is(0, *_DRIVE_FIELDS)),
+    WriteRule(0x1600, 0x17FF, 1, 64, 4, "receive mapping: entry", "0x6411 of a comb, 0x2000, none", _drive_field),
     WriteRule(0x1800, 0x19FF, 1, 1, 4, "identifier of a transmit PDO", "the node's own four; or off", _own_or_off),
     WriteRule(0x1800, 0x19FF, 2, 2, 1, "transmit PDO: transmission type", "any", _anything),
     WriteRule(0x1800, 0x19FF, 3, 3, 2, "transmit PDO: inhibit time", "any", _anything),
@@ -102,8 +119,8 @@ WRITE_RULES: Final = (
     WriteRule(0x2010, 0x2010, 0, 0, 1, "SYNCs without a drive PDO until 0 V", "1 or more, never off", _not_zero),
     WriteRule(0x2011, 0x2011, 0, 0, 2, "largest step of a drive count", "1 to our own slew limit", _step),
     WriteRule(0x2012, 0x2012, 0, 0, 2, "time without an applied drive PDO", "1 ms to the limit", _in_time),
-    WriteRule(0x6443, 0x6443, 1, 3, 1, "error mode of a comb", "1, use the error value", _is(1)),
-    WriteRule(0x6444, 0x6444, 1, 3, 4, "error value of a comb", "0, that is 0 V", _is(0)),
+    WriteRule(0x6443, 0x6443, 1, 254, 1, "error mode of a comb", "1, use the error value", _of_a_comb(1)),
+    WriteRule(0x6444, 0x6444, 1, 254, 4, "error value of a comb", "0, that is 0 V", _of_a_comb(0)),
 )
 
 
@@ -122,9 +139,7 @@ def is_read(data: bytes) -> bool:
     return command == _ABORT
 
 
-def write_refusal(
-    data: bytes, node_id: int, controller_node_id: int, heartbeat_timeout_max_ms: int, count_slew_max: int
-) -> str | None:
+def write_refusal(data: bytes, limits: WriteContext) -> str | None:
     """Why the eight bytes are not a permitted write; None if they are."""
     command, index, subindex, value = _fields(data)
     size = _DOWNLOAD_SIZE.get(command)
@@ -133,7 +148,7 @@ def write_refusal(
     name = f"0x{index:04X}:{subindex:02X}"
     if value >> 8 * size:
         return f"SDO write of {name}: the bytes behind its {size} are not empty"
-    context = WriteContext(index, node_id, controller_node_id, heartbeat_timeout_max_ms, count_slew_max)
+    context = limits._replace(object_index=index, subindex=subindex)
     for rule in WRITE_RULES:
         if rule.covers(index, subindex):
             if size != rule.size:

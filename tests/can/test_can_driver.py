@@ -83,17 +83,21 @@ def test_frames_of_another_kind_are_not_ours(flag, can_id):
 
 
 def test_our_heartbeat_keeps_its_grid_however_late_it_is_sent():
-    """Its grid would be the node's, whose first heartbeat came at 0; it stays 1 ms before that."""
+    """It begins 2 ms after the node's first, at 0; where it would meet one of the node's, it goes out 1 ms before."""
     driver = started()
-    assert driver.heartbeat_due(18_999) is None
-    assert driver.heartbeat_due(19_000) == frame(OUR_HEARTBEAT)
-    assert driver.heartbeat_due(19_400) == frame(OUR_HEARTBEAT)  # until it was sent
-    driver.heartbeat_sent(19_400)
-    assert driver.heartbeat_due(38_999) is None
-    assert driver.heartbeat_due(39_000) is not None
+    assert driver.heartbeat_due(1_999) is None
+    driver.heartbeat_sent(2_000)
+    assert driver.heartbeat_due(21_999) is None
+    driver.receive(heartbeat(OPERATIONAL), 21_500)
+    assert driver.heartbeat_due(21_999) is None
+    assert driver.heartbeat_due(22_000) == frame(OUR_HEARTBEAT)
+    assert driver.heartbeat_due(22_400) == frame(OUR_HEARTBEAT)  # until it was sent
+    driver.heartbeat_sent(22_400)
+    assert driver.heartbeat_due(40_499) is None
+    assert driver.heartbeat_due(40_500) is not None
     driver.heartbeat_sent(105_000)  # whole periods are skipped
-    assert driver.heartbeat_due(118_999) is None
-    assert driver.heartbeat_due(119_000) is not None
+    assert driver.heartbeat_due(120_499) is None
+    assert driver.heartbeat_due(120_500) is not None
 
 
 def test_stop_is_zero_volts_then_pre_operational():
@@ -248,7 +252,7 @@ def test_before_the_node_is_configured_others_may_have_spoken_and_from_then_on_n
     assert driver.node_events == 0
     server = ObedientServer()
     while driver.state is DriverState.IDENTIFYING:
-        asked = driver.receive(server.answer(asked[0]), 120)
+        asked = driver.receive(server.answer(asked[-1]), 120)
     driver.receive(frame(sent), 130)
     assert driver.node_events == FOREIGN_FRAME
 

@@ -4,6 +4,7 @@ canopen's node does no NMT gating, no boot-up after a reset and no SYNC-driven P
 file sends the boot-up, the heartbeats and the sense PDOs for it, packed by canopen's own PDO maps.
 """
 
+from copy import copy
 from pathlib import Path
 
 import can
@@ -12,7 +13,7 @@ import pytest
 
 from pkxyz_ctrl.can.codec import crc8
 from pkxyz_ctrl.can.driver import NODE_REBOOTED, AmplifierDriver, DriverState
-from pkxyz_ctrl.can.driver_config import DriverConfig
+from pkxyz_ctrl.can.driver_config import DriverConfig, ProvenModule
 from pkxyz_ctrl.can.frame import Frame
 from pkxyz_ctrl.can.sense_input import SENSE_COUNTER, SENSE_MISSING
 
@@ -55,11 +56,15 @@ def to_frame(message: can.Message) -> Frame:
 
 
 class Bench:
-    """Driver and LocalNode on one wire; every frame takes 100 us."""
+    """Driver and LocalNode on one wire; every frame takes 100 us. canopen stores 0x1016 and does nothing with it:
+    ``consumes`` has this file do what it says.
+    """
 
-    def __init__(self, config: DriverConfig, boots: bool = True) -> None:
+    def __init__(self, config: DriverConfig, boots: bool = True, consumes: bool = True) -> None:
         self.t_us = 0
         self.boots = boots
+        self.consumes = consumes
+        self.beat_us = 1 << 62
         self.driver = AmplifierDriver(config)
         self.bus = MemoryBus()
         self.network = canopen.Network(self.bus)
@@ -68,12 +73,17 @@ class Bench:
     def to_node(self, frame: Frame) -> None:
         self.t_us += FRAME_US
         self.network.notify(frame.can_id, bytearray(frame.data), self.t_us * 1e-6)
+        if frame.can_id == 0x77F:
+            self.beat_us = self.t_us
         if frame.can_id == 0 and self.boots:
             if frame.data[0] == 0x81:
                 self.node.nmt.send_command(129)  # canopen sends the boot-up message here
             self.node.nmt.send_command({0x81: 128, 0x01: 1, 0x80: 128}[frame.data[0]])
 
     def from_node(self) -> list[Frame]:
+        if self.consumes and self.t_us >= self.beat_us + 50_000:
+            self.beat_us = 1 << 62
+            self.node.nmt.send_command(128)
         for task in self.bus.tasks:
             if self.t_us >= task.next_us:
                 self.bus.sent.append(to_frame(task.message))
@@ -93,6 +103,8 @@ class Bench:
             for frame in self.from_node():
                 waiting += self.driver.receive(frame, self.t_us)
             waiting += self.driver.poll(self.t_us)
+        for frame in waiting:
+            self.to_node(frame)
 
     def start(self) -> None:
         self.settle(self.driver.start(self.t_us), 20_000_000)
@@ -115,6 +127,15 @@ def test_start_up_configures_canopens_node(protection):
         pdo.read(from_od=False)
         assert (pdo.enabled, pdo.trans_type, len(pdo.data)) == (True, 1, length)
     assert bench.bus.tasks[-1].period_us == 20_000
+
+
+def test_a_node_that_only_stores_what_it_should_do_without_us_is_not_enabled():
+    bench = Bench(DriverConfig(), consumes=False)
+    bench.start()
+    assert bench.node.sdo[0x1016][1].raw == 127 << 16 | 50
+    assert bench.driver.state is DriverState.FAILED
+    assert "did not notice that our heartbeat ended: 100 ms later its heartbeat says op" in bench.driver.failure
+    assert bench.node.nmt.state == "PRE-OPERATIONAL"
 
 
 def test_drive_and_sense_through_canopens_pdo_maps():
@@ -160,22 +181,25 @@ def test_wrong_identity():
 
 
 @pytest.mark.parametrize(
-    ("index", "code", "remedy"),
+    ("index", "told", "remedy"),
     [
         (0x2000, "0x06020000", "set protection = false in the bus config"),
-        (0x6444, "0x06020000", "must not be used"),
-        (0x1016, "0x06020000", "must produce and consume heartbeats"),
+        (0x2011, "no 0x2011 (largest step", "makes two in one where a frame is lost"),
+        (0x6444, "no 0x6444 (error value of comb 1: 0 V), and no report", "--voltmeter` makes one"),
+        (0x1016, "no 0x1016 (consumer of our heartbeat), and nothing else takes the combs to 0 V", "must not be used"),
+        (0x1401, "no 0x1401", "in the PDOs and channels of the bus config"),
     ],
 )
-def test_an_object_that_canopens_node_lacks(index, code, remedy):
+def test_an_object_that_canopens_node_lacks(index, told, remedy):
     bench = Bench(DriverConfig())
     del bench.node.object_dictionary[index]
     if index == 0x2000:  # canopen stores any mapping; a device with PDO checks refuses it as it refuses the object
+        bench.node.object_dictionary[0x1601][0].default = 3
         bench.node.add_write_callback(refuse_unknown_mapping(bench.node.object_dictionary))
     bench.start()
     assert bench.driver.state is DriverState.FAILED
     assert remedy in bench.driver.failure
-    assert code in bench.driver.failure
+    assert told in bench.driver.failure
 
 
 def refuse_unknown_mapping(dictionary):
@@ -188,11 +212,132 @@ def refuse_unknown_mapping(dictionary):
 
 
 def test_a_node_that_does_not_boot():
-    bench = Bench(DriverConfig(boot_timeout_us=5_000), boots=False)
+    bench = Bench(DriverConfig(boot_timeout_us=5_000, sdo_timeout_us=1_000), boots=False)
+    bench.node.network.subscribers.clear()  # nobody is there
     bench.start()
     assert bench.driver.state is DriverState.FAILED
     assert "sent no boot-up message 0x70A within 5 ms of NMT reset, 3 times" in bench.driver.failure
-    assert 15_000 <= bench.t_us <= 16_000
+    assert 18_000 <= bench.t_us <= 20_000
+
+
+@pytest.mark.parametrize(("index", "lost"), [(0x1019, "no 0x1019"), (0x1029, "no 0x1029"), (0x1005, "")])
+def test_what_a_node_may_lack_is_said(index, lost):
+    bench = Bench(DriverConfig())
+    del bench.node.object_dictionary[index]
+    bench.start()
+    assert (bench.driver.state, bench.driver.failure) == (DriverState.OPERATIONAL, "")
+    assert [line[: len(lost)] for line in bench.driver.lost] == ([lost] if lost else [])
+    assert bench.driver.sync(0).data == (b"" if index == 0x1019 else b"\1")
+    assert bench.driver.sync(0).data == (b"" if index == 0x1019 else b"\2")
+
+
+def test_a_boot_up_that_was_missed_is_no_end():
+    bench = Bench(DriverConfig(boot_timeout_us=5_000))
+    heard = bench.from_node
+    bench.from_node = lambda: [f for f in heard() if (f.can_id, f.data) != (0x70A, b"\0")]
+    bench.start()
+    assert (bench.driver.state, bench.driver.failure) == (DriverState.OPERATIONAL, "")
+    assert "sent no boot-up message 0x70A within 5 ms of NMT reset, 3 times: that it answers" in bench.driver.lost[0]
+
+
+@pytest.mark.parametrize("protection", [True, False])
+def test_what_stands_is_not_written(protection):
+    """A mapping and identifiers that can't be changed are right as they are; only what differs is written."""
+    bench = Bench(DriverConfig(protection=protection))
+    entries = bench.node.object_dictionary
+    written = []
+    if not protection:
+        for index in (0x1601, 0x1A01):
+            entries[index][0].default = 3
+    for index in (0x1401, 0x1601, 0x1801, 0x1A01):
+        for variable in entries[index].values():
+            variable.access_type = "const"
+    bench.node.add_write_callback(lambda index, subindex, od, data: written.append((index, subindex)))
+    bench.start()
+    assert (bench.driver.state, bench.driver.failure) == (DriverState.OPERATIONAL, "")
+    assert written == [(0x1016, 1), (0x1017, 0)]
+
+
+def test_a_constant_mapping_that_is_another_is_refused():
+    bench = Bench(DriverConfig())
+    for variable in bench.node.object_dictionary[0x1601].values():
+        variable.access_type = "const"
+    bench.node.object_dictionary[0x1601][2].default = 0x64110110
+    bench.start()
+    assert "writing 0x1601:00 (mapping of the drive PDO, cleared) was refused: 0x06010002" in bench.driver.failure
+
+
+@pytest.mark.parametrize(("value", "sent"), [(0, [b"", b"", b""]), (2, [b"\1", b"\2", b"\1"])])
+def test_a_counter_of_sync_that_cannot_be_changed_is_followed(value, sent):
+    bench = Bench(DriverConfig())
+    overflow = bench.node.object_dictionary[0x1019]
+    overflow.default, overflow.access_type = value, "const"
+    bench.start()
+    assert (bench.driver.state, bench.driver.failure) == (DriverState.OPERATIONAL, "")
+    assert [bench.driver.sync(0).data for _ in sent] == sent
+
+
+PROVEN = {"vendor_id": 0x7078797A, "product_code": 3, "revision": 0x10000, "serial": 1, "digest": "sha256:" + 64 * "0"}
+
+
+@pytest.mark.parametrize("serial", [1, 2])
+@pytest.mark.parametrize(
+    ("index", "lines"),
+    [(0x6443, ("heartbeat lost", "leaving operational")), (0x6444, ("heartbeat lost",)), (0x1016, ("drive time-out",))],
+)
+def test_a_passed_report_stands_in_for_what_a_node_lacks_if_it_is_of_this_very_module(index, lines, serial):
+    config = DriverConfig(proven=ProvenModule(**{**PROVEN, "serial": serial, "lines": lines}))
+    bench = Bench(config, consumes=False)
+    del bench.node.object_dictionary[index]
+    bench.start()
+    accepted = serial == 1 and lines != ("heartbeat lost",)
+    assert bench.driver.state is (DriverState.OPERATIONAL if accepted else DriverState.FAILED)
+    assert (f"no 0x{index:04X}" in str(bench.driver.lost)) == accepted
+    assert ("it is of another module" in str(bench.driver.lost)) == (serial == 2)
+
+
+def test_a_module_that_is_known_is_not_tried_again():
+    bench = Bench(DriverConfig())
+    bench.start()
+    first_us = bench.t_us
+    bench.start()
+    assert bench.driver.state is DriverState.OPERATIONAL
+    assert bench.t_us - first_us < first_us - 50_000
+    del bench.node.object_dictionary[0x1018].subindices[4]  # a module without serial number may be another one
+    bench.consumes = False
+    bench.start()
+    assert bench.driver.state is DriverState.FAILED
+
+
+def test_other_pdos_and_channels():
+    config = DriverConfig(
+        drive_pdo=1, sense_pdo=3, drive_channels=(2, 3, 4), sense_channels=(5, 6, 7), protection=False, vendor_id="any"
+    )
+    bench = Bench(config)
+    dictionary = bench.node.object_dictionary
+    for there, wanted in ((0x1401, 0x1400), (0x1601, 0x1600), (0x1801, 0x1802), (0x1A01, 0x1A02)):
+        record = canopen.objectdictionary.ODRecord(f"of {wanted:X}", wanted)
+        for variable in dictionary[there].values():
+            moved = copy(variable)
+            moved.index, moved.parent = wanted, record
+            record.add_member(moved)
+        dictionary.add_object(record)
+    for index in (0x6443, 0x6444):
+        extra = copy(dictionary[index][3])
+        extra.subindex = 4
+        dictionary[index].add_member(extra)
+    bench.start()
+    assert (bench.driver.state, bench.driver.failure) == (DriverState.OPERATIONAL, "")
+    sdo = bench.node.sdo
+    assert (sdo[0x1400][1].raw, sdo[0x1802][1].raw) == (0x20A, 0x4000038A)
+    assert [sdo[0x1600][place].raw for place in (1, 2, 3)] == [0x64110210, 0x64110310, 0x64110410]
+    assert [sdo[0x1A02][place].raw for place in (1, 2, 3)] == [0x64010510, 0x64010610, 0x64010710]
+    assert bench.driver.drive((1, 2, 3), 0).can_id == 0x20A
+    bench.driver.sync(0)
+    bench.driver.receive(Frame(0x38A, b"\1\0\2\0\3\0"), 0)
+    assert bench.driver.sense.take() == (1, 2, 3, 0)
+    assert 'identity "any"' in bench.driver.lost[0]
+    assert "protection = false" in bench.driver.lost[1]
 
 
 def test_a_lost_answer_costs_one_time_out():

@@ -17,6 +17,7 @@ from scripted_node import (
     run_dialogue,
     started,
     text,
+    try_out,
 )
 
 from pkxyz_ctrl.can.codec import ProcessCodec
@@ -36,19 +37,19 @@ def test_start_up_word_for_word():
     assert driver.receive(heartbeat(OPERATIONAL), 1100) == ()  # from before the reset
     first = driver.receive(heartbeat(BOOT_UP), 2000)
     assert driver.state is DriverState.IDENTIFYING
+    assert text(first)[0] == PRE_OP  # where a node that starts by itself is not
     assert run_dialogue(driver, server, first) == [OUR_HEARTBEAT, START]
     assert driver.state is DriverState.STARTING
-    identity = ["40 00 10 00", "40 18 10 01", "40 18 10 02"]
-    last_written = list(dict.fromkeys(line[3:11] for line in WRITES))
-    read_back = [f"40 {where}" for where in last_written]
-    assert server.requests == [
-        *(f"{head} 00 00 00 00" for head in identity),
-        *WRITES,
-        *(f"{head} 00 00 00 00" for head in read_back),
-    ]
+    identity = ["00 10 00", "18 10 01", "18 10 02", "18 10 03", "18 10 04"]
+    written = {line[3:11] for line in WRITES}
+    asked, said = server.requests[: 5 + len(written)], server.requests[5 + len(written) :]
+    assert asked[:5] == [f"40 {where} 00 00 00 00" for where in identity]
+    assert {request[3:11] for request in asked[5:]} == written
+    assert {request[:2] for request in asked} == {"40"}
+    assert said == [*WRITES, *(f"40 {request[3:11]} 00 00 00 00" for request in asked[5:])]
     assert driver.receive(heartbeat(PRE_OPERATIONAL), 3000) == ()
     assert driver.state is DriverState.STARTING
-    driver.receive(heartbeat(OPERATIONAL), 4000)
+    try_out(driver, 4000)
     assert driver.state is DriverState.OPERATIONAL
     assert (driver.failure, driver.node_events) == ("", 0)
 
@@ -77,16 +78,13 @@ def test_frames_have_the_format_of_the_bus(fd):
         ("40 18 10 01 00 00 00 00", "43 18 10 01 01 00 00 00", "(vendor) is 0x00000001, expected 0x7078797A"),
         ("40 18 10 02 00 00 00 00", "43 18 10 02 09 00 00 00", "(product code) is 0x00000009, expected 0x00000003"),
         (
-            WRITES[7],
+            WRITES[6],
             "80 01 16 04 41 00 04 06",
             "0x06040041, object cannot be mapped to the PDO; does the amplifier have",
         ),
-        (WRITES[19], "80 43 64 01 00 00 02 06", "0x06020000, object does not exist"),
-        (
-            "40 44 64 02 00 00 00 00",
-            "43 44 64 02 01 00 00 00",
-            "read-back of error value of comb 2: 0 V) is 0x00000001",
-        ),
+        (WRITES[19], "80 43 64 01 22 00 00 08", "0x08000022, data cannot be transferred"),
+        ("40 17 10 00 00 00 00 00", "80 17 10 00 00 00 02 06", "no 0x1017 (heartbeat period): the amplifier must prod"),
+        ("40 44 64 02 00 00 00 00", "43 44 64 02 01 00 00 00", "read-back of error value of comb 2: 0 V) is 0x0000000"),
     ],
 )
 def test_start_up_ends_at_the_first_wrong_answer(asked, answer, expected):
@@ -96,7 +94,7 @@ def test_start_up_ends_at_the_first_wrong_answer(asked, answer, expected):
     assert driver.state is DriverState.FAILED
     assert driver.failure.startswith("amplifier (node 10): ")
     assert expected in driver.failure
-    assert server.requests[-1] == asked
+    assert asked in server.requests
     assert driver.poll(10**9) == ()
 
 
@@ -138,7 +136,9 @@ def test_no_boot_up():
     driver = AmplifierDriver(DriverConfig(boot_timeout_us=1000, retries=2))
     driver.start(0)
     assert [text(driver.poll(t_us)) for t_us in (999, 1000, 1999, 2000, 2999)] == [[], [RESET], [], [RESET], []]
-    assert driver.poll(3000) == ()
+    assert text(driver.poll(3000)) == [PRE_OP, "60a 40 00 10 00 00 00 00 00"]  # perhaps it is there all the same
+    for t_us in (53_000, 103_000, 153_000):
+        driver.poll(t_us)
     assert driver.state is DriverState.FAILED
     assert driver.failure == (
         "amplifier (node 10) sent no boot-up message 0x70A within 1 ms of NMT reset, 3 times; "
@@ -180,7 +180,7 @@ def test_a_second_boot_up_begins_the_dialogue_again_but_not_for_ever():
     driver = AmplifierDriver(DriverConfig(retries=2))
     driver.start(0)
     for _ in range(3):
-        assert text(driver.receive(heartbeat(BOOT_UP), 0)) == ["60a 40 00 10 00 00 00 00 00"]
+        assert text(driver.receive(heartbeat(BOOT_UP), 0)) == [PRE_OP, "60a 40 00 10 00 00 00 00 00"]
         assert driver.state is DriverState.IDENTIFYING
     assert driver.receive(heartbeat(BOOT_UP), 0) == ()
     assert driver.state is DriverState.FAILED

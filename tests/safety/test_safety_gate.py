@@ -12,9 +12,10 @@ from hypothesis import strategies as st
 
 from hil.lanes.wall import wall_gate
 from hil.runs.scenario import load_scenario
+from pkxyz_ctrl.can.codec import ProcessCodec
 from pkxyz_ctrl.can.driver_config import DriverConfig
 from pkxyz_ctrl.can.frame import FD, REMOTE, Frame
-from pkxyz_ctrl.can.sdo import request
+from pkxyz_ctrl.can.sdo import SdoStep, request
 from pkxyz_ctrl.can.startup import configuration_steps, identity_steps
 from pkxyz_ctrl.safety.gate import GateConfig, TransmitGate
 from pkxyz_ctrl.safety.modes import MAY_ENERGISE, Mode
@@ -268,9 +269,32 @@ def test_drivers_own_start_up_passes(protection: bool, mode: Mode) -> None:
         assert gate.check(Frame(0x600 + config.node_id, request(step), True, True), mode, T) is None
 
 
+def test_the_drive_frame_may_be_that_of_another_pdo_with_other_channels() -> None:
+    config = DriverConfig(drive_pdo=1, sense_pdo=1, drive_channels=(4, 2, 7), sense_channels=(9, 8, 7))
+    gate = TransmitGate(
+        GateConfig(count_max=100, count_slew_max=100, period_us=T, drive_pdo=1, drive_channels=(4, 2, 7))
+    )
+    for step in (*identity_steps(config), *configuration_steps(config, 1)):
+        assert gate.check(Frame(0x60A, request(step), True, True), Mode.BOOT, T) is None
+    for index, subindex, size, value in (
+        (0x1600, 1, 4, 0x64110110),
+        (0x1401, 1, 4, 0x30A),
+        (0x1401, 2, 1, 1),
+        (0x6443, 1, 1, 1),
+        (0x6444, 3, 4, 0),
+    ):
+        step = SdoStep(index, subindex, size, value, True, "", "")
+        assert gate.check(Frame(0x60A, request(step), True, True), Mode.BOOT, T) is not None
+    gate.clear()
+    drives = [Frame(can_id, ProcessCodec(can_id, True).encode((0, 0, 0), 0), True, True) for can_id in (0x20A, 0x30A)]
+    assert gate.check(drives[0], Mode.ENABLED, 2 * T) is None
+    assert "not in the list" in str(gate.check(drives[1], Mode.ENABLED, 3 * T))
+
+
 @pytest.mark.parametrize(
     ("changes", "named"),
     [
+        ({"drive_pdo": 5}, "drive_pdo"),
         ({"count_max": -1}, "count_max"),
         ({"count_max": 32768}, "count_max"),
         ({"count_max": 1.5}, "count_max"),
