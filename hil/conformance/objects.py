@@ -115,11 +115,11 @@ def _configuration(talker: Talker) -> str:
     for step in steps:
         if step.write:
             result = talker.write(step.index, step.subindex, step.value or 0, step.size)
-            if not result.ok:
+            if not result.ok and not step.optional:
                 deviations.append(f"{step.name} = 0x{step.value or 0:X}: {result.text}")
-        else:
+        elif step.value is not None:
             result = talker.read(step.index, step.subindex)
-            if result.unsigned != step.value:
+            if not result.ok or (result.unsigned ^ step.value) & ~step.alike:
                 deviations.append(f"{step.name}: {result.text}, not 0x{step.value or 0:X}")
     deviate_if(deviations)
     return f"{len(steps)} transfers as they should be"

@@ -263,10 +263,13 @@ class AmplifierDriver:
 
     def _on_emergency(self, data: bytes, t_us: int) -> None:
         emergency = decode_emergency(data, t_us)
-        if emergency is not None and not (emergency.code == _HEARTBEAT_ERROR and self.state in _TRIAL):
-            self.emergencies.append(emergency)
-            if not emergency.is_reset:
-                self.node_events |= NODE_EMERGENCY
+        if emergency is None:
+            return
+        if self.state in _TRIAL and (emergency.code == _HEARTBEAT_ERROR or emergency.is_reset):
+            return  # as it should be
+        self.emergencies.append(emergency)
+        if not emergency.is_reset:
+            self.node_events |= NODE_EMERGENCY
 
     def _on_foreign(self, received_id: int, data: bytes) -> None:
         """A frame that only we may send, and that we did not, since a controller does not receive its own.

@@ -134,6 +134,7 @@ class StartSequence:
         """A node that starts by itself (CiA 302-2, object 1F80h) is not configured while it is operational."""
         self.state = DriverState.IDENTIFYING
         self._deadline_us = _NEVER_US
+        self._found = {}
         return self._nmt(NmtCommand.PRE_OPERATIONAL), *self._ask(identity_steps(self._config), t_us)
 
     def _ask(self, steps: tuple[SdoStep, ...], t_us: int) -> Messages:
@@ -150,11 +151,16 @@ class StartSequence:
             return self._sdo(requests)
         if self.state is DriverState.IDENTIFYING:
             self.state, self._is_planned = DriverState.CONFIGURING, False
-            self._found = dialogue.values
+            self._found = dict(dialogue.values)
             return self._ask(survey(self._config), t_us)
         if not self._is_planned:
             return self._configure(t_us)
-        self.sync_overflow = dialogue.values.get((0x1019, 0), self._found.get((0x1019, 0))) or 0
+        overflow = dialogue.values.get((0x1019, 0), self._found.get((0x1019, 0))) or 0
+        if overflow == 1 or overflow > cob_id.SYNC_COUNTER_OVERFLOW:
+            return self._fail(
+                f"{self._name} counts SYNCs to {overflow} (0x1019), CiA 301 permits 2 to 240; see its manual"
+            )
+        self.sync_overflow = overflow
         self._repeats_left = self._config.retries
         return self._start(t_us)
 

@@ -181,7 +181,8 @@ def plan(config: DriverConfig, count_step_max: int, found: Found) -> Plan:
 def _writes(
     config: DriverConfig, count_step_max: int, found: Found, absent: Mapping[int, Setting]
 ) -> tuple[SdoStep, ...]:
-    first, last = [], []
+    first: list[SdoStep] = []
+    last: list[SdoStep] = []
     for pdo in _pdos(config):
         before, after = pdo.writes(found)
         first += before

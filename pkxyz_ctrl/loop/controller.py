@@ -8,9 +8,10 @@ from collections.abc import Callable
 import numpy as np
 from numpy.typing import NDArray
 
-from pkxyz_ctrl.can.driver import AmplifierDriver, DriverState
+from pkxyz_ctrl.can.driver import AmplifierDriver
 from pkxyz_ctrl.can.frame import Frame
 from pkxyz_ctrl.can.other_traffic import OtherTraffic
+from pkxyz_ctrl.can.start_sequence import DriverState
 from pkxyz_ctrl.config.bus import BusConfig, CanConfig
 from pkxyz_ctrl.loop import cycle as cycling
 from pkxyz_ctrl.loop.period import period_on

@@ -28,11 +28,11 @@ from pkxyz_ctrl.can.driver import (
     NODE_NOT_OPERATIONAL,
     NODE_REBOOTED,
     AmplifierDriver,
-    DriverState,
 )
 from pkxyz_ctrl.can.driver_config import DriverConfig
 from pkxyz_ctrl.can.frame import Frame
 from pkxyz_ctrl.can.sense_input import SENSE_MISSING
+from pkxyz_ctrl.can.start_sequence import DriverState
 
 # -- the loop ---------------------------------------------------------------------------------------------------------
 

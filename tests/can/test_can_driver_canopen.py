@@ -12,10 +12,11 @@ import canopen
 import pytest
 
 from pkxyz_ctrl.can.codec import crc8
-from pkxyz_ctrl.can.driver import NODE_REBOOTED, AmplifierDriver, DriverState
+from pkxyz_ctrl.can.driver import NODE_REBOOTED, AmplifierDriver
 from pkxyz_ctrl.can.driver_config import DriverConfig, ProvenModule
 from pkxyz_ctrl.can.frame import Frame
 from pkxyz_ctrl.can.sense_input import SENSE_COUNTER, SENSE_MISSING
+from pkxyz_ctrl.can.start_sequence import DriverState
 
 EDS = str(Path(__file__).resolve().parents[2] / "configs" / "comb_amplifier.eds")
 FRAME_US = 100

@@ -9,9 +9,10 @@ from hil.bus.clock import Lockstep
 from hil.bus.wire import Wire
 from hil.node.amplifier import AmplifierNode, NmtState
 from hil.node.sense import Plant
-from pkxyz_ctrl.can.driver import AmplifierDriver, DriverState
+from pkxyz_ctrl.can.driver import AmplifierDriver
 from pkxyz_ctrl.can.driver_config import DriverConfig
 from pkxyz_ctrl.can.frame import Frame
+from pkxyz_ctrl.can.start_sequence import DriverState
 from sim.config import PlantConfig
 from sim.config.device import Device
 from sim.plant import Plant as SimPlant

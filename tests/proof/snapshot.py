@@ -27,8 +27,8 @@ import numpy as np
 
 from hil.node.amplifier import AmplifierNode
 from hil.node.object_dictionary import ObjectDictionary
-from pkxyz_ctrl.can.driver import DriverState
 from pkxyz_ctrl.can.sdo import SdoDialogue
+from pkxyz_ctrl.can.start_sequence import DriverState, StartSequence
 from pkxyz_ctrl.loop.controller import Controller
 
 DRIVE_ID = 0x30A
@@ -43,14 +43,17 @@ UNREAD = {
     ("Controller", "_drive_counts"),  # written by compute, read by finish; in between no state is taken
     ("TransmitGate", "blocked_frames"),
     ("AmplifierDriver", "emergencies"),
-    ("SdoDialogue", "values"),
+    ("AmplifierDriver", "lost"),
+    ("StartSequence", "lost"),
+    ("StartSequence", "_never_booted"),  # words
     ("DriveReceiver", "crc"),
     ("SenseTransmitter", "crc"),
     ("SenseTransmitter", "counts"),
     ("SenseTransmitter", "_sent"),
     ("Alarm", "_armed_us"),  # not after due_us, where it only goes back to sleep
     ("SdoServer", "_multiplexer"),  # of a segmented transfer, which nobody begins
-    ("AmplifierDriver", "_dialogue"),  # read in two states; `key` adds it there
+    ("StartSequence", "_dialogue"),  # read in two states; `key` adds it there
+    ("StartSequence", "_found"),
     ("Lockstep", "_order"),
     ("Lockstep", "now_us"),
     ("Lockstep", "running"),
@@ -63,6 +66,7 @@ TEXTS = {
     ("Controller", "_blocked"),
     ("TransmitGate", "latched"),
     ("AmplifierDriver", "failure"),
+    ("StartSequence", "failure"),
     ("SdoDialogue", "failure"),
 }
 INSTANTS = {("TransmitGate", "_time_us"), ("Alarm", "due_us")}
@@ -88,7 +92,6 @@ CONSTANT = {
     "_w2",
     "_rows",
     "_formats",
-    "_sync_frames",
     "_heartbeat_frame",
     "_sense_id",
     "_drive_id",
@@ -117,6 +120,9 @@ CONSTANT = {
     "_protected",
     "_limit",
     "config",
+    "_config",
+    "_heartbeat",
+    "_written",
     "can",
     "law",
     "memory",
@@ -150,7 +156,7 @@ def _is_constant(kind: str, name: str, value: object) -> bool:
     if kind in CONSTANT_KINDS or name in CONSTANT:
         return True
     if (kind, name) in {
-        ("AmplifierDriver", "_dialogue"),
+        ("StartSequence", "_dialogue"),
         ("DriveReceiver", "receive"),
         ("AmplifierNode", "_receivers"),
     }:
@@ -191,6 +197,7 @@ RULES = {
     ("", "_receivers"): "tuple(sorted([(i, f.__name__) for i, f in {x}.items()]))",
     ("", "_sync_following"): "len({x})",
     ("", "_w3"): "{x} is None",
+    ("", "_sync_frames"): "len({x})",
     ("", "_layout"): "len({x}.fields)",
 }
 _PLAIN = {int, bool, bytes, str, type(None)}
@@ -199,8 +206,10 @@ _PLAIN = {int, bool, bytes, str, type(None)}
 _IN_DIALOGUE = (DriverState.IDENTIFYING, DriverState.CONFIGURING)
 
 
-def _dialogue(v: SdoDialogue, now_us: int) -> Any:
-    return len(v._steps), v._position, v._tries, bool(v.failure), max(v._deadline_us - now_us, -1)
+def _dialogue(s: StartSequence, now_us: int) -> Any:
+    v = s._dialogue
+    told = plain(s._found), plain(v.values)
+    return len(v._steps), v._position, v._tries, bool(v.failure), max(v._deadline_us - now_us, -1), told
 
 
 def plain(v: Any) -> Any:
@@ -262,6 +271,7 @@ class Snapshot:
     def __init__(self, attributes: list[tuple[Any, str, str]], controller: Controller, node: AmplifierNode) -> None:
         self.attributes = attributes
         self._driver, self._node = controller.driver, node
+        self._start_up = controller.driver._start_up
         self._memory = controller.memory
         self._safe_cycles = int(controller.law["limits"]["safe_cycles"][0])
         self._bytes = controller.memory.view(np.uint8)
@@ -293,8 +303,9 @@ class Snapshot:
         return space["read"], space["write"], space["name"]
 
     def take(self) -> tuple[Any, ...]:
-        dialogue = self._driver._dialogue
-        state = dialogue._position, dialogue._tries, dialogue._deadline_us, dialogue.failure
+        dialogue = self._start_up._dialogue
+        told = dialogue.values.copy()
+        state = dialogue._position, dialogue._tries, dialogue._deadline_us, dialogue.failure, told
         values = tuple(map(self._value_of, self._entries))
         if values != self._dictionary[0]:
             self._dictionary = values, marshal.dumps([values[i] for i in self._named], 2)
@@ -303,7 +314,8 @@ class Snapshot:
     def put(self, taken: tuple[Any, ...]) -> None:
         held, (dialogue, state), dictionary, memory = taken
         self._write(held)
-        dialogue._position, dialogue._tries, dialogue._deadline_us, dialogue.failure = state
+        dialogue._position, dialogue._tries, dialogue._deadline_us, dialogue.failure, told = state
+        dialogue.values = told.copy()
         for entry, value in zip(self._entries, dictionary[0], strict=True):
             entry.value = value
         self._bytes[:] = np.frombuffer(memory, np.uint8)
@@ -314,8 +326,7 @@ class Snapshot:
         homing = int(record["homing_count"]) if record["mode"] == 3 else 0
         named = self._name(held, bases.now_us, bases.drive, bases.sense, bases.sync)
         memory = (self._bytes & self._mask).tobytes()
-        driver = self._driver
-        dialogue = _dialogue(driver._dialogue, bases.now_us) if driver.state in _IN_DIALOGUE else None
+        dialogue = _dialogue(self._start_up, bases.now_us) if self._driver.state in _IN_DIALOGUE else None
         parts = (more, named, homing, dialogue, min(int(record["safe_cycles"]), self._safe_cycles), memory)
         digest = hashlib.blake2b(marshal.dumps(parts, 2), digest_size=12)
         digest.update(dictionary[1])

@@ -17,8 +17,9 @@ from world import CONFIGURATIONS, LEVELS, Configuration, World, learnt
 from hil.node.amplifier import AmplifierNode
 from hil.node.drive import DriveReceiver
 from hil.node.heartbeat import HeartbeatConsumer
-from pkxyz_ctrl.can.driver import AmplifierDriver, DriverState
+from pkxyz_ctrl.can.driver import AmplifierDriver
 from pkxyz_ctrl.can.frame import Frame
+from pkxyz_ctrl.can.start_sequence import DriverState, StartSequence
 from pkxyz_ctrl.loop.controller import Controller
 from pkxyz_ctrl.safety.gate import TransmitGate
 from pkxyz_ctrl.safety.modes import Event, Mode
@@ -140,6 +141,16 @@ def _no_crc(patch: pytest.MonkeyPatch) -> None:
     _no_step_limit(patch)
 
 
+def _believes_what_is_written(patch: pytest.MonkeyPatch) -> None:
+    """A start-up that tries nothing: whoever stores 0x1016 is taken to act on it."""
+    patch.setattr(StartSequence, "_is_tried", property(lambda start_up: True, lambda start_up, value: None), raising=False)
+
+
+def _started_untried(patch: pytest.MonkeyPatch) -> None:
+    _deaf_to_silence(patch)
+    _believes_what_is_written(patch)
+
+
 def _deaf_to_silence(patch: pytest.MonkeyPatch) -> None:
     """A node without any time-out: what it holds, it holds for as long as nothing comes."""
     patch.setattr(AmplifierNode, "_count_silence", lambda node, t_us: None)
@@ -178,12 +189,24 @@ PLANTED: dict[str, tuple[Plant, str]] = {
     "node without a step limit": (_no_step_limit, "a step from"),
     "start-up that has to be seen": (_old_start_up, "a start-up can go on for ever"),
     "node without a CRC": (_no_crc, "a step from"),
-    "node without time-outs": (_deaf_to_silence, "ticks after the decision"),
+    "node without time-outs, not tried": (_started_untried, "ticks after the decision"),
     "voltage in every mode": (_unhomed, "a voltage is sent"),
     "nobody can clear": (_no_way_back, "no way leads back"),
     "no gate": (_no_gate, "a step from|beyond 0"),
     "node that keeps its voltage": (_keeps_its_voltage, "ticks after the decision|gate takes combs"),
 }
+
+
+def test_a_node_without_time_outs_never_has_a_voltage(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Its start-up ends where our heartbeat is left out on purpose, whatever else goes wrong."""
+    learnt(ONE)
+    _deaf_to_silence(monkeypatch)
+    met = set()
+    found = explore(ONE, look=lambda world: met.add((world.plant.counts, world.controller.mode)))
+    assert not found.violation
+    assert found.is_complete
+    assert {counts for counts, _ in met} == {(0, 0, 0)}
+    assert {mode for _, mode in met} <= {Mode.BOOT, Mode.PRE_OPERATIONAL}
 
 
 @pytest.mark.parametrize("name", PLANTED)

@@ -12,7 +12,7 @@ matter of the sizes in `CONFIGURATIONS`.
 """
 
 from collections import deque
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cache
 from typing import Any, Final, NamedTuple
 
@@ -23,13 +23,12 @@ from snapshot import Attributes, Bases, Snapshot
 from hil.bus.clock import Lockstep
 from hil.node.amplifier import AmplifierNode, NmtState
 from hil.node.emergency import FrameErrors
-from pkxyz_ctrl.can import driver as driver_module
-from pkxyz_ctrl.can import sense_input, startup
+from pkxyz_ctrl.can import sense_input, start_sequence, startup
 from pkxyz_ctrl.can.codec import Counts, ProcessCodec
-from pkxyz_ctrl.can.driver import DriverState
 from pkxyz_ctrl.can.driver_config import DriverConfig
 from pkxyz_ctrl.can.frame import Frame
 from pkxyz_ctrl.can.sdo import SdoStep
+from pkxyz_ctrl.can.start_sequence import DriverState
 from pkxyz_ctrl.config.bus import BusConfig
 from pkxyz_ctrl.config.files import load
 from pkxyz_ctrl.loop.controller import Controller, StartUpError
@@ -140,7 +139,8 @@ class World:
     def __init__(self, configuration: Configuration, attributes: Attributes | None = None) -> None:
         sense_input._SYNCS_UNCOUNTABLE = 4
         FrameErrors.HOLD_US = 30_000
-        driver_module.configuration_steps = startup.configuration_steps if configuration.whole_dialogue else _few_steps
+        start_sequence.survey = startup.survey if configuration.whole_dialogue else _few_questions
+        start_sequence.plan = startup.plan if configuration.whole_dialogue else _few_writes
         self.configuration = configuration
         bus = _bus(configuration)
         assert bus.can is not None
@@ -237,7 +237,7 @@ class World:
     def is_landmark(self) -> bool:
         """Where ways meet again although nothing is to be decided: before a tick, and now and then in the dialogue."""
         if self.wire:
-            return self.wire[0].can_id == REQUEST and self.controller.driver._dialogue._position % 6 == 0
+            return self.wire[0].can_id == REQUEST and self.controller.driver._start_up._dialogue._position % 6 == 0
         return self.phase == "before"
 
     # -- what may happen -----------------------------------------------------------------------------------------
@@ -515,15 +515,25 @@ def damaged(frame: Frame) -> list[Frame]:
     return [Frame._make((can_id, payload, flags)) for payload in made]
 
 
-OF_EACH_SORT = {0x1401: (1,), 0x2010: (0,), 0x2011: (0,), 0x2012: (0,), 0x1016: (1,), 0x1017: (0,), 0x1019: (0,)}
+OF_EACH_SORT = {0x2010: (0,), 0x2011: (0,), 0x2012: (0,), 0x1016: (1,), 0x1017: (0,), 0x1019: (0,)}
 
 
-def _few_steps(config: DriverConfig, count_step_max: int) -> tuple[SdoStep, ...]:
-    """Of the shipped steps, in their order, those that change what the node does from then on; what the others write is
-    the default of the EDS. The dialogue treats all alike, and remembers nothing of one but that it is done.
+def _of_each_sort(steps: tuple[SdoStep, ...]) -> tuple[SdoStep, ...]:
+    """Of the shipped steps, in their order, those that change what the node does from then on; what the others ask for
+    is the default of the EDS, so nothing of it is written. The dialogue treats all alike, and remembers nothing of one
+    but its answer.
     """
-    steps = startup.configuration_steps(config, count_step_max)
-    return tuple(step for step in steps if step.subindex in OF_EACH_SORT.get(step.index, ()))
+    return tuple(step for step in steps if step.index == 0x1018 or step.subindex in OF_EACH_SORT.get(step.index, ()))
+
+
+def _few_questions(config: DriverConfig) -> tuple[SdoStep, ...]:
+    return _of_each_sort(startup.survey(config))
+
+
+def _few_writes(config: DriverConfig, count_step_max: int, found: startup.Found) -> startup.Plan:
+    answered = {setting.key: setting.value for setting in startup.settings(config, count_step_max)}
+    planned = startup.plan(config, count_step_max, answered | dict(found))
+    return replace(planned, steps=_of_each_sort(planned.steps))
 
 
 @cache

@@ -108,7 +108,7 @@ class GateSweep(ABC):
 
     @pytest.mark.parametrize("fill", [0x00, 0x40, 0xFF])
     def test_every_identifier_with_every_length(self, fill: int) -> None:
-        """0x40 fills are well-formed for SYNC alone, no bytes at all as well (and an SDO read must have empty bytes behind)."""
+        """No bytes, and 0x40, are well-formed for SYNC alone (an SDO read must have empty bytes behind)."""
         frames = (
             (str(length), Frame(can_id, bytes([fill]) * length, True, True))
             for can_id in range(2048)
