@@ -60,6 +60,7 @@ class StartSequence:
         self._found: dict[Key, int | None] = {}
         self._identity: tuple[int | None, ...] = ()
         self._is_tried = False
+        self._times_left = 0
         self._tried_identity: tuple[int | None, ...] = ()
 
     def begin(self, t_us: int) -> Messages:
@@ -95,11 +96,7 @@ class StartSequence:
             return self._boot_up(t_us)
         if self.state is DriverState.STARTING and node_state == NmtState.OPERATIONAL:
             return self._started(t_us)
-        if self.state is DriverState.TRYING and node_state != NmtState.OPERATIONAL:
-            self._is_tried, self._tried_identity = True, self._identity
-            self._repeats_left = self._config.retries
-            return self._start(t_us)
-        return _NOTHING
+        return self._left_or_not(node_state, t_us) if self.state is DriverState.TRYING else _NOTHING
 
     # -- reset ------------------------------------------------------------------------------------------------------
 
@@ -192,10 +189,19 @@ class StartSequence:
             self.state = DriverState.OPERATIONAL
             self._deadline_us = _NEVER_US
             return _NOTHING
-        config = self._config
         self.state = DriverState.TRYING
-        self._deadline_us = t_us + 1000 * (config.controller_heartbeat_timeout_ms + config.node_heartbeat_timeout_ms)
+        self._times_left = 0
+        self._deadline_us = t_us + 1000 * self._trial_ms
         return _NOTHING
+
+    def _left_or_not(self, node_state: int, t_us: int) -> Messages:
+        """It has left once it says so twice: one heartbeat may be damaged, late, or somebody else's."""
+        self._times_left = self._times_left + 1 if node_state != NmtState.OPERATIONAL else 0
+        if self._times_left < 2:
+            return _NOTHING
+        self._is_tried, self._tried_identity = True, self._identity
+        self._repeats_left = self._config.retries
+        return self._start(t_us)
 
     def _start_timed_out(self, t_us: int) -> Messages:
         if self._repeats_left > 0:
@@ -208,15 +214,21 @@ class StartSequence:
         )
 
     def _trial_timed_out(self) -> Messages:
-        config = self._config
         return self._fail(
-            f"{self._name} did not notice that our heartbeat ended: "
-            f"{config.controller_heartbeat_timeout_ms + config.node_heartbeat_timeout_ms} ms later {self._heard}. "
+            f"{self._name} did not notice that our heartbeat ended: {self._trial_ms} ms later {self._heard}. "
             "It may store 0x1016 and 0x1029 and do nothing with them: it would hold its combs at a voltage for ever",
             self._nmt(NmtCommand.PRE_OPERATIONAL),
         )
 
     # -- small things -----------------------------------------------------------------------------------------------
+
+    @property
+    def _trial_ms(self) -> int:
+        """The node's consumer, and then two heartbeats of its own."""
+        config = self._config
+        return (
+            config.controller_heartbeat_timeout_ms + config.node_heartbeat_period_ms + config.node_heartbeat_timeout_ms
+        )
 
     @property
     def _heard(self) -> str:

@@ -143,7 +143,9 @@ def _no_crc(patch: pytest.MonkeyPatch) -> None:
 
 def _believes_what_is_written(patch: pytest.MonkeyPatch) -> None:
     """A start-up that tries nothing: whoever stores 0x1016 is taken to act on it."""
-    patch.setattr(StartSequence, "_is_tried", property(lambda start_up: True, lambda start_up, value: None), raising=False)
+    patch.setattr(
+        StartSequence, "_is_tried", property(lambda start_up: True, lambda start_up, value: None), raising=False
+    )
 
 
 def _started_untried(patch: pytest.MonkeyPatch) -> None:
