@@ -146,6 +146,7 @@ class AmplifierNode:
             return
         if self.state is NmtState.OPERATIONAL:
             self._sense.stop()
+            self._drive_deadline.cancel()
             self._outputs_to_error_value()
         self.state = state
         self._sync_expected = None
@@ -255,23 +256,27 @@ class AmplifierNode:
                 )
                 self._release_combs()
                 return
-            self._drive_deadline.set(t_us + self._drive_timeout_us)
+        self._drive_deadline.set(t_us + self._drive_timeout_us)
         self._drive.pending = None
         self._silent_syncs = 0
         self.outputs = counts
         self._plant.drive(counts)
 
     def _count_silence(self, t_us: int) -> None:
-        """A cycle without a valid drive PDO. After as many as object 0x2010 says, energised combs are released."""
+        """A cycle without a valid drive PDO. After as many as object 0x2010 says it is told, and energised combs are
+        released.
+        """
         self._silent_syncs = silent = self._silent_syncs + 1
-        if silent == self.od[0x2010, 0] and any(self.outputs):
-            self._drive_errors.bad(ErrorCode.DRIVE_MISSING, t_us, bytes((silent,)))
-            self._release_combs()
+        if silent == self.od[0x2010, 0]:
+            self._miss_drive(t_us, bytes((silent,)))
 
     def _drive_overdue(self, now_us: int) -> None:
         """Nothing was applied for as long as 0x2012 says, whatever has become of SYNC."""
+        self._miss_drive(now_us, b"")
+
+    def _miss_drive(self, t_us: int, info: bytes) -> None:
+        self._drive_errors.bad(ErrorCode.DRIVE_MISSING, t_us, info)
         if any(self.outputs):
-            self._drive_errors.bad(ErrorCode.DRIVE_MISSING, now_us, b"")
             self._release_combs()
 
     def _release_combs(self) -> None:

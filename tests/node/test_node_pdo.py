@@ -124,7 +124,8 @@ def test_a_bad_drive_pdo_is_not_applied_and_is_reported_once(data: bytes, code: 
         rig.run(100)
     assert rig.plant.driven == []
     assert emergencies(rig)[0] == code
-    assert len(rig.of(EMCY)) <= 2  # a frame that repeats has a wrong counter as well
+    assert set(emergencies(rig)) <= {code, COUNTER, 0x8250}  # repeated, its counter is wrong, and none is applied
+    assert len(rig.of(EMCY)) <= 3
     assert rig.node.state is NmtState.OPERATIONAL
 
 
@@ -410,11 +411,35 @@ def test_a_frame_before_the_first_sync_of_a_new_start_is_not_late_for_one_of_bef
     assert (rig.node.outputs, emergencies(rig)) == ((6, 6, 6), [])
 
 
-def test_nothing_is_missed_at_zero_volts() -> None:
+def test_that_none_arrives_is_said_at_zero_volts_too_and_nothing_else_comes_of_it() -> None:
+    """Or a controller that commands 0 V would never hear that its drive PDOs do not arrive."""
     rig = operational()
-    for _ in range(50):
+    for cycle in range(1, 50):
         rig.cycle()
-    assert (rig.plant.driven, rig.of(EMCY)) == ([], [])
+        assert bool(rig.of(EMCY)) == (cycle >= rig.node.od[0x2010, 0])
+    assert (rig.plant.driven, emergencies(rig)) == ([], [0x8250])
+    rig.drive((5, 5, 5))  # no combs were released, so no 0 V is asked for first; it is the first, so it is not late
+    rig.sync()
+    assert rig.node.outputs == (5, 5, 5)
+
+
+def test_at_zero_volts_the_time_without_a_drive_pdo_is_watched_once_one_has_come() -> None:
+    rig = operational()
+    limit_us = 1000 * rig.node.od[0x2012, 0]
+    rig.run(3 * limit_us)
+    assert rig.of(EMCY) == []
+    rig.drive(ZERO)
+    rig.sync()
+    rig.run(limit_us - 1000)
+    assert rig.of(EMCY) == []
+    rig.run(2000)
+    assert emergencies(rig) == [0x8250]
+    rig.forget()
+    rig.cycle(ZERO)
+    rig.cycle(ZERO)
+    rig.nmt(128)
+    rig.run(200_000)
+    assert 0x8250 not in emergencies(rig)  # outside operational nobody sends any
 
 
 def test_error_mode_and_value_of_each_comb() -> None:
@@ -472,9 +497,10 @@ def test_sync_counter_wraps_where_configured(last: int) -> None:
     for k in range(3 * last):
         rig.give(SYNC, bytes((k % last + 1,)))
         rig.run(100)
-    assert (len(rig.of(SENSE)), rig.of(EMCY)) == (3 * last, [])
+    assert (len(rig.of(SENSE)), emergencies(rig)) == (3 * last, [0x8250])  # no drive PDO came
     rig.give(SYNC, bytes((last + 1,)))
-    assert emergencies(rig) == [0x8240]
+    rig.run(2000)
+    assert emergencies(rig) == [0x8250, 0x8240]
 
 
 def test_sync_without_counter_and_with_another_identifier() -> None:
