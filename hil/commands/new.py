@@ -1,10 +1,11 @@
 """``pkxyz new``: a commented file to start from, which runs as it is written."""
 
+import json
 import re
 import shutil
 from enum import StrEnum
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated
+from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
@@ -41,6 +42,9 @@ def new(
     kind: Annotated[Kind, typer.Argument(help="What the file is about.")],
     file: Annotated[Path, typer.Argument(help="File to write, ending in .toml; an existing one is left alone.")],
     like: Annotated[str | None, typer.Option(help="Shipped file, or one of your own, to begin with.")] = None,
+    eds: Annotated[
+        Path | None, typer.Option(help="Of a bus: the amplifier's EDS, for identity, PDO numbers and channels.")
+    ] = None,
 ) -> None:
     """Write a commented file that runs as it is, to be changed from there."""
     if file.suffix != ".toml":
@@ -49,15 +53,48 @@ def new(
         raise ConfigError(f"{file}: is there already and is left alone; give another name or remove it")
     folder, model = _FOLDERS[kind], _model(kind)
     source = find(folder, like or _LIKE[kind])
-    load(folder, source, model)
+    begun = load(folder, source, model)
     command = _RUNS[kind].format(file=file)
+    text = commented(source, model, file.stem, command)
+    if eds is not None:
+        text = _with_settings(text, _from_eds(begun, eds), eds.name)
     with writing(file):
         file.parent.mkdir(parents=True, exist_ok=True)
-        file.write_text(commented(source, model, file.stem, command), encoding="utf-8")
+        file.write_text(text, encoding="utf-8")
         for name in _tables_of(source):
             if not (file.parent / name).exists():
                 shutil.copyfile(source.parent / name, file.parent / name)
     say(f"{file}: as {source.stem}, with comments; run it with: {command}")
+
+
+def _from_eds(begun: "BaseModel", eds: Path) -> dict[str, Any]:
+    from hil.conformance.from_eds import settings_from_eds
+    from pkxyz_ctrl.config.bus import BusConfig
+
+    if not isinstance(begun, BusConfig) or begun.can is None:
+        raise ConfigError("--eds: an EDS is about the amplifier of a bus with [can]")
+    return settings_from_eds(eds, begun.can.driver.node_id)
+
+
+def _with_settings(text: str, settings: dict[str, Any], origin: str) -> str:
+    """The text of a bus with other values in [can.driver], where they came from in a comment."""
+    lines, table = [], ""
+    for line in text.splitlines():
+        if header := _TABLE.match(line):
+            table = header[1]
+        key = _ENTRY.match(line)
+        if table == "can.driver" and key is not None and key[1] in settings:
+            continue
+        lines.append(line)
+        if header and table == "can.driver":
+            lines += [f"{f'{key} = {_toml(value)}':<35} # {origin}" for key, value in settings.items()]
+    return "\n".join(lines) + "\n"
+
+
+def _toml(value: Any) -> str:
+    if isinstance(value, int) and not isinstance(value, bool) and value > 9:
+        return f"0x{value:08X}"
+    return json.dumps(value)
 
 
 def commented(source: Path, model: "type[BaseModel]", name: str, command: str) -> str:

@@ -7,8 +7,8 @@ from hil.conformance.eds import Variable
 from hil.conformance.sdo_client import SdoResult, upload_request
 from hil.conformance.talker import Talker
 from hil.conformance.verdict import OUR_CONTRACT, Check
-from pkxyz_ctrl.can.sdo import abort_text
-from pkxyz_ctrl.can.startup import configuration_steps, identity_steps
+from pkxyz_ctrl.can.sdo import NO_SUCH_OBJECT, abort_text
+from pkxyz_ctrl.can.startup import identity_steps, plan, survey
 
 _ABSENT_INDEX = 0x5FFF  # last of the manufacturer's area
 _NO_OBJECT, _NO_SUBINDEX = 0x06020000, 0x06090011
@@ -52,8 +52,9 @@ def _objects_read(talker: Talker) -> str:
 
 
 def _is_there(variable: Variable, result: SdoResult) -> bool:
-    """An error that has not happened is no data: that object exists all the same."""
-    return result.ok or (variable.index == 0x1003 and variable.subindex > 0 and result.abort in _NO_ERROR_YET)
+    """An error that has not happened is no data, and a file is long: such an object exists all the same."""
+    is_no_error = variable.index == 0x1003 and variable.subindex > 0 and result.abort in _NO_ERROR_YET
+    return result.ok or result.is_cut or is_no_error
 
 
 def _read_values(talker: Talker) -> Iterator[tuple[Variable, bytes]]:
@@ -110,9 +111,20 @@ def _writable(talker: Talker) -> str:
 
 
 def _configuration(talker: Talker) -> str:
+    """As the driver does it: what differs is written; what is not there may be done without, or not."""
     talker.reset()
-    deviations, steps = [], configuration_steps(talker.driver)
-    for step in steps:
+    found: dict[tuple[int, int], int | None] = {}
+    for step in survey(talker.driver):
+        result = talker.read(step.index, step.subindex)
+        if result.ok:
+            found[step.index, step.subindex] = result.unsigned
+        elif result.abort in NO_SUCH_OBJECT:
+            found[step.index, step.subindex] = None
+    planned = plan(talker.driver, 32767, found)
+    if planned.refusal:
+        raise DeviationError(planned.refusal)
+    deviations = []
+    for step in planned.steps:
         if step.write:
             result = talker.write(step.index, step.subindex, step.value or 0, step.size)
             if not result.ok and not step.optional:
@@ -122,13 +134,13 @@ def _configuration(talker: Talker) -> str:
             if not result.ok or (result.unsigned ^ step.value) & ~step.alike:
                 deviations.append(f"{step.name}: {result.text}, not 0x{step.value or 0:X}")
     deviate_if(deviations)
-    return f"{len(steps)} transfers as they should be"
+    return "; ".join((f"{len(found)} values asked for, {len(planned.steps)} transfers", *planned.lost))
 
 
 def _mapping_in_use(talker: Talker) -> str:
     talker.operational()
     deviations = []
-    for index in (0x1601, 0x1A01):
+    for index in (talker.drive_parameter + 0x200, talker.sense_parameter + 0x200):
         result = talker.write(index, 0, 0, 1)
         if result.abort not in _IN_USE:
             deviations.append(f"0x{index:04X}:00 = 0: {result.text}")

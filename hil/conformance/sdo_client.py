@@ -9,7 +9,7 @@ from pkxyz_ctrl.can.sdo import abort_text
 Exchange = Callable[[bytes], bytes | None]
 """Sends one request of eight bytes; the reply of eight bytes, None if none came in time."""
 
-_SEGMENTS_MAX = 40  # 280 bytes: no object of this profile is longer; a server that never ends is cut off
+_SEGMENTS_MAX = 40  # 280 bytes: no object of this profile is longer, but an EDS in one is; such a one is cut off
 
 
 @dataclass(frozen=True)
@@ -19,6 +19,8 @@ class SdoResult:
     data: bytes | None
     abort: int = 0
     trouble: str = ""
+    is_cut: bool = False
+    """It was longer than anybody wants to know."""
 
     @property
     def ok(self) -> bool:
@@ -80,7 +82,7 @@ def read(exchange: Exchange, index: int, subindex: int) -> SdoResult:
         if segment[0] & 1:
             return SdoResult(data)
         toggle ^= 1
-    return SdoResult(None, trouble=f"more than {7 * _SEGMENTS_MAX} bytes")
+    return SdoResult(None, trouble=f"more than {7 * _SEGMENTS_MAX} bytes", is_cut=True)
 
 
 def write(exchange: Exchange, index: int, subindex: int, data: bytes) -> SdoResult:

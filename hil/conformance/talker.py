@@ -61,8 +61,12 @@ class Talker:
         self.node_id = node
         self.heartbeat_id = cob_id.HEARTBEAT_BASE + node
         self.emergency_id = cob_id.EMCY_BASE + node
-        self.sense_id = cob_id.SENSE_BASE + node
-        self.drive_id = cob_id.DRIVE_BASE + node
+        self.sense_id = cob_id.sense(node, self.driver.sense_pdo)
+        self.drive_id = cob_id.drive(node, self.driver.drive_pdo)
+        self.sense_parameter = 0x1800 + self.driver.sense_pdo - 1
+        self.drive_parameter = 0x1400 + self.driver.drive_pdo - 1
+        self.sync_overflow = cob_id.SYNC_COUNTER_OVERFLOW
+        """Of the node's SYNC counter; 0: its SYNC has none."""
         self.drive_codec = ProcessCodec(self.drive_id, self.driver.protection)
         self.sense_codec = ProcessCodec(self.sense_id, self.driver.protection)
         self.heard: list[tuple[int, Frame]] = []
@@ -179,6 +183,8 @@ class Talker:
         for step in configuration_steps(unhurried):
             if step.write and step.value is not None:
                 self.write(step.index, step.subindex, step.value, step.size)
+        overflow = self.read(0x1019, 0)
+        self.sync_overflow = overflow.unsigned if overflow.ok else 0
         self.beating = True
         self._beat_us = self.now_us
         self.run(SETTLE_US)
@@ -189,8 +195,11 @@ class Talker:
     def sync(self, data: bytes | None = None) -> int:
         """Send SYNC, its counter one on unless ``data`` is given; the time just before."""
         begin_us = self.now_us  # not after: a process that is held up there would find the answer before the question
-        self._sync_counter = self._sync_counter % cob_id.SYNC_COUNTER_OVERFLOW + 1
-        self.send(cob_id.SYNC, bytes((self._sync_counter,)) if data is None else data)
+        counted = b""
+        if self.sync_overflow:
+            self._sync_counter = self._sync_counter % self.sync_overflow + 1
+            counted = bytes((self._sync_counter,))
+        self.send(cob_id.SYNC, counted if data is None else data)
         return begin_us
 
     def next_drive(self, counts: Counts = ZERO) -> bytes:
@@ -218,7 +227,7 @@ class Talker:
 
     def outputs(self) -> Counts:
         """0x6411 as the node tells it. Raises UndecidedError if it does not."""
-        outcomes = [self.read(0x6411, comb) for comb in (1, 2, 3)]
+        outcomes = [self.read(0x6411, channel) for channel in self.driver.drive_channels]
         if silent := next((result for result in outcomes if not result.ok), None):
             raise UndecidedError(f"0x6411 cannot be read ({silent.text}): hold a voltmeter to the terminals")
         a, b, c = (result.unsigned for result in outcomes)

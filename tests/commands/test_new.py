@@ -10,6 +10,7 @@ from command_line import pkxyz
 from hil.commands.new import _FOLDERS, Kind, _model, commented
 from hil.runs.metrics import RowFigures
 from hil.screen.figures import error_lines, where_to_read
+from pkxyz_ctrl.config.bus import BusConfig
 from pkxyz_ctrl.config.files import CONFIG_DIR, load, names
 
 SHIPPED = [(kind, name) for kind in Kind for name in names(_FOLDERS[kind])]
@@ -107,3 +108,16 @@ def test_a_fault_leads_to_its_place_on_the_troubleshooting_page():
     assert line is not None
     assert line.endswith("docs/do/troubleshooting.md#sense_frozen_2, #comb_force_1")
     assert where_to_read(["the node ended (in the middle)"]) is None
+
+
+def test_a_bus_takes_what_an_eds_says(tmp_path):
+    text = (CONFIG_DIR / "comb_amplifier.eds").read_text(encoding="utf-8").replace("0x7078797A", "0x00001234")
+    (tmp_path / "other.eds").write_text(text, encoding="utf-8")
+    done = pkxyz("new", "bus", "mine.toml", "--like", "fd_5k", "--eds", "other.eds", cwd=tmp_path)
+    assert done.returncode == 0, done.stderr
+    driver = load("buses", tmp_path / "mine.toml", BusConfig).can.driver
+    assert (driver.vendor_id, driver.drive_pdo, driver.drive_channels) == (0x1234, 2, (1, 2, 3))
+    assert "# other.eds" in (tmp_path / "mine.toml").read_text(encoding="utf-8")
+    refused = pkxyz("new", "stage", "mine2.toml", "--eds", "other.eds", cwd=tmp_path)
+    assert refused.returncode == 2
+    assert "about the amplifier of a bus" in refused.stderr

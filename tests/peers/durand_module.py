@@ -1,4 +1,4 @@
-"""A plain CiA 401 module of another's making: durand's CANopen stack (PDO, SYNC, NMT, SDO, EMCY, heartbeat), on any bus.
+"""A plain CiA 401 module of another's making, on any bus: durand's CANopen stack.
 
 The stack does the talking. What every maker of a module adds is here: converters behind 0x6411 and 0x6401, and what
 the outputs do outside operational. durand has no heartbeat consumer, so the module gets one of its own, or none, or one
