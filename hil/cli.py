@@ -22,6 +22,7 @@ COMMANDS = {
     "replay": ("hil.commands.replay:replay", "A recording once more through the tick."),
     "run": ("hil.commands.run:run", "Control an amplifier at rate."),
     "plant": ("hil.commands.run:plant", "Serve amplifier and plant for run."),
+    "serve": ("hil.commands.serve:serve", "Operate a stage: page and clients."),
     "operate": ("hil.commands.operate:operate", "The loop that serve operates."),
     "check-amplifier": ("hil.commands.check_amplifier:check_amplifier", "May this amplifier be enabled?"),
     "export": ("hil.commands.export:export", "The controller as C for a board."),

@@ -37,7 +37,7 @@ def operate(
         autostart=False,
     )  # fmt: skip
     try:
-        run_loop(setup, settings, name, _say)
+        run_loop(setup, settings, name, {"stage": stage, "controller": controller, "bus": bus}, _say)
     except StartUpError as error:
         print(f"pkxyz: {error}", file=sys.stderr)
         raise typer.Exit(1) from None

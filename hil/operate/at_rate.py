@@ -9,9 +9,10 @@ from collections.abc import Callable
 
 import numpy as np
 
+from hil.bus.frame_time import frame_duration_ns
 from hil.lanes.ending import Ended, Ending
 from hil.lanes.setup import Setup
-from hil.lanes.wall import WallRig
+from hil.lanes.wall import WallRig, require_real_bus
 from hil.operate.commands import COMMAND, PATH_BLOCK, TICK, Verb, new_command
 from hil.operate.memory import StageMemory
 from hil.operate.path_stream import PathStream
@@ -21,6 +22,7 @@ from hil.operate.setpoints import Setpoints
 from hil.operate.settings import Settings
 from pkxyz_ctrl.can.frame import Frame
 from pkxyz_ctrl.client import place
+from pkxyz_ctrl.config.bus import CanConfig
 from pkxyz_ctrl.io.realtime import go_real_time, leave_real_time, settle_memory
 from pkxyz_ctrl.loop.row import ROW
 from pkxyz_ctrl.stage import Stage
@@ -30,19 +32,24 @@ KEPT_S = 60.0
 """Of telemetry that stays in the memory."""
 _COMMANDS_A_TICK = 4
 _COMPANY_S, _LOOK_S = 30.0, 0.02
-_FRAME_BITS = 47  # of a classic frame beside its data; an FD frame's data are faster, its head is not
 
 
 class _Counted:
     """``TakesTicks`` that counts frames; the rows go to the memory."""
 
-    def __init__(self) -> None:
+    def __init__(self, can: CanConfig) -> None:
         self.frames = 0
-        self.bits = 0
+        self.wire_ns = 0
+        self._nominal = can.nominal_bitrate_bit_per_s
+        self._data = can.data_bitrate_bit_per_s or can.nominal_bitrate_bit_per_s
+        self._duration_ns: dict[int, int] = {}
 
     def frame(self, frame: Frame, t_us: int) -> None:
         self.frames += 1
-        self.bits += _FRAME_BITS + 8 * len(frame.data)
+        length = len(frame.data)
+        if length not in self._duration_ns:
+            self._duration_ns[length] = frame_duration_ns(frame, self._nominal, self._data)
+        self.wire_ns += self._duration_ns[length]
 
     def row(self, row: memoryview) -> None:
         """Nobody's here."""
@@ -71,7 +78,7 @@ class OperatedLoop:
             self._take_rows()
         session.after(row, self._given())
         state = session.state
-        state["frames"], state["frame_bits"] = self._counted.frames, self._counted.bits
+        state["frames"], state["wire_ns"] = self._counted.frames, self._counted.wire_ns
         self._tick_bytes[: ROW.itemsize] = controller.row
         self._tick["session"] = state
         self._ticks.write(self._tick_bytes)
@@ -94,19 +101,20 @@ class OperatedLoop:
             self._session.take_rows(int(rows["path"]), int(rows["first"]), rows["motion"][:count])
 
 
-def operate(setup: Setup, settings: Settings, name: str, say: Callable[[str], object]) -> int:
+def operate(setup: Setup, settings: Settings, name: str, files: dict[str, str], say: Callable[[str], object]) -> int:
     """Run the loop until SIGINT or SIGTERM; returns the signal. At its end the combs are at 0 V.
 
-    ``setup`` without automatic start. Raises ``ConfigError``, ``StartUpError``, and ``OSError`` for the memory.
+    ``setup`` without automatic start; ``files``: by which names or files others find what it consists of.
+    Raises ``ConfigError``, ``StartUpError``, and ``OSError`` for the memory.
     """
     with Ending() as ending:
-        counted = _Counted()
+        counted = _Counted(require_real_bus(setup.bus))
         rig = WallRig(setup, counted, ending)
         memory = StageMemory.made(name, round(KEPT_S / setup.bus.period_s))
         try:
             session = _session_of(setup, settings, rig, memory)
             _wait_for_others(rig, say, ending)
-            place.write(name, "loop", _description(setup, settings, memory))
+            place.write(name, "loop", _description(setup, settings, memory, files))
             say(go_real_time())
             settle_memory()
             rig.operate(session.stage.setpoints, OperatedLoop(session, memory, counted).after)
@@ -160,11 +168,13 @@ def _wait_for_others(rig: WallRig, say: Callable[[str], object], ending: Ending)
         time.sleep(_LOOK_S)
 
 
-def _description(setup: Setup, settings: Settings, memory: StageMemory) -> dict[str, object]:
+def _description(setup: Setup, settings: Settings, memory: StageMemory, files: dict[str, str]) -> dict[str, object]:
     """What others need to know of the loop."""
     return {
-        "pid": os.getpid(), "memory": str(memory.path), "stage": setup.stage.name, "plant": setup.plant.name,
+        "pid": os.getpid(), "memory": str(memory.path), "files": files, "stage": setup.stage.name,
         "controller": setup.controller.name, "bus": setup.bus.name, "period_us": setup.bus.period_us,
         "voltage_max_v": setup.controller.limits.voltage_max_v, "on_silence": settings.on_silence,
         "interface": setup.bus.can.interface if setup.bus.can is not None else "",
+        "limits": list(settings.limits), "window_m": settings.window_m, "dwell_s": settings.dwell_s,
+        "middle_m": [float(v) for v in setup.law["tick"]["estimator"]["operating_point_m"][0]],
     }  # fmt: skip

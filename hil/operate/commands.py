@@ -133,7 +133,7 @@ SESSION = np.dtype(
         ("commands", "<u8"),  # taken so far
         ("missed", "<i8"),  # ticks, since the loop began
         ("frames", "<i8"),  # sent and received
-        ("frame_bits", "<i8"),  # of these, without stuffing
+        ("wire_ns", "<i8"),  # that these took on the wire; a frame as long as the first of its length
     ],
     align=True,
 )

@@ -31,6 +31,7 @@ class _Ring:
         layout = slot_of(record)
         fields = dict(layout.fields or {})
         self.slots = slots
+        self._layout = layout
         self._size = layout.itemsize
         self._crc_at = fields["crc"][1]
         self._record_at = fields["record"][1]
@@ -38,7 +39,6 @@ class _Ring:
         self._newest = np.frombuffer(memory, _NUMBER, 1)
         self._numbers = np.ndarray((slots,), _NUMBER, memory, _HEAD_BYTES, (self._size,))
         self._bytes = memory[_HEAD_BYTES:]
-        self._slots = np.frombuffer(memory, layout, slots, _HEAD_BYTES)
 
     def _slot(self, number: int) -> memoryview:
         at = (number - 1) % self.slots * self._size
@@ -138,8 +138,9 @@ class Reader(_Ring):
     def _checked(self, first: int, count: int) -> NDArray[np.void]:
         """Records from ``first`` on as long as they are whole; ``count`` must not reach past the end of the memory."""
         at = (first - 1) % self.slots
-        copy = self._slots[at : at + count].copy()
-        data, size, crc_at = copy.view(np.uint8).data if count else memoryview(b""), self._size, self._crc_at
+        size, crc_at = self._size, self._crc_at
+        data = bytearray(self._bytes[at * size : (at + count) * size])  # padding, too, which an array's copy leaves out
+        copy = np.frombuffer(data, self._layout, count)
         whole = 0
         for number, seen in enumerate(copy["number"].tolist(), first):
             begin = whole * size
@@ -155,5 +156,5 @@ class Reader(_Ring):
         return left_out
 
 
-def _is_whole(slot: bytes | memoryview, crc_at: int) -> bool:
+def _is_whole(slot: bytes | bytearray | memoryview, crc_at: int) -> bool:
     return zlib.crc32(slot[:crc_at]) == int.from_bytes(slot[crc_at : crc_at + 4], "little")

@@ -46,7 +46,9 @@ HOUSE: Mapping[str, Room] = MappingProxyType({
     "pkxyz_ctrl.client": Room(),
     # the device, and what is designed for it offline
     "pkxyz_ctrl.elements": Room(("pkxyz_ctrl.config",)),
-    "pkxyz_ctrl": Room(("pkxyz_ctrl.compiled", "pkxyz_ctrl.config", "pkxyz_ctrl.core", "pkxyz_ctrl.elements")),
+    "pkxyz_ctrl": Room(
+        ("pkxyz_ctrl.client", "pkxyz_ctrl.compiled", "pkxyz_ctrl.config", "pkxyz_ctrl.core", "pkxyz_ctrl.elements")
+    ),
     "pkxyz_ctrl.fabrication": Room(
         ("pkxyz_ctrl.config", "pkxyz_ctrl.elements"), ("math", "itertools", "pydantic", "numpy", *VALUES)
     ),
@@ -77,8 +79,9 @@ HOUSE: Mapping[str, Room] = MappingProxyType({
         ("sim.config", "sim", "pkxyz_ctrl.*", "hil.bus", "hil.node", "hil.plant", "hil.faults")
     ),
     "hil.conformance": Room(("sim.config", "sim", "pkxyz_ctrl.*", "hil.bus", "hil.node", "hil.plant", "hil.lanes")),
-    "hil.operate": Room(("pkxyz_ctrl.*", "hil.lanes")),
+    "hil.operate": Room(("pkxyz_ctrl.*", "hil.bus", "hil.lanes")),
     "hil.runs": Room(("sim.config", "pkxyz_ctrl.*", "hil.recording", "hil.faults", "hil.lanes")),
+    "hil.server": Room(("pkxyz_ctrl.*", "hil.operate", "hil.runs")),
     # many times, for one question
     "hil.studies.spread": Room(("pkxyz_ctrl.*",)),
     "hil.studies.wafer": Room(("pkxyz_ctrl.*", "hil.studies.spread")),
@@ -113,7 +116,7 @@ HOUSE: Mapping[str, Room] = MappingProxyType({
     )),
     "hil.commands": Room((
         "pkxyz_ctrl.*", "hil.recording", "hil.faults", "hil.lanes", "hil.conformance", "hil.operate", "hil.runs",
-        "hil.studies", "hil.pictures", "hil.screen", "hil.bench.rigs", "hil.bench",
+        "hil.server", "hil.studies", "hil.pictures", "hil.screen", "hil.bench.rigs", "hil.bench",
     )),
     "hil": Room((
         "pkxyz_ctrl.*", "hil.lanes", "hil.runs", "hil.screen", "hil.api", "hil.commands.studies", "hil.commands",

@@ -9,6 +9,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
+from hil.operate.commands import TICK
 from hil.operate.memory import StageMemory
 from hil.operate.ring import Reader, Writer, bytes_for, slot_of
 
@@ -59,6 +60,18 @@ def test_blocks_and_single_records_agree(count, most):
             while len(rows := many.read_block(most)):
                 block += rows["n"].tolist()
     assert single == block == list(range(1, count // 5 * 5 + 1))
+
+
+def test_records_with_padding_come_through_in_blocks(tmp_path):
+    """An array's copy leaves padding out, and the CRC is over all bytes of a slot."""
+    memory = StageMemory(tmp_path / "memory", kept_ticks=500)
+    writer, reader = memory.writer("ticks"), memory.reader("ticks")
+    tick = np.zeros(1, TICK)
+    for n in range(300):
+        tick["row"]["tick"] = n
+        writer.write(tick.view(np.uint8).data)
+        if n % 10 == 9:
+            assert reader.read_block(1000)["row"]["tick"].tolist() == list(range(n - 9, n + 1))
 
 
 def test_a_torn_record_is_not_read_whichever_byte_is_torn():

@@ -1,0 +1,50 @@
+"""``pkxyz serve``: a stage in operation, with a page and clients."""
+
+import json
+import sys
+from typing import Annotated
+
+import typer
+
+from hil.screen.first_run import say_if_compiling
+
+
+def serve(
+    bus: Annotated[
+        str | None, typer.Option(help="Name or file of the bus of real hardware; without it a stage is simulated.")
+    ] = None,
+    stage: Annotated[str, typer.Option(help="Name or file of the stage.")] = "reconstructed",
+    controller: Annotated[str, typer.Option(help="Name or file of the controller.")] = "youla",
+    plant: Annotated[str, typer.Option(help="Name or file of the simulated plant.")] = "nominal",
+    name: Annotated[str, typer.Option(help="What the stage is called, where there are several.")] = "stage",
+    on_silence: Annotated[
+        str, typer.Option(help="What becomes of a moving stage when the server falls silent: hold or park.")
+    ] = "hold",
+    host: Annotated[str, typer.Option(help="Address to listen at. Others than this machine's can reach it then.")] = (
+        "127.0.0.1"
+    ),
+    port: Annotated[int, typer.Option(help="0: any that is free.", min=0, max=65535)] = 8765,
+    as_json: Annotated[bool, typer.Option("--json", help="Print where it is as JSON.")] = False,
+) -> None:
+    """Operate a stage: a loop at rate, and beside it a page and clients, until Ctrl-C. At the end the combs are at 0 V.
+
+    What it prints is the address of the page; what stands behind # in it lets people in, so keep it to yourself.
+    """
+    from hil.server.serving import Served, serve
+    from pkxyz_ctrl.config.bus import BusConfig
+    from pkxyz_ctrl.config.files import load
+
+    config = load("buses", bus or _SIMULATED_BUS, BusConfig)
+    is_simulated = config.can is not None and config.can.interface == "pkxyz-unix"
+    say_if_compiling(quiet=as_json)
+    if host not in ("127.0.0.1", "localhost", "::1"):
+        print(f"everybody who can reach {host} and has the address below can move the stage", file=sys.stderr)
+
+    def tell(url: str) -> None:
+        print(json.dumps({"url": url}) if as_json else f"the stage is at {url}", flush=True)
+
+    served = Served(name, stage, controller, plant, bus or _SIMULATED_BUS, on_silence, host, port, is_simulated)
+    raise typer.Exit(serve(served, tell))
+
+
+_SIMULATED_BUS = "unix_2k"

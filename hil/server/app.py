@@ -1,0 +1,132 @@
+"""The server's outside: HTTP for the page, one WebSocket a client. Nothing gets in without the token of this start."""
+
+import asyncio
+import contextlib
+import hmac
+from collections.abc import AsyncIterator, Awaitable, Callable
+from pathlib import Path
+from typing import Any
+
+from starlette.applications import Starlette
+from starlette.middleware import Middleware
+from starlette.responses import PlainTextResponse
+from starlette.routing import Mount, WebSocketRoute
+from starlette.staticfiles import StaticFiles
+from starlette.types import ASGIApp, Receive, Scope, Send
+from starlette.websockets import WebSocket, WebSocketDisconnect
+
+from hil.server.desk import Client, Desk
+from pkxyz_ctrl.client.protocol import SUBPROTOCOL, TEXT_MAX_BYTES, TOKEN_PREFIX
+
+PAGE = Path(__file__).parent / "page"
+CLIENTS_MOST = 32
+_LOOK_S, _SHOW_S, _STATUS_S = 0.01, 1 / 30, 0.1
+_HEADERS = [
+    (b"content-security-policy", b"default-src 'self'; style-src 'self' 'unsafe-inline'; img-src 'self' data: blob:"),
+    (b"x-content-type-options", b"nosniff"),
+    (b"x-frame-options", b"DENY"),
+    (b"referrer-policy", b"no-referrer"),
+    (b"cache-control", b"no-cache"),
+]
+
+
+class OnlyOurHost:
+    """Answers only under the names that this server is meant to have: a page of another host can't reach it by a name
+    that was made to point here.
+    """
+
+    def __init__(self, app: ASGIApp, hosts: frozenset[str]) -> None:
+        self._app, self._hosts = app, hosts
+
+    async def __call__(self, scope: Scope, receive: Receive, send: Send) -> None:
+        if scope["type"] not in ("http", "websocket"):
+            await self._app(scope, receive, send)
+            return
+        headers = dict(scope["headers"])
+        host = headers.get(b"host", b"").decode("latin-1")
+        origin = headers.get(b"origin")
+        ours = {f"http://{name}" for name in self._hosts}
+        if host not in self._hosts or (origin is not None and origin.decode("latin-1") not in ours):
+            if scope["type"] == "websocket":
+                await WebSocket(scope, receive, send).close(4403)
+            else:
+                await PlainTextResponse("not from here", 403)(scope, receive, send)
+            return
+
+        async def with_headers(message: Any) -> None:
+            if message["type"] == "http.response.start":
+                message["headers"] = [*message["headers"], *_HEADERS]
+            await send(message)
+
+        await self._app(scope, receive, with_headers)
+
+
+def app_of(desk: Desk, token: str, hosts: frozenset[str]) -> Starlette:
+    """``hosts``: names with port under which it answers."""
+
+    async def talk(socket: WebSocket) -> None:
+        offered = socket.scope.get("subprotocols", [])
+        given = [name.removeprefix(TOKEN_PREFIX) for name in offered if name.startswith(TOKEN_PREFIX)]
+        if SUBPROTOCOL not in offered or not any(hmac.compare_digest(g.encode(), token.encode()) for g in given):
+            await socket.close(4401)
+            return
+        if len(desk.clients) >= CLIENTS_MOST:
+            await socket.close(4429)
+            return
+        await socket.accept(SUBPROTOCOL)
+        client = desk.enter()
+        speaking = asyncio.create_task(_speak(socket, client))
+        try:
+            while not client.is_hopeless:
+                message = await socket.receive()
+                if message["type"] == "websocket.disconnect":
+                    break
+                text = message.get("text")
+                if text is None or len(text) > TEXT_MAX_BYTES:
+                    break
+                await desk.ask(client, text)
+        except (WebSocketDisconnect, RuntimeError):
+            pass
+        finally:
+            speaking.cancel()
+            desk.leave(client)
+            with contextlib.suppress(Exception):
+                await socket.close()
+
+    @contextlib.asynccontextmanager
+    async def lifespan(app: Starlette) -> AsyncIterator[None]:
+        tasks = [asyncio.create_task(_every(period, each)) for period, each in _rounds(desk)]
+        try:
+            yield
+        finally:
+            for task in tasks:
+                task.cancel()
+
+    return Starlette(
+        routes=[WebSocketRoute("/stage", talk), Mount("/", StaticFiles(directory=PAGE, html=True))],
+        middleware=[Middleware(OnlyOurHost, hosts=hosts)],
+        lifespan=lifespan,
+    )
+
+
+async def _speak(socket: WebSocket, client: Client) -> None:
+    with contextlib.suppress(WebSocketDisconnect, RuntimeError):
+        while True:
+            said = await client.next_said()
+            if isinstance(said, bytes):
+                await socket.send_bytes(said)
+            else:
+                await socket.send_text(said)
+
+
+def _rounds(desk: Desk) -> list[tuple[float, Callable[[], object]]]:
+    return [(_LOOK_S, desk.look), (_SHOW_S, lambda: desk.show_telemetry(2000)), (_STATUS_S, desk.tell_status)]
+
+
+async def _every(period_s: float, each: Callable[[], object]) -> None:
+    while True:
+        each()
+        await asyncio.sleep(period_s)
+
+
+Plan = Callable[..., Awaitable[Any]]

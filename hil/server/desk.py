@@ -1,0 +1,342 @@
+"""The desk at which clients stand: who holds control, what each may ask, and what each is told.
+
+It knows messages and no sockets: a client is whatever takes texts and bytes.
+"""
+
+import asyncio
+import contextlib
+import json
+from collections.abc import Awaitable, Callable
+from typing import Any
+
+import numpy as np
+
+from hil.operate.commands import FINAL, State, Verb
+from hil.server.link import Answer, BusyError, Link
+from hil.server.paths import Feeding, Planner, StagePath
+from hil.server.status import status_of
+from pkxyz_ctrl.client.protocol import Block, packed
+from pkxyz_ctrl.config.files import ConfigError
+from pkxyz_ctrl.loop.row import ROW
+
+_SAID_MOST, _BLOCKS_MOST = 400, 4
+_FIELDS = frozenset(name for name in ROW.names or () if ROW[name].base.kind in "fi")
+_AXES = ("x", "y", "z")
+_LIMITS = ("velocity_m_per_s", "acceleration_m_per_s2", "jerk_m_per_s3")
+_FREE = frozenset({"stop", "release", "subscribe", "take_control", "give_control", "preview"})
+"""What needs no control: nothing of it moves anything, or it stops what moves."""
+
+
+class AskedWrongError(ValueError):
+    """A message that means nothing; the text says what was expected."""
+
+
+class Client:
+    """One that is connected. ``said`` waits for its socket; what is too much for a slow one is left out."""
+
+    def __init__(self, number: int) -> None:
+        self.number = number
+        self.said: asyncio.Queue[str | bytes] = asyncio.Queue(_SAID_MOST)
+        self.fields: tuple[str, ...] = ()
+        self.precision: Any = "f4"
+        self.tags: dict[int, Any] = {}
+        self.lost = 0
+        self._blocks = 0
+        self.is_hopeless = False
+
+    def tell(self, message: dict[str, Any]) -> None:
+        """Queue a message; a client that takes none of hundreds is given up."""
+        self.tell_text(json.dumps(message, allow_nan=False))
+
+    def tell_text(self, text: str) -> None:
+        """The same, of what is a text already."""
+        try:
+            self.said.put_nowait(text)
+        except asyncio.QueueFull:
+            self.is_hopeless = True
+
+    def show(self, block: Block) -> None:
+        """Queue a block of telemetry, or leave it out and count its rows."""
+        if self._blocks >= _BLOCKS_MOST:
+            self.lost += len(block)
+            return
+        self._blocks += 1
+        self.said.put_nowait(packed(Block(block.first_tick, block.columns, self.lost), self.precision))
+        self.lost = 0
+
+    async def next_said(self) -> str | bytes:
+        """What comes next."""
+        said = await self.said.get()
+        if isinstance(said, bytes):
+            self._blocks -= 1
+        return said
+
+
+class Desk:
+    """``plan`` runs a function where it doesn't hold up the others."""
+
+    def __init__(self, link: Link, planner: Planner, plan: Callable[..., Awaitable[Any]]) -> None:
+        self.link = link
+        self.clients: list[Client] = []
+        self.holder: Client | None = None
+        self.last_fault = ""
+        self._planner, self._plan = planner, plan
+        self._feeding: Feeding | None = None
+        self._jog_id = 0
+        self._jog_direction = [0.0, 0.0, 0.0]
+        self._numbers = 0
+        self._frames = (0, 0, 0)
+        self._load = 0.0
+
+    # -- clients -------------------------------------------------------------------------------------------------------
+
+    def enter(self) -> Client:
+        """Somebody is connected."""
+        self._numbers += 1
+        client = Client(self._numbers)
+        self.clients.append(client)
+        client.tell(self._hello(client))
+        self._tell_control(client)
+        if self.last_fault:
+            client.tell({"event": {"kind": "fault", "words": self.last_fault, "old": True}})
+        return client
+
+    def _hello(self, client: Client) -> dict[str, Any]:
+        return {"hello": self.link.description | {"fields": sorted(_FIELDS), "client": client.number}}
+
+    def leave(self, client: Client) -> None:
+        """Somebody is gone; what was moved by hand ends."""
+        if client in self.clients:
+            self.clients.remove(client)
+        if self.holder is client:
+            self._end_control()
+
+    async def ask(self, client: Client, text: str) -> None:
+        """A message from a client. What is wrong with it, it is told."""
+        tag = None
+        try:
+            message = json.loads(text)
+            if not isinstance(message, dict) or not isinstance(message.get("do"), str):
+                raise AskedWrongError('a message is {"do": what, ...}')
+            tag = _tag(message.get("tag"))
+            await self._do(client, message["do"], message, tag)
+        except (AskedWrongError, BusyError, ConfigError, RecursionError, ValueError, TypeError) as error:
+            ours = isinstance(error, AskedWrongError | BusyError | ConfigError)
+            words = str(error) if ours else f"not understood: {error}"
+            client.tell({"answer": {"tag": tag, "id": None, "verb": "", "state": "refused", "words": words}})
+
+    async def _do(self, client: Client, what: str, message: dict[str, Any], tag: Any) -> None:
+        if what not in _FREE and self.holder is not client:
+            raise AskedWrongError(
+                "take control first: " + ("nobody has it" if self.holder is None else "another client has it")
+            )
+        if what == "stop":
+            self.link.stop()
+            self._feeding = None
+            client.tell(_answer(tag, "stop", "done", "the loop was told to stop"))
+        elif what == "subscribe":
+            self._subscribe(client, message)
+        elif what == "take_control":
+            self._take_control(client, tag)
+        elif what == "give_control":
+            if self.holder is client:
+                self._end_control()
+            client.tell(_answer(tag, "give_control", "done", ""))
+        elif what == "preview":
+            path = await self._planned(message)
+            client.tell({"preview": {"tag": tag, **_shown(path)}})
+        elif what == "path":
+            await self._send_path(client, message, tag)
+        else:
+            self._command(client, what, message, tag)
+
+    # -- control -------------------------------------------------------------------------------------------------------
+
+    def _take_control(self, client: Client, tag: Any) -> None:
+        if self.holder not in (None, client):
+            raise AskedWrongError("another client has control; it has to give it back, or to leave")
+        self.holder = client
+        client.tell(_answer(tag, "take_control", "done", "you have control"))
+        self._tell_all_control()
+
+    def _end_control(self) -> None:
+        self.holder = None
+        if self._jog_id:
+            self._end_jog()
+        self._tell_all_control()
+
+    def _end_jog(self) -> None:
+        with contextlib.suppress(BusyError):  # its lease ends by itself
+            self.link.command(Verb.JOG, self.link.next_id(), target_m=(0.0, 0.0, 0.0))
+        self._jog_id = 0
+
+    def _tell_all_control(self) -> None:
+        for client in self.clients:
+            self._tell_control(client)
+
+    def _tell_control(self, client: Client) -> None:
+        client.tell({"control": {"held": self.holder is not None, "yours": self.holder is client}})
+
+    # -- commands ------------------------------------------------------------------------------------------------------
+
+    def _command(self, client: Client, what: str, message: dict[str, Any], tag: Any) -> None:
+        fields: dict[str, Any] = {}
+        if what == "jog_again":
+            if self._jog_id:
+                self.link.command(Verb.JOG, self._jog_id, target_m=self._jog_direction)
+            return
+        if what == "jog_end":
+            self._end_jog()
+            return
+        try:
+            verb = Verb[what.upper()]
+        except KeyError:
+            raise AskedWrongError(f"there is nothing called {what!r} to do") from None
+        if verb is Verb.MOVE:
+            fields["target_m"] = [_number(message, f"{axis}_m", np.nan) for axis in _AXES]
+            fields["relative"] = int(bool(message.get("relative", False)))
+        if verb is Verb.JOG:
+            axis, sign = message.get("axis"), _number(message, "direction", 1.0)
+            if axis not in _AXES or sign == 0:
+                raise AskedWrongError("jog needs axis x, y or z, and a direction of 1 or -1")
+            self._jog_direction = [float(np.sign(sign)) * (a == axis) for a in _AXES]
+            fields["target_m"] = self._jog_direction
+        if verb in (Verb.MOVE, Verb.JOG, Verb.LIMITS):
+            fields |= {name: _number(message, name, 0.0) for name in _LIMITS}
+        if verb is Verb.SETTLE:
+            fields |= {name: _number(message, name, None) for name in ("window_m", "dwell_s")}
+        command_id = self.link.next_id()
+        self.link.command(verb, command_id, **fields)
+        client.tags[command_id] = tag
+        if verb is Verb.JOG:
+            self._jog_id = command_id
+        self._tell(Verb(verb).name.lower(), command_id, State.ACCEPTED, "")
+
+    async def _planned(self, message: dict[str, Any]) -> StagePath:
+        if "scenario" in message:
+            return await self._plan(self._planner.of_scenario, str(message["scenario"]))
+        if "table" in message:
+            limits = {name.replace("_m_per_s", "_max_m_per_s"): message.get(name) for name in _LIMITS}
+            return await self._plan(self._planner.of_table, str(message["table"]), limits)
+        return await self._plan(self._planner.of_segments, message.get("segments"))
+
+    async def _send_path(self, client: Client, message: dict[str, Any], tag: Any) -> None:
+        path = await self._planned(message)
+        command_id = self.link.next_id()
+        client.tags[command_id] = tag
+        self._feeding = Feeding(self.link, command_id, path)
+        self.link.command(Verb.PATH, command_id, path=command_id, rows=path.rows, start_m=path.start_m)
+        self._tell("path", command_id, State.ACCEPTED, f"{path.name}: {path.duration_s:.3g} s")
+
+    # -- what the loop says --------------------------------------------------------------------------------------------
+
+    def look(self) -> None:
+        """Hand on what has come from the loop, and feed it."""
+        if not self.link.is_joined:
+            if not self.link.join():
+                return
+            for client in self.clients:
+                client.tell(self._hello(client))
+        self.link.sign_of_life()
+        self.link.answers(self._heard)
+        if self._feeding is not None and not self._feeding.go_on():
+            self._feeding = None
+
+    def _heard(self, answer: Answer) -> None:
+        if answer.is_fault:
+            self.last_fault = answer.words
+            for client in self.clients:
+                client.tell({"event": {"kind": "fault", "words": answer.words, "t_us": answer.t_us}})
+            return
+        if answer.verb == "clear" and answer.state is State.DONE:
+            self.last_fault = ""
+        if answer.state in FINAL:
+            if self._feeding is not None and self._feeding.number == answer.id:
+                self._feeding = None
+            if answer.id == self._jog_id:
+                self._jog_id = 0
+        self._tell(answer.verb, answer.id, answer.state, answer.words)
+
+    def _tell(self, verb: str, command_id: int, state: State, words: str) -> None:
+        if state in FINAL:
+            self.tell_status()  # whoever waited for the end looks where the stage is now
+        for client in self.clients:
+            tag = client.tags.get(command_id)
+            if state in FINAL:
+                client.tags.pop(command_id, None)
+            client.tell(_answer(tag, verb, state.name.lower(), words, command_id))
+
+    def tell_status(self) -> None:
+        """Where the stage is, to everybody."""
+        newest = self.link.newest()
+        if newest is None:
+            status: dict[str, Any] = {"activity": "starting", "words": "the loop is starting", "alive": False}
+        else:
+            self._look_at_load(newest)
+            status = status_of(newest, self.link.description, self._load) | {"alive": self.link.is_alive}
+        status |= {"last_fault": self.last_fault, "held": self.holder is not None, "clients": len(self.clients)}
+        text = json.dumps({"status": status}, allow_nan=False)
+        for client in self.clients:
+            client.tell_text(text)
+
+    def _look_at_load(self, newest: np.void) -> None:
+        now = (int(newest["row"]["t_us"]), int(newest["session"]["wire_ns"]), int(newest["session"]["missed"]))
+        passed_us = now[0] - self._frames[0]
+        if passed_us >= 500_000 or passed_us < 0:
+            self._load = (now[1] - self._frames[1]) * 1e-3 / passed_us if passed_us > 0 else 0.0
+            self._frames = now
+
+    # -- telemetry -----------------------------------------------------------------------------------------------------
+
+    def _subscribe(self, client: Client, message: dict[str, Any]) -> None:
+        fields = message.get("fields", [])
+        unknown = [f for f in fields if f not in _FIELDS] if isinstance(fields, list) else [fields]
+        if unknown or len(fields) > len(_FIELDS):
+            raise AskedWrongError(f"no telemetry is called {unknown[:1]}; there are: {', '.join(sorted(_FIELDS))}")
+        if message.get("precision", "f4") not in ("f4", "f8"):
+            raise AskedWrongError("precision is f4 or f8")
+        client.fields, client.precision = tuple(dict.fromkeys(fields)), message.get("precision", "f4")
+
+    def show_telemetry(self, most: int) -> None:
+        """New rows to whoever asked for them."""
+        if self.link.newest() is None:
+            return
+        ticks, before = self.link.ticks, self.link.ticks.lost
+        rows = ticks.read_block(most)
+        if not len(rows):
+            return
+        first, values = int(rows["row"]["tick"][0]), rows["row"]
+        for client in self.clients:
+            if client.fields:
+                client.lost += ticks.lost - before
+                client.show(Block(first, {name: values[name] for name in client.fields}))
+
+
+def _answer(tag: Any, verb: str, state: str, words: str, command_id: int | None = None) -> dict[str, Any]:
+    return {"answer": {"tag": tag, "id": command_id, "verb": verb, "state": state, "words": words}}
+
+
+def _tag(value: Any) -> str | int | None:
+    """What a client may put on a message to know its answers by."""
+    if value is None or (isinstance(value, str) and len(value) <= 64):
+        return value
+    if isinstance(value, int) and abs(value) < 1 << 53:
+        return value
+    raise AskedWrongError("a tag is a short text or a whole number")
+
+
+def _shown(path: StagePath) -> dict[str, Any]:
+    points = path.shown()
+    return {
+        "name": path.name, "duration_s": path.duration_s, "start_m": path.start_m.tolist(),
+        "points_m": np.round(points, 12).tolist(), "low_m": points.min(0).tolist(), "high_m": points.max(0).tolist(),
+    }  # fmt: skip
+
+
+def _number(message: dict[str, Any], name: str, absent: float | None) -> float:
+    value = message.get(name, absent)
+    if value is None and absent is not None:
+        value = absent
+    if isinstance(value, bool) or not isinstance(value, int | float):
+        raise AskedWrongError(f"{name} is a number, not {value!r}")
+    return float(value)

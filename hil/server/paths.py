@@ -1,0 +1,130 @@
+"""Paths for the loop: planned and checked away from it, and streamed to it while it follows them."""
+
+import math
+import tempfile
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Annotated, Any
+
+import numpy as np
+from numpy.typing import NDArray
+from pydantic import Field, TypeAdapter
+
+from hil.operate.commands import PATH_ROWS
+from hil.runs.scenario import load_scenario
+from hil.server.link import Link
+from pkxyz_ctrl.config.bus import BusConfig
+from pkxyz_ctrl.config.controller import ControllerConfig
+from pkxyz_ctrl.config.files import ConfigError, FrozenModel, load, parse
+from pkxyz_ctrl.config.stage import StageConfig
+from pkxyz_ctrl.stage import Stage
+from pkxyz_ctrl.trajectory import Segment, Trajectory
+from pkxyz_ctrl.trajectory.check import DriveLimits, check_against
+from pkxyz_ctrl.trajectory.table import Table
+
+Array = NDArray[np.float64]
+
+_AHEAD_ROWS = 5000
+_BLOCKS_AT_ONCE = 16
+_SHOWN_POINTS = 3000
+_LEADING = ("hold", "move")
+
+
+class _Segments(FrozenModel):
+    reference: Annotated[tuple[Segment, ...], Field(min_length=1, max_length=1000)]
+
+
+@dataclass(frozen=True)
+class StagePath:
+    """A path that the stage can follow: a trajectory from the first segment that is more than going there."""
+
+    trajectory: Trajectory
+    period_us: int
+    first_tick: int
+    rows: int
+    name: str
+
+    @property
+    def start_m(self) -> Array:
+        """(3,), where it begins at rest."""
+        return self.sample(0, 1)[0, 0:3]
+
+    @property
+    def duration_s(self) -> float:
+        """At its own speed."""
+        return self.rows * self.period_us * 1e-6
+
+    def sample(self, first: int, count: int) -> Array:
+        """Rows (count, 9)."""
+        return self.trajectory.sample(self.first_tick + first, count, self.period_us)
+
+    def shown(self) -> Array:
+        """Positions (n, 3) to draw it by."""
+        step = max(1, self.rows // _SHOWN_POINTS)
+        return np.concatenate([self.sample(n, 1)[:, 0:3] for n in range(0, self.rows, step)])
+
+
+class Planner:
+    """For one stage, controller and bus, by name or file. Raises ``ConfigError``."""
+
+    def __init__(self, stage: str, controller: str, bus: str) -> None:
+        config = load("stages", stage, StageConfig)
+        limits = load("controllers", controller, ControllerConfig).limits
+        self.period_us = load("buses", bus, BusConfig).period_us
+        self.stage = Stage(config)
+        self._drive = DriveLimits(limits.voltage_max_v, limits.slew_max_v_per_s, self.period_us)
+
+    def of_scenario(self, name: str) -> StagePath:
+        """The reference of a shipped scenario: names only, as a client can't be let into our files."""
+        if "/" in name or "\\" in name or "." in name:
+            raise ConfigError(f"{name!r}: the name of a shipped scenario is wanted; a file of yours is sent as a table")
+        return self._path(load_scenario(name).trajectory, name)
+
+    def of_segments(self, segments: Any, name: str = "scan") -> StagePath:
+        """Segments as in the ``[[reference]]`` of a scenario file."""
+        parsed = parse({"reference": segments}, _Segments, "the path")
+        if any(isinstance(segment, Table) for segment in parsed.reference):
+            raise ConfigError("the path: a table is sent by itself, not by the name of a file")
+        return self._path(Trajectory(parsed.reference), name)
+
+    def of_table(self, text: str, limits: dict[str, float]) -> StagePath:
+        """A table of positions at instants, as the text of a CSV file."""
+        with tempfile.TemporaryDirectory(prefix="pkxyz-") as folder:
+            file = Path(folder) / "table.csv"
+            file.write_text(text, encoding="utf-8")
+            table = TypeAdapter(Table).validate_python({"kind": "csv", "file": str(file)} | limits)
+            try:
+                return self._path(Trajectory([table]), "table")
+            except ConfigError as error:
+                raise ConfigError(str(error).replace(str(file), "the table")) from None
+
+    def _path(self, trajectory: Trajectory, name: str) -> StagePath:
+        check_against(self.stage, trajectory, self._drive)
+        if any(segment.jumps_us for segment in trajectory.segments):
+            raise ConfigError(
+                f"{name}: jumps on purpose, which a stage in operation does not; use `pkxyz run` for that"
+            )
+        begins = [s.t_start_us for s in trajectory.segments if s.kind not in _LEADING]
+        first_tick = math.ceil((begins[0] if begins else 0) / self.period_us)
+        rows = math.ceil(trajectory.duration_us / self.period_us) - first_tick + 1
+        return StagePath(trajectory, self.period_us, first_tick, rows, name)
+
+
+class Feeding:
+    """A path on its way to the loop."""
+
+    def __init__(self, link: Link, number: int, path: StagePath) -> None:
+        self.number, self.path = number, path
+        self._link, self._sent = link, 0
+
+    def go_on(self) -> bool:
+        """Send some of what the loop may want next; whether there is more to send."""
+        newest = self._link.newest()
+        at = float(newest["session"]["path_row"]) if newest is not None else 0.0
+        for _ in range(_BLOCKS_AT_ONCE):
+            if self._sent >= self.path.rows or self._sent > at + _AHEAD_ROWS:
+                break
+            count = min(PATH_ROWS, self.path.rows - self._sent)
+            self._link.rows(self.number, self._sent, self.path.sample(self._sent, count))
+            self._sent += count
+        return self._sent < self.path.rows

@@ -1,0 +1,171 @@
+"""``pkxyz serve``: amplifier and plant, loop and server, each a process of its own, started and ended together."""
+
+import asyncio
+import os
+import secrets
+import signal
+import socket
+import subprocess
+import sys
+import time
+from collections.abc import Callable
+from dataclasses import dataclass
+
+import uvicorn
+
+from hil.server.app import app_of
+from hil.server.desk import Desk
+from hil.server.link import Link
+from hil.server.paths import Planner
+from pkxyz_ctrl.client import place
+from pkxyz_ctrl.client.protocol import TEXT_MAX_BYTES
+from pkxyz_ctrl.config.files import ConfigError
+
+_ENDS_S = 3.0
+_LOOPBACK = ("127.0.0.1", "localhost", "::1")
+
+
+@dataclass(frozen=True)
+class Served:
+    """What to serve, by names or files."""
+
+    name: str
+    stage: str
+    controller: str
+    plant: str
+    bus: str
+    on_silence: str
+    host: str
+    port: int
+    is_simulated: bool
+    """whether amplifier and plant are to be started, too"""
+
+
+class _Children:
+    """The processes beside the server. ``ended`` names one that ended by itself."""
+
+    def __init__(self) -> None:
+        self._processes: dict[str, subprocess.Popen[bytes]] = {}
+
+    def start(self, what: str, *arguments: str) -> int:
+        """Start ``pkxyz`` with arguments; Ctrl-C reaches the server alone, which ends the others in their order."""
+        process = subprocess.Popen(
+            [sys.executable, "-m", "hil", *arguments], stdout=subprocess.DEVNULL, start_new_session=True
+        )
+        self._processes[what] = process
+        return process.pid
+
+    @property
+    def ended(self) -> str | None:
+        """Which has ended."""
+        return next((what for what, process in self._processes.items() if process.poll() is not None), None)
+
+    def end(self) -> None:
+        """The loop first, so that the combs are at 0 V while the amplifier still listens."""
+        for what in ("loop", "plant"):
+            process = self._processes.get(what)
+            if process is not None and process.poll() is None:
+                process.send_signal(signal.SIGTERM)
+                try:
+                    process.wait(_ENDS_S)
+                except subprocess.TimeoutExpired:
+                    process.kill()
+
+
+def serve(served: Served, tell: Callable[[str], object]) -> int:
+    """Serve until SIGINT or SIGTERM; ``tell`` is told where. Returns an exit code. Raises ``ConfigError``."""
+    children = _Children()
+    is_new = place.read(served.name, "loop") is None
+    if place.read(served.name, "server") is not None:
+        raise ConfigError(f"a server for {served.name!r} is running already; give another --name, or end that one")
+    bound = _bound(served.host, served.port)
+    port = int(bound.getsockname()[1])
+    token = secrets.token_urlsafe(24)
+    try:
+        if is_new:
+            _start(children, served)
+        link = Link(served.name)
+        planner = Planner(served.stage, served.controller, served.bus)
+        desk = Desk(link, planner, asyncio.to_thread)
+        hosts = frozenset(f"{_in_url(host)}:{port}" for host in {*_LOOPBACK, served.host})
+        url = f"http://{_in_url(served.host)}:{port}/"
+        place.write(served.name, "server", {"pid": os.getpid(), "url": url, "token": token})
+        tell(f"{url}#{token}")
+        config = uvicorn.Config(
+            app_of(desk, token, hosts), log_level="error", access_log=False, ws_max_size=TEXT_MAX_BYTES,
+            ws_max_queue=8, ws_ping_interval=10, ws_ping_timeout=10, limit_concurrency=128,
+            timeout_graceful_shutdown=1, lifespan="on",
+        )  # fmt: skip
+        server = uvicorn.Server(config)
+        return _run(server, bound, children, is_new)
+    finally:
+        place.forget(served.name, "server")
+        children.end()
+        if not is_new:
+            _end_loop(served.name)
+        bound.close()
+
+
+def _run(server: uvicorn.Server, bound: socket.socket, children: _Children, is_new: bool) -> int:
+    async def main() -> str | None:
+        serving = asyncio.create_task(server.serve([bound]))
+        ended = None
+        while not serving.done():
+            ended = children.ended
+            if ended is not None:
+                server.should_exit = True
+                await serving
+                break
+            await asyncio.sleep(0.1)
+        return ended
+
+    signal.signal(signal.SIGTERM, signal.default_int_handler)  # uvicorn raises anew what ended it, and we tidy up
+    try:
+        ended = asyncio.run(main())
+    except KeyboardInterrupt:
+        return 0
+    if ended is not None:
+        print(f"pkxyz: the {ended} has ended by itself; the combs are at 0 V", file=sys.stderr)
+        return 1
+    return 0
+
+
+def _start(children: _Children, served: Served) -> None:
+    common = ["--bus", served.bus, "--stage", served.stage]
+    if served.is_simulated:
+        pid = children.start("plant", "plant", *common, "--plant", served.plant)
+        place.write(served.name, "plant", {"pid": pid})
+    children.start(
+        "loop", "operate", *common, "--controller", served.controller, "--name", served.name, "--on-silence",
+        served.on_silence,
+    )  # fmt: skip
+
+
+def _end_loop(name: str) -> None:
+    """Of a server before this one: what it started ends with this one."""
+    for kind in ("loop", "plant"):
+        found = place.read(name, kind)
+        if found is None:
+            continue
+        os.kill(found["pid"], signal.SIGTERM)
+        end_s = time.monotonic() + _ENDS_S
+        while place.read(name, kind) is not None and time.monotonic() < end_s:
+            time.sleep(0.02)
+    place.forget(name, "plant")
+
+
+def _bound(host: str, port: int) -> socket.socket:
+    family = socket.AF_INET6 if ":" in host else socket.AF_INET
+    bound = socket.socket(family, socket.SOCK_STREAM)
+    bound.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
+    try:
+        bound.bind((host, port))
+        bound.listen(128)  # whoever is told the address may connect at once, and waits until the server is there
+    except OSError as error:
+        bound.close()
+        raise ConfigError(f"--port {port}: {error.strerror}; give another, or 0 for any that is free") from None
+    return bound
+
+
+def _in_url(host: str) -> str:
+    return f"[{host}]" if ":" in host else host

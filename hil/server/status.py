@@ -1,0 +1,33 @@
+"""Where a stage in operation stands, for a person: one record of the loop in words and numbers."""
+
+import math
+from typing import Any
+
+import numpy as np
+
+from hil.operate.commands import ACTIVITY_WORDS, Activity
+from pkxyz_ctrl.safety.modes import MODE_FACTS, Mode
+
+
+def status_of(tick: np.void, description: dict[str, Any], bus_load: float) -> dict[str, Any]:
+    """Plain data of a record of ``TICK``; lengths in m, voltages in V."""
+    row, session = tick["row"], tick["session"]
+    activity, mode = Activity(int(session["activity"])), Mode(int(row["mode"]))
+    most_v = float(description.get("voltage_max_v", math.inf))
+    voltage = [float(v) for v in row["voltage_v"]]
+    return {
+        "t_s": int(row["t_us"]) * 1e-6, "tick": int(row["tick"]),
+        "mode": mode.name, "mode_words": MODE_FACTS[mode].meaning,
+        "activity": activity.name.lower(), "words": ACTIVITY_WORDS[activity],
+        "homed": bool(session["homed"]), "driven": bool(session["driven"]),
+        "in_position": bool(session["in_position"]), "running_id": int(session["running_id"]),
+        "setpoint_m": _finite(row["reference_m"]), "position_m": _finite(row["estimate_m"]),
+        "error_m": _finite(row["estimate_m"] - row["reference_m"]), "target_m": _finite(session["target_m"]),
+        "voltage_v": voltage, "headroom_v": most_v - max(voltage), "saturated": bool(row["saturated"]),
+        "progress": float(session["progress"]), "missed_ticks": int(session["missed"]),
+        "frames": int(session["frames"]), "bus_load": round(bus_load, 4),
+    }  # fmt: skip
+
+
+def _finite(values: np.ndarray) -> list[float | None]:
+    return [float(v) if math.isfinite(v) else None for v in values]

@@ -1,0 +1,85 @@
+"""What a stage in operation says back: where it stands, what became of a command, and what went wrong."""
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+from typing import Any, Self
+
+import numpy as np
+from numpy.typing import NDArray
+
+
+class StageError(Exception):
+    """Something with a stage in operation went wrong; the message says what to do."""
+
+
+class RefusedError(StageError):
+    """The stage did not do what was asked, and nothing moved; the message says why."""
+
+
+class AbortedError(StageError):
+    """What was asked was begun and did not come to its end; the message says why."""
+
+
+class NoStageError(StageError):
+    """No server, or one that does not let us in."""
+
+
+@dataclass(frozen=True)
+class Status:
+    """Where the stage stood a tenth of a second ago at most. Lengths in m, voltages in V, time in s."""
+
+    activity: str
+    """in a word: off, homing, holding, moving, jogging, scanning, paused, stopping, fault, starting"""
+    words: str
+    """the same in a sentence"""
+    mode: str
+    homed: bool
+    driven: bool
+    """whether the loop is closed"""
+    in_position: bool
+    t_s: float
+    """since the loop's first tick"""
+    position_m: NDArray[np.float64]
+    """(3,), as estimated"""
+    setpoint_m: NDArray[np.float64]
+    """(3,)"""
+    target_m: NDArray[np.float64]
+    """(3,), where the present motion ends"""
+    voltage_v: NDArray[np.float64]
+    """(3,), of the combs"""
+    headroom_v: float
+    progress: float
+    """0 to 1 of a path"""
+    missed_ticks: int
+    bus_load: float
+    """0 to 1"""
+    last_fault: str
+    """what happened and what to check; empty if nothing did"""
+
+    @classmethod
+    def of(cls, data: Mapping[str, Any]) -> Self:
+        """From the server's words."""
+        values: dict[str, Any] = {name: data.get(name) for name in cls.__dataclass_fields__}
+        for name in ("position_m", "setpoint_m", "target_m", "voltage_v"):
+            values[name] = np.array([np.nan if v is None else v for v in values[name] or [None] * 3], np.float64)
+        plain: dict[str, Any] = {"homed": False, "driven": False, "in_position": False, "missed_ticks": 0}
+        plain |= dict.fromkeys(("t_s", "headroom_v", "progress", "bus_load"), 0.0)
+        return cls(**{name: plain.get(name, "") if value is None else value for name, value in values.items()})
+
+
+@dataclass
+class Command:
+    """Something that was asked. ``state``: accepted, running, done, refused or aborted."""
+
+    id: int | None
+    verb: str
+    state: str
+    words: str = ""
+
+    def require_done(self) -> "Command":
+        """Raise ``RefusedError`` or ``AbortedError`` unless it was done."""
+        if self.state == "refused":
+            raise RefusedError(self.words)
+        if self.state == "aborted":
+            raise AbortedError(self.words)
+        return self

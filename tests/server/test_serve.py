@@ -1,0 +1,242 @@
+"""``pkxyz serve`` as it is started: plant, loop and server, each a process, and clients over loopback."""
+
+import contextlib
+import http.client
+import os
+import signal
+import socket
+import subprocess
+import sys
+import time
+from collections.abc import Iterator
+from pathlib import Path
+from urllib.parse import urlsplit
+
+import numpy as np
+import pytest
+from websockets.exceptions import InvalidStatus
+from websockets.sync.client import connect as plain_connect
+from websockets.typing import Subprotocol
+
+import pkxyz_ctrl
+from hil.server.app import CLIENTS_MOST
+from pkxyz_ctrl.client import place
+from pkxyz_ctrl.client.plain import Stage
+from pkxyz_ctrl.client.protocol import SUBPROTOCOL, TOKEN_PREFIX
+from pkxyz_ctrl.client.reply import RefusedError
+from pkxyz_ctrl.config.files import find
+
+STARTS_S = 200.0  # the kernels may have to be compiled
+
+
+class Server:
+    def __init__(self, bus: Path) -> None:
+        self._command = [sys.executable, "-m", "hil", "serve", "--bus", str(bus), "--port", "0", "--json"]
+        self.process: subprocess.Popen[str]
+
+    def start(self) -> None:
+        self.process = subprocess.Popen(self._command, stdout=subprocess.PIPE, stdin=subprocess.DEVNULL, text=True)
+        assert self.process.stdout is not None
+        assert self.process.stdout.readline().startswith('{"url": "http://127.0.0.1:')
+
+    def end(self) -> int:
+        self.process.send_signal(signal.SIGTERM)
+        return self.process.wait(20)
+
+
+@pytest.fixture(scope="module")
+def server(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Server]:
+    folder = tmp_path_factory.mktemp("serve")
+    text = find("buses", "unix_1k").read_text(encoding="utf-8")
+    assert 'channel = "pkxyz"' in text
+    bus = folder / "bus.toml"
+    bus.write_text(text.replace('channel = "pkxyz"', f'channel = "{folder}/wire"'), encoding="utf-8")
+    before = os.environ.get("XDG_RUNTIME_DIR")
+    os.environ["XDG_RUNTIME_DIR"] = str(folder)
+    served = Server(bus)
+    try:
+        served.start()
+        yield served
+        served.end()
+    finally:
+        for kind in ("server", "loop", "plant"):
+            if (found := place.read("stage", kind)) is not None:
+                with contextlib.suppress(ProcessLookupError):
+                    os.kill(found["pid"], signal.SIGKILL)
+        os.environ.pop("XDG_RUNTIME_DIR")
+        if before is not None:
+            os.environ["XDG_RUNTIME_DIR"] = before
+
+
+@contextlib.contextmanager
+def alive(control: bool = True) -> Iterator[Stage]:
+    with pkxyz_ctrl.connect(control=control) as stage:
+        end_s = time.monotonic() + STARTS_S
+        while stage.status.activity == "starting" and time.monotonic() < end_s:
+            time.sleep(0.05)
+        if stage.status.activity == "fault":  # a machine that stood still
+            stage.clear()
+        yield stage
+
+
+def driven(stage: Stage) -> None:
+    if stage.status.activity == "fault":
+        stage.clear()
+    if not stage.status.driven:
+        stage.home()
+        stage.enable()
+    stage.move_to(0.0, 0.0, 18e-6)
+
+
+def address() -> tuple[str, str]:
+    found = place.read("stage", "server")
+    assert found is not None
+    return urlsplit(found["url"]).netloc, found["token"]
+
+
+def shake(token: str, **keywords: object) -> None:
+    netloc, _ = address()
+    offered = [Subprotocol(SUBPROTOCOL), Subprotocol(TOKEN_PREFIX + token)]
+    plain_connect(f"ws://{netloc}/stage", subprotocols=offered, proxy=None, **keywords).close()
+
+
+def test_the_first_program_anyone_writes(server):
+    with alive() as stage:
+        driven(stage)
+        command = stage.move_to(x=1e-6)
+        assert command.state == "done"
+        assert command.words.startswith("in position at (1, 0, 18) um")
+        assert np.allclose(stage.wait_in_position().position_m, [1e-6, 0, 18e-6], atol=50e-9)
+        with pytest.raises(RefusedError, match=r"x = 50 um is asked for, limits -13\.51 to 13\.51 um"):
+            stage.move_to(x=50e-6)
+        stage.park()
+        while stage.status.activity != "off":  # the tick of the answer may be a moment old
+            time.sleep(0.01)
+        assert (stage.status.voltage_v == 0).all()
+
+
+def test_a_capture_begins_where_its_trigger_says(server):
+    with alive() as stage:
+        driven(stage)
+        stage.move_to(x=-1e-6)
+        stage.move_to(x=1e-6, velocity_m_per_s=10e-6, wait=False)
+        block = stage.capture("reference_m", seconds=0.1, trigger=("reference_x_m", "rises above", 0.0), before_s=0.03)
+        assert len(block) == 100
+        x = block["reference_m"][:, 0]
+        assert x[29] <= 0.0 < x[30]
+        assert (np.diff(block["tick"]) == 1).all()
+        assert np.allclose(np.diff(x[10:90]), 10e-9, rtol=0.02)
+
+
+def test_a_path_is_paused_and_resumed_over_the_wire(server):
+    with alive() as stage:
+        driven(stage)
+        stage.follow("raster", wait=False)
+        while stage.status.progress < 0.2:
+            time.sleep(0.01)
+        assert stage.pause().words.startswith("stands on its path at")
+        assert stage.resume().state == "done"
+        while stage.status.activity in ("scanning", "paused"):
+            time.sleep(0.02)
+        assert stage.status.last_fault == ""
+
+
+@pytest.mark.parametrize(
+    ("token", "keywords"),
+    [
+        ("", {}),
+        ("wrong", {}),
+        (None, {"origin": "http://evil.example"}),
+        (None, {"origin": "null"}),
+        (None, {"additional_headers": {"Host": "evil.example"}}),
+    ],
+)
+def test_nobody_gets_in_without_the_token_or_from_another_page(server, token, keywords):
+    with pytest.raises(InvalidStatus, match=r"40[03]"):
+        shake(address()[1] if token is None else token, **keywords)
+
+
+def test_the_page_comes_without_token_and_nothing_beside_it(server):
+    netloc, token = address()
+    with contextlib.closing(http.client.HTTPConnection(netloc, timeout=5)) as http_client:
+
+        def status_of(path: str, **headers: str) -> tuple[int, bytes]:
+            http_client.request("GET", path, headers=headers)
+            answer = http_client.getresponse()
+            body = answer.read()
+            assert "default-src 'self'" in (answer.headers["Content-Security-Policy"] or "") or answer.status == 403
+            return answer.status, body
+
+        status, body = status_of("/")
+        assert status == 200
+        assert token.encode() not in body
+        for path in (
+            "/../app.py",
+            "/%2e%2e/app.py",
+            "/..%2fapp.py",
+            "//etc/passwd",
+            "/stage",
+            "/.git/config",
+            "/\\..\\app.py",
+        ):
+            assert status_of(path)[0] in (400, 404), path
+        assert status_of("/", Host="evil.example")[0] == 403
+        assert status_of("/", Origin="http://evil.example")[0] == 403
+
+
+def test_two_hundred_connections_that_read_nothing_leave_the_others_alone(server):
+    netloc, token = address()
+    host, _, port = netloc.partition(":")
+    shaking = (
+        f"GET /stage HTTP/1.1\r\nHost: {netloc}\r\nUpgrade: websocket\r\nConnection: Upgrade\r\n"
+        "Sec-WebSocket-Key: dGhlIHNhbXBsZSBub25jZQ==\r\nSec-WebSocket-Version: 13\r\n"
+        f"Sec-WebSocket-Protocol: {SUBPROTOCOL}, {TOKEN_PREFIX}{token}\r\n\r\n"
+    ).encode()
+    with alive() as stage, contextlib.ExitStack() as stack:
+        connections = [stack.enter_context(socket.create_connection((host, int(port)), 10)) for _ in range(200)]
+        for each in connections:
+            with contextlib.suppress(OSError):
+                each.sendall(shaking)
+        answers = []
+        for each in connections:
+            with contextlib.suppress(OSError):
+                answers.append(each.recv(12))
+        assert answers.count(b"HTTP/1.1 101") <= CLIENTS_MOST
+        assert len(answers) > 0
+        driven(stage)
+        assert stage.move_to(x=0.5e-6).state == "done"
+
+
+def test_a_server_that_is_killed_in_a_scan_leaves_a_stage_that_holds(server):
+    """Its successor finds the same loop, in the same run, without a fault, standing."""
+    with alive() as stage:
+        driven(stage)
+        stage.follow("raster", wait=False)
+        while stage.status.progress < 0.2:
+            time.sleep(0.01)
+        before_s = stage.status.t_s
+        loop = place.read("stage", "loop")
+        server.process.kill()
+        server.process.wait(5)
+    time.sleep(0.3)
+    server.start()
+    with alive() as stage:
+        assert place.read("stage", "loop") == loop
+        assert stage.status.t_s > before_s
+        assert stage.status.last_fault == ""
+        assert stage.status.activity == "holding"
+        position = stage.status.target_m
+        assert position[2] > 15e-6
+        assert stage.move_to(x=0.0, y=0.0, z=18e-6).state == "done"
+
+
+def test_at_the_end_nothing_is_left(server):
+    pids = [place.read("stage", kind)["pid"] for kind in ("loop", "plant")]
+    assert server.end() == 0
+    end_s = time.monotonic() + 5
+    for pid in pids:
+        while place._is_alive(pid) and time.monotonic() < end_s:
+            time.sleep(0.02)
+        assert not place._is_alive(pid), Path(f"/proc/{pid}/stat").read_text()
+    assert not list(place.folder().glob("*.json"))
+    server.start()  # the fixture ends it
