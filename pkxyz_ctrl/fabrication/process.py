@@ -162,7 +162,10 @@ class Process(FrozenModel):
     pressure_pa: Spread = Spread()
     """of the gas around the device, itself"""
     requirements: Annotated[dict[str, Bound], Field(min_length=1)]
-    """figure by name of ``figures.FIGURES``, or of the closed loop: where it has to lie"""
+    """figure by name of ``figures.FIGURES``: where it has to lie"""
+    closed_loop: Annotated[dict[str, Bound], Field(default_factory=dict)]
+    """figure of a loop, ``"shipped.error_nm"`` and the like: where it has to lie under the law as shipped, and under
+    one designed for what an identification finds (``known``)"""
 
 
 SOURCES: tuple[str, ...] = (

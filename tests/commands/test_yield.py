@@ -18,7 +18,7 @@ def pkxyz(capsys, monkeypatch, *words):
 
 def test_a_study_leaves_table_summary_and_picture_and_any_device_again(capsys, monkeypatch, tmp_path):
     monkeypatch.chdir(tmp_path)
-    words = ("yield", "--devices", 300, "--sensitivity", 64, "--workers", 1, "--json")
+    words = ("yield", "--devices", 300, "--loops", 3, "--sensitivity", 64, "--workers", 1, "--json")
     code, shown = pkxyz(capsys, monkeypatch, *words)
     assert (code, shown.err) == (0, "")
     data = json.loads(shown.out)
@@ -27,26 +27,41 @@ def test_a_study_leaves_table_summary_and_picture_and_any_device_again(capsys, m
     assert 0.0 <= data["shares"]["ok"]["low"] <= data["shares"]["ok"]["value"] <= data["shares"]["ok"]["high"]
     assert data["causes"]["total_index_and_error"].keys() == {*data["shares"]}
     assert json.loads((tmp_path / "yield" / "summary.json").read_text()) == data
-    assert sorted(p.name for p in (tmp_path / "yield").iterdir()) == ["devices", "summary.json", "wafer.png"]
+    assert data["loops"]["known"]["devices"] == 3
+    left = sorted(p.name for p in (tmp_path / "yield").iterdir())
+    assert left == ["devices", "loops", "loops.png", "summary.json", "wafer.png"]
     code, shown = pkxyz(capsys, monkeypatch, "yield", "--alone", 123, "--json")
     assert code == 0
     alone = json.loads(shown.out)
     assert alone["device"] == 123
     assert len(alone["etch_bias_m"]) == 3
+    assert 1.0 < alone["shipped.peak_s"] < 3.0
     again, shown = pkxyz(capsys, monkeypatch, *words)
     assert (again, json.loads(shown.out)) == (0, data)  # from the table, bit for bit
 
 
 def test_what_is_shown_is_a_table_and_what_wins_most(capsys, monkeypatch, tmp_path):
     code, shown = pkxyz(
-        capsys, monkeypatch, "yield", "--devices", 200, "--sensitivity", 0, "--workers", 1, "--out", tmp_path
+        capsys,
+        monkeypatch,
+        "yield",
+        "--devices",
+        200,
+        "--loops",
+        0,
+        "--sensitivity",
+        0,
+        "--workers",
+        1,
+        "--out",
+        tmp_path,
     )
     assert code == 0
     assert "200 devices of oreo_drie by the drawing reconstructed, seed 1" in shown.out
     assert "all of them" in shown.out
-    code, shown = pkxyz(capsys, monkeypatch, "yield", "--alone", 5)
+    code, shown = pkxyz(capsys, monkeypatch, "yield", "--alone", 5, "--loops", 0)
     assert code == 0
     assert "split_hz: " in shown.out
-    code, shown = pkxyz(capsys, monkeypatch, "yield", "--devices", 200, "--seed", 2, "--out", tmp_path)
+    code, shown = pkxyz(capsys, monkeypatch, "yield", "--devices", 200, "--seed", 2, "--loops", 0, "--out", tmp_path)
     assert code == 2
     assert "devices of another study" in shown.err

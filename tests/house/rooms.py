@@ -84,7 +84,7 @@ HOUSE: Mapping[str, Room] = MappingProxyType({
     "hil.server": Room(("pkxyz_ctrl.*", "hil.operate", "hil.runs")),
     # many times, for one question
     "hil.studies.spread": Room(("pkxyz_ctrl.*",)),
-    "hil.studies.wafer": Room(("pkxyz_ctrl.*", "hil.studies.spread")),
+    "hil.studies.wafer": Room(("sim.config", "pkxyz_ctrl.*", "hil.lanes", "hil.runs", "hil.studies.spread")),
     "hil.studies.margins": Room(("pkxyz_ctrl.*", "hil.lanes")),
     "hil.studies.identify": Room(("pkxyz_ctrl.*", "hil.lanes", "hil.studies.margins")),
     "hil.studies.tune": Room(("pkxyz_ctrl.*", "hil.lanes", "hil.runs", "hil.studies.spread")),

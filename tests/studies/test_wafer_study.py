@@ -9,7 +9,7 @@ from process_rig import SHIPPED, STAGE, process
 
 from hil.studies.wafer.causes import PLACE, causes
 from hil.studies.wafer.shares import share_of
-from hil.studies.wafer.study import PART_WAFERS, WaferStudy, run_study
+from hil.studies.wafer.study import PART_WAFERS, WaferStudy, parts_for, run_study
 from hil.studies.wafer.table import Table
 from pkxyz_ctrl.config.calibration import Calibration
 from pkxyz_ctrl.config.files import ConfigError
@@ -25,7 +25,7 @@ def study(of=SHIPPED, seed=1):
 
 def kept(asked, folder, devices, workers=1):
     table = Table(folder, asked.digest())
-    run_study(asked, devices, table, workers)
+    run_study(asked, parts_for(SHIPPED, devices), table, workers)
     return table
 
 
@@ -59,12 +59,12 @@ def test_an_interrupted_study_goes_on_and_is_the_same(tmp_path):
             raise KeyboardInterrupt
 
     with pytest.raises(KeyboardInterrupt):
-        run_study(asked, 2 * PART, table, 1, on_progress=interrupt)
+        run_study(asked, 2, table, 1, on_progress=interrupt)
     assert table.parts == {0}
     half = table.read(["ok"], 2 * PART)["ok"]  # a partial result at any time
     worked = []
     resumed = Table(tmp_path / "a", asked.digest())
-    run_study(asked, 2 * PART, resumed, 1, on_progress=lambda done, total: worked.append(done))
+    run_study(asked, 2, resumed, 1, on_progress=lambda done, total: worked.append(done))
     assert worked == [1, 2]
     whole = resumed.read(["ok", "top_v"], 2 * PART)
     assert whole["ok"][:PART].tolist() == half.tolist()

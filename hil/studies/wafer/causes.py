@@ -16,7 +16,7 @@ import numpy as np
 import scipy.stats
 from numpy.typing import NDArray
 
-from hil.studies.wafer.study import WaferStudy
+from hil.studies.wafer.study import WaferStudy, spread_die
 from pkxyz_ctrl.fabrication.figures import figures
 from pkxyz_ctrl.fabrication.process import SOURCES, Spread
 from pkxyz_ctrl.fabrication.wafer import Deviates, Sampled, dies_per_wafer, sample_wafers
@@ -66,7 +66,7 @@ def causes(study: WaferStudy, count: int, on_progress: Callable[[int, int], None
     steps = len(names) + len(spread) + 2
 
     def look(asked: WaferStudy, sampled: Sampled, done: int) -> Array:
-        found = figures(asked.stage, asked.drawn, asked.made(sampled))
+        found = figures(asked.stage, asked.as_drawn, asked.made(sampled))
         on_progress(done, steps)
         works = asked.verdicts(found)["ok"]
         return np.stack([*(np.nan_to_num(found[name], posinf=_INFINITE) for name in wanted[:-1]), works])
@@ -95,14 +95,9 @@ def _independent(study: WaferStudy, first: int, count: int) -> Sampled:
     for begin in range(0, count, 64):
         some = min(64, count - begin)
         sampled = sample_wafers(study.process, study.seed, range(_FRESH + first + begin, _FRESH + first + begin + some))
-        found.append(sampled.take(np.arange(some) * dies + _die_of(first + begin + np.arange(some), dies)))
+        found.append(sampled.take(np.arange(some) * dies + spread_die(first + begin + np.arange(some), dies)))
     deviates = {name: _joined([d.deviates[name] for d in found]) for name in SOURCES}
     return Sampled(np.concatenate([d.device for d in found]), np.concatenate([d.place_m for d in found]), deviates)
-
-
-def _die_of(number: NDArray[np.int64], dies: int) -> NDArray[np.int64]:
-    """A die for each wafer that no other choice depends on, all dies alike often: steps by the golden ratio."""
-    return np.asarray((number * 0.6180339887498949 % 1.0 * dies).astype(np.int64))
 
 
 def _joined(parts: list[Deviates]) -> Deviates:

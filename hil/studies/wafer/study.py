@@ -7,7 +7,7 @@ that was interrupted goes on where it stopped.
 from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass
 from functools import cached_property
-from typing import Any
+from typing import Any, Protocol
 
 import numpy as np
 from numpy.typing import NDArray
@@ -47,10 +47,10 @@ class WaferStudy:
             raise ConfigError(
                 f"{self.stage.name}: is one measured device, not a drawing; give the stage file it began as"
             )
-        _ = self.drawn
+        _ = self.as_drawn
 
     @cached_property
-    def drawn(self) -> Devices:
+    def as_drawn(self) -> Devices:
         """One device as drawn."""
         return _told(lambda: as_drawn(self.stage, self.process))
 
@@ -69,6 +69,10 @@ class WaferStudy:
         """Devices with these random numbers."""
         return _told(lambda: made(self.stage, self.process, sizes(self.process, sampled)))
 
+    def part(self, number: int) -> Columns:
+        """``columns`` of the wafers of a part."""
+        return self.columns(range(number * PART_WAFERS, (number + 1) * PART_WAFERS))
+
     def columns(self, wafers: range) -> Columns:
         """All that is kept of the devices of whole wafers: number, place, sizes (of the chains, the mean), figures,
         and of each requirement whether it is met.
@@ -76,7 +80,7 @@ class WaferStudy:
         sampled = sample_wafers(self.process, self.seed, wafers)
         size = sizes(self.process, sampled)
         devices = _told(lambda: made(self.stage, self.process, size))
-        found = figures(self.stage, self.drawn, devices)
+        found = figures(self.stage, self.as_drawn, devices)
         return {
             "device": sampled.device,
             "wafer": sampled.device // dies_per_wafer(self.process),
@@ -111,33 +115,33 @@ def within(values: Array, least: float | None, most: float | None) -> NDArray[np
     return np.asarray(above & (np.ones(len(values), np.bool_) if most is None else values <= most))
 
 
+class Parts(Protocol):
+    """Work in numbered parts, each a table's."""
+
+    def part(self, number: int) -> Columns:
+        """Columns of a part."""
+        ...
+
+
 def run_study(
-    study: WaferStudy,
-    devices: int,
+    study: Parts,
+    parts: int,
     table: Table,
     workers: int,
     scheduler: str | None = None,
     on_progress: Callable[[int, int], None] = lambda done, total: None,
 ) -> None:
-    """Work out the parts that hold devices 0 to ``devices`` and are not in the table yet. Interrupted, it keeps those
-    that are done.
+    """Work out those of the first ``parts`` parts that are not in the table yet. Interrupted, it keeps those that are
+    done.
     """
-    parts = parts_for(study.process, devices)
     left = [part for part in range(parts) if part not in table.parts]
     on_progress(parts - len(left), parts)
     if workers == 1 and scheduler is None:
-        done = ((part, _part(study, part)) for part in left)
-        _keep(done, table, parts - len(left), parts, on_progress)
-        return
-    if left:
+        _keep(((part, study.part(part)) for part in left), table, parts - len(left), parts, on_progress)
+    elif left:
         with worker_pool(workers, scheduler) as (pool, width):
-            _keep(
-                as_done(pool, width, with_constant(_part, study), left, ahead=width),
-                table,
-                parts - len(left),
-                parts,
-                on_progress,
-            )
+            done = as_done(pool, width, with_constant(_part, study), left, ahead=width)
+            _keep(done, table, parts - len(left), parts, on_progress)
 
 
 def parts_for(process: Process, devices: int) -> int:
@@ -145,8 +149,13 @@ def parts_for(process: Process, devices: int) -> int:
     return -(-devices // (PART_WAFERS * dies_per_wafer(process)))
 
 
-def _part(study: WaferStudy, part: int) -> Columns:
-    return study.columns(range(part * PART_WAFERS, (part + 1) * PART_WAFERS))
+def _part(study: Parts, part: int) -> Columns:
+    return study.part(part)
+
+
+def spread_die(wafer: NDArray[np.int64], dies: int) -> NDArray[np.int64]:
+    """A die for each wafer, all dies alike often: steps by the golden ratio."""
+    return np.asarray((wafer * 0.6180339887498949 % 1.0 * dies).astype(np.int64))
 
 
 def _keep(

@@ -55,7 +55,10 @@ class Table:
 
     def read(self, names: Sequence[str], devices: int) -> dict[str, NDArray[Any]]:
         """Columns of the devices below a number, in their order, of the parts that are there."""
-        read = [pq.read_table(self._path(part), columns=[*names, "device"]) for part in sorted(self.parts)]
+        read = [
+            pq.read_table(self._path(part), columns=list(dict.fromkeys((*names, "device"))))
+            for part in sorted(self.parts)
+        ]
         whole = pa.concat_tables(read)
         keep = whole.column("device").to_numpy() < devices
         return {name: np.asarray(whole.column(name).to_numpy())[keep] for name in names}

@@ -1,0 +1,61 @@
+"""Sampled devices in a closed loop: what the shipped law makes of them, and one that knows the device."""
+
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from matplotlib.axes import Axes
+from numpy.typing import NDArray
+
+from hil.pictures.style import BLUE, GREEN, bound, dress, legend, save, sheet
+from hil.studies.wafer.closed_loop import ClosedLoops
+from hil.studies.wafer.shares import Share
+
+Columns = Mapping[str, NDArray[Any]]
+
+_COLOURS = {"shipped": BLUE, "known": GREEN}
+_LEGEND = {"shipped": "law as shipped", "known": "law for the device as it is"}
+_PANELS = {
+    "peak_s": "Ms in the middle of the strokes",
+    "error_about_mean_nm": "RMS error about its mean (nm)",
+    "error_nm": "RMS error (nm)",
+}
+
+
+def draw_loops(asked: ClosedLoops, columns: Columns, shares: Mapping[str, Share], path: Path) -> None:
+    """Each figure over the share of devices that stay below it, and what the links' height leaves of the error.
+
+    ``columns`` of the study's table; ``shares`` by law.
+    """
+    said = ", ".join(f"{_LEGEND[law]}: {shares[law].value:.0%} work" for law in asked.laws)
+    name = f"{asked.wafers.process.name}, {asked.scenario.config.name}, {len(columns['device'])} devices"
+    figure = sheet(15.0, 4.4, f"{name}; {said}")
+    panels = figure.subplots(1, 4)
+    for plot, (key, words) in zip(panels, _PANELS.items(), strict=False):
+        for law in asked.laws:
+            _below(plot, columns[f"{law}.{key}"], law)
+            limit = asked.wafers.process.closed_loop.get(f"{law}.{key}")
+            if limit is not None and limit.max is not None:
+                plot.axvline(limit.max, color=_COLOURS[law], lw=1.0, ls="--")
+        plot.set_xscale("linear" if key == "peak_s" else "log")
+        plot.set_ylim(0.0, 101.0)
+        dress(plot, words, "devices at most there (%)")
+    legend(panels[0], "lower right")
+    _over_height(panels[3], asked, columns)
+    save(figure, path)
+
+
+def _below(plot: Axes, values: NDArray[np.float64], law: str) -> None:
+    order = np.sort(values[np.isfinite(values)])
+    share = 100.0 * np.arange(1, len(order) + 1) / len(values)
+    plot.step(order, share, where="post", color=_COLOURS[law], label=_LEGEND[law])
+
+
+def _over_height(plot: Axes, asked: ClosedLoops, columns: Columns) -> None:
+    for law in asked.laws:
+        error = columns[f"{law}.error_nm"]
+        plot.plot(1e6 * columns["handle_m"], error, ".", ms=5, color=_COLOURS[law], alpha=0.8)
+    bound(plot, 5.0, "5 nm", float(1e6 * columns["handle_m"].min()))
+    plot.set_yscale("log")
+    dress(plot, "handle thicker than drawn (um)", "RMS error (nm)")

@@ -1,0 +1,231 @@
+"""Sampled devices in a closed loop: margins, and the error of a scenario on the fast lane.
+
+Device k of this part lies on wafer k, so that the devices are independent of each other. Each is run under the law as
+shipped, which knows the drawing only, and if asked also under the law designed for what an identification without
+error would find: springs, combs, sense combs and damping of this device, by the drawing's mass. Links are taken to be
+alike (their mean), which the plant's mechanism has them.
+"""
+
+import math
+from collections.abc import Mapping
+from dataclasses import dataclass, replace
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from hil.lanes import in_process as lanes
+from hil.lanes.lane import Lane
+from hil.lanes.setup import Setup
+from hil.runs.metrics import Metrics
+from hil.runs.scenario import Scenario, resolve
+from hil.studies.wafer.study import WaferStudy, spread_die, within
+from pkxyz_ctrl.config import files as config
+from pkxyz_ctrl.config.calibration import Calibration
+from pkxyz_ctrl.config.files import ConfigError
+from pkxyz_ctrl.config.stage import StageConfig
+from pkxyz_ctrl.design.law import design_law
+from pkxyz_ctrl.design.law_about import law_about
+from pkxyz_ctrl.design.margins.margins import peak_sensitivity
+from pkxyz_ctrl.design.model.loop_plant import Perturbation, loop_plant
+from pkxyz_ctrl.fabrication.devices import Devices
+from pkxyz_ctrl.fabrication.process import SOURCES
+from pkxyz_ctrl.fabrication.wafer import dies_per_wafer, sample_devices
+from pkxyz_ctrl.stage import Stage
+from sim.config import Device, PlantConfig
+
+Array = NDArray[np.float64]
+Triple = tuple[float, float, float]
+
+PART_DEVICES = 16
+LAWS = ("shipped", "known")
+LOOP_FIGURES: dict[str, str] = {
+    "peak_s": "largest singular value of the sensitivity, in the middle of the strokes; infinite: unstable",
+    "error_nm": "RMS error of the scenario's scan, of the worst axis; infinite: ended in a fault",
+    "error_about_mean_nm": "the same about its own mean, which an offset shifts",
+}
+"""Of each law: columns are ``shipped.peak_s`` and so on."""
+
+
+@dataclass(frozen=True)
+class ClosedLoops:
+    """What is asked of devices in a loop. The scenario's stage is the drawing."""
+
+    wafers: WaferStudy
+    scenario: Scenario
+    known: bool
+    """also under a law designed for each device"""
+
+    def __post_init__(self) -> None:
+        names = [f"{law}.{figure}" for law in LAWS for figure in LOOP_FIGURES]
+        unknown = [name for name in self.wafers.process.closed_loop if name not in names]
+        if unknown:
+            raise ConfigError(
+                f"{self.wafers.process.name}: closed_loop.{unknown[0]!r}: no such figure; known: {', '.join(names)}"
+            )
+
+    def digest(self) -> str:
+        """Of all that decides about a device's loop, its number apart."""
+        return config.digest({"wafers": self.wafers.digest(), "scenario": resolve(self.scenario), "known": self.known})
+
+    @property
+    def columns(self) -> tuple[str, ...]:
+        """Columns of the figures of the laws that are run."""
+        return tuple(f"{law}.{figure}" for law in self.laws for figure in LOOP_FIGURES)
+
+    @property
+    def verdict_columns(self) -> tuple[str, ...]:
+        """Columns of verdicts: each requirement of the laws that are run, and all of each law."""
+        asked = (name for name in self.wafers.process.closed_loop if name.partition(".")[0] in self.laws)
+        return (*(f"ok.{name}" for name in asked), *(f"ok.{law}" for law in self.laws))
+
+    @property
+    def laws(self) -> tuple[str, ...]:
+        """Those of ``LAWS`` that are run."""
+        return LAWS if self.known else LAWS[:1]
+
+    def numbers(self, part: int) -> NDArray[np.int64]:
+        """Numbers of the devices of a part: one on each of its wafers."""
+        wafer = part * PART_DEVICES + np.arange(PART_DEVICES)
+        dies = dies_per_wafer(self.wafers.process)
+        return np.asarray(wafer * dies + spread_die(wafer, dies))
+
+    def part(self, number: int) -> dict[str, NDArray[Any]]:
+        """All that is kept of the devices of a part: ``device`` is k, ``number`` what it has in the wafers' table."""
+        numbers = self.numbers(number)
+        rows = [self.device(int(n)) for n in numbers]
+        found = {name: np.array([row[name] for row in rows], dtype=np.float64) for name in rows[0]}
+        first = number * PART_DEVICES
+        return {
+            "device": np.arange(first, first + PART_DEVICES),
+            "number": numbers,
+            **found,
+            **self.verdicts(found),
+        }
+
+    def verdicts(self, found: Mapping[str, Array]) -> dict[str, NDArray[np.bool_]]:
+        """``ok.NAME`` for each requirement on the loop whose law was run; ``ok.LAW``: all of a law's and all of the
+        device's own.
+        """
+        bounds = {k: b for k, b in self.wafers.process.closed_loop.items() if k.partition(".")[0] in self.laws}
+        each = {f"ok.{name}": within(found[name], b.min, b.max) for name, b in bounds.items()}
+        own = found["own"] > 0.5
+        return each | {
+            f"ok.{law}": np.logical_and.reduce([own, *(each[f"ok.{n}"] for n in bounds if n.startswith(f"{law}."))])
+            for law in self.laws
+        }
+
+    def device(self, number: int) -> dict[str, float]:
+        """Figures of one device by its number, its sizes (of the chains, the mean), and whether it meets what is asked
+        of it without a loop (``own``: 1 or 0).
+        """
+        of = self.wafers
+        made = of.made(sample_devices(of.process, of.seed, number, 1))
+        truth = Truth(of.stage, of.as_drawn, made)
+        alone = of.alone(number)
+        found = {"own": float(alone["ok"]), **{name: float(np.mean(alone[name])) for name in SOURCES}}
+        for law in self.laws:
+            found |= {f"{law}.{name}": value for name, value in self._run(truth, number, law == "known").items()}
+        return found
+
+    def _run(self, truth: "Truth", number: int, known: bool) -> dict[str, float]:
+        asked = replace(
+            self.scenario,
+            config=self.scenario.config.model_copy(update={"seed": number}),
+            plant=truth.plant(self.scenario.plant),
+        ).setup()
+        setup = replace(asked, stage=truth.stage if known else asked.stage, device=truth.device(asked.device))
+        if known:  # of no use to anybody else: not to be kept with the shipped ones
+            setup.__dict__["law"] = design_law(Stage(setup.stage), setup.controller, setup.bus, autostart=True)
+        metrics = Metrics(setup.trajectory, setup.bus.period_us)
+        ran = lanes.run(setup, Lane.FAST, on_block=metrics.update)
+        figures = metrics.figures()
+
+        def worst(values: Mapping[str, float] | None) -> float:
+            return math.inf if ran.faults or values is None else max(values.values())
+
+        return {
+            "peak_s": truth.peak_sensitivity(setup),
+            "error_nm": worst(figures.rms_error_nm),
+            "error_about_mean_nm": worst(figures.error_deviation_nm),
+        }
+
+
+class Truth:
+    """One device as stage file, plant and linear plant have it."""
+
+    def __init__(self, drawing: StageConfig, drawn: Devices, made: Devices) -> None:
+        self._drawing = drawing
+        self._mass = float(made.mass_kg[0] / drawn.mass_kg[0])
+        self._slider = made.slider_n_per_m[0] / drawn.slider_n_per_m[0]
+        self._crank = made.crank_n_m_per_rad[0] / drawn.crank_n_m_per_rad[0]
+        self._link = float(made.link_n_m_per_rad[0] / drawn.link_n_m_per_rad[0])
+        self._comb, self._sense = made.comb_gain[0], made.sense_gain[0]
+        self._quality = float(made.quality_factor[0])
+        self._height_m, self._projection_m = float(made.height_m[0]), float(made.projection_m[0].mean())
+
+    @property
+    def stage(self) -> StageConfig:
+        """The drawing with what an identification finds: forces and stiffnesses go with the drawing's mass."""
+        return self._drawing.model_copy(
+            update={
+                "calibration": Calibration(
+                    comb_gain=_triple(self._comb / self._mass),
+                    sense_gain=_triple(self._sense),
+                    slider_stiffness=_triple(self._slider / self._mass),
+                    crank_stiffness=_triple(self._crank / self._mass),
+                    link_stiffness=self._link / self._mass,
+                    quality_factor=self._quality,
+                )
+            }
+        )
+
+    def device(self, drawn: Device) -> Device:
+        """Links as they were made, for the plant."""
+        return drawn.model_copy(update={"geometry": drawn.geometry.model_copy(update=self._links())})
+
+    def plant(self, plant: PlantConfig) -> PlantConfig:
+        """A plant with this device's errors in place of its own of these kinds."""
+        data = plant.model_dump()
+        data["stiffness_mismatch"] |= {
+            "on": True,
+            "leaf": _triple(self._slider - 1.0),
+            "crank_hinge": _triple(self._crank - 1.0),
+            "link_hinge": (self._link - 1.0,) * 3,
+        }
+        data["mass_error"] |= {"on": True, "relative": self._mass - 1.0}
+        data["comb_mismatch"] |= {"on": True, "relative": _triple(self._comb - 1.0)}
+        data["sense_gain"] |= {"on": True, "relative": _triple(self._sense - 1.0)}
+        data["damping"] |= {"on": True, "quality_factor": self._quality}
+        return PlantConfig.model_validate(data)
+
+    def peak_sensitivity(self, setup: Setup) -> float:
+        """Ms of this device under a setup's law, in the middle of the strokes, sensed and pulled as that law has it."""
+        limits = self._drawing.limits
+        strokes = np.full(3, 0.5 * (limits.stroke_min_m + limits.stroke_max_m))
+        belief = Stage(setup.stage)
+        itself = Stage(
+            self.stage.model_copy(update={"geometry": self._drawing.geometry.model_copy(update=self._links())})
+        )
+        believed = setup.stage.calibration or Calibration()
+        pull = self._comb / self._mass / np.array(believed.comb_gain)
+        seen = self._sense / np.array(believed.sense_gain)
+        plant = loop_plant(itself, setup.bus, strokes, Perturbation(comb_gain=_triple(pull - 1.0)))
+        jacobian = itself.jacobian(itself.forward_kinematics(strokes))
+        scale = np.linalg.solve(jacobian, seen[:, None] * jacobian)
+        holds, thinks = (s.holding_forces(s.forward_kinematics(strokes)) for s in (itself, belief))
+        # by how much the controller is off about the forces that hold the point
+        law = law_about(belief, setup.law, strokes, Perturbation(comb_gain=_triple(pull * thinks / holds - 1.0)))
+        return peak_sensitivity(replace(plant, c=scale @ plant.c), law)
+
+    def _links(self) -> dict[str, float | None]:
+        return {
+            "link_projection_rest_m": self._projection_m,
+            "link_height_rest_m": self._height_m,
+            "link_length_m": None,
+            "elevation_rest_rad": None,
+        }
+
+
+def _triple(values: Array) -> Triple:
+    return float(values[0]), float(values[1]), float(values[2])
