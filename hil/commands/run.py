@@ -34,6 +34,9 @@ ReplaceEarlier = Annotated[
 Refresh = Annotated[
     str | None, typer.Option(metavar="FILE", help="Begin with what a run has learnt, and go on learning.")
 ]
+Adapted = Annotated[
+    str | None, typer.Option(metavar="FILE", help="Begin with what a run has learnt of the device (its adapted.json).")
+]
 _MEETING_BUSES = ("unix_2k", "unix_1k")  # on one channel: a plant on one of them serves a controller on the other, too
 
 
@@ -47,6 +50,7 @@ def run(
     learn: Learn = False,
     apply: Apply = None,
     refresh: Refresh = None,
+    adapted: Adapted = None,
     replace_earlier: ReplaceEarlier = False,
     wait_s: Annotated[
         float, typer.Option("--wait", min=0, max=3600, help="Seconds until somebody else has to be on the bus.")
@@ -73,7 +77,9 @@ def run(
     require_seconds(duration_s)
     say_if_compiling(quiet=as_json)
     try:
-        loaded = _met(scenario, measured=True, stage=stage, controller=controller, bus=bus, learning=learning)
+        loaded = _met(
+            scenario, measured=True, stage=stage, controller=controller, bus=bus, learning=learning, adapted=adapted
+        )
     except Ended as end:
         raise typer.Exit(128 + end.signal_number) from None
     loaded = _lasting(loaded, duration_s)

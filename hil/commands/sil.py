@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from hil.commands.run import Apply, Learn, Refresh, ReplaceEarlier, learning_of
+from hil.commands.run import Adapted, Apply, Learn, Refresh, ReplaceEarlier, learning_of
 from hil.lanes.lane import Lane
 from hil.screen.choices import InProcessLane, require_simulated
 from hil.screen.figures import error_lines, where_to_read
@@ -38,6 +38,7 @@ def sil(
     learn: Learn = False,
     apply: Apply = None,
     refresh: Refresh = None,
+    adapted: Adapted = None,
     replace_earlier: ReplaceEarlier = False,
     as_json: Annotated[bool, typer.Option("--json", help="Print the summary as JSON, and nothing else.")] = False,
 ) -> None:
@@ -53,8 +54,9 @@ def sil(
     faults = [parse(text) for text in fault or ()]
     learning = learning_of(learn, apply, refresh)
     loaded = load_scenario(
-        scenario, seed=seed, stage=stage, plant=plant, controller=controller, bus=bus, faults=faults, learning=learning
-    )
+        scenario, seed=seed, stage=stage, plant=plant, controller=controller, bus=bus, faults=faults,
+        learning=learning, adapted=adapted,
+    )  # fmt: skip
     from hil.pictures.run import draw
     from hil.recording.recording import RecordingError
     from hil.runs.run import require_bus, run_into

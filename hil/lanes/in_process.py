@@ -38,6 +38,8 @@ class LaneResult:
     """stage time over the machine's time"""
     learner: Learner | None = None
     """what was learnt, where the run learns"""
+    adaptation: NDArray[np.void] | None = None
+    """(1,) of ``core.adaptation.ADAPTATION_STATE`` in the end: what was learnt of the device"""
 
 
 def run(
@@ -70,11 +72,12 @@ def run(
         rig = LockstepRig(setup, frame_log)
         begin_s = time.perf_counter()  # designed, wired up and loaded: what is timed from here is the run
         missed, load = rig.run(blocks)
-        faults = rig.controller.faults
+        faults, memory = rig.controller.faults, rig.controller.memory
     else:
         raise ValueError(f"the {lane} lane waits for a clock: hil.lanes.wall")
     factor = setup.ticks * setup.bus.period_s / (time.perf_counter() - begin_s)
-    return LaneResult(setup.ticks, missed, load, tuple(faults), factor, learner)
+    adaptation = memory["tick"]["adaptation"].copy()
+    return LaneResult(setup.ticks, missed, load, tuple(faults), factor, learner, adaptation)
 
 
 def _run_fast(setup: Setup, run_block: RunBlock, memory: NDArray[np.void], plant: Plant, blocks: Blocks) -> list[str]:

@@ -5,6 +5,9 @@ import time
 from collections.abc import Callable
 from dataclasses import dataclass
 
+import numpy as np
+from numpy.typing import NDArray
+
 from hil.lanes.ending import Ended, Ending
 from hil.lanes.lane import Lane
 from hil.lanes.wall import AmplifierGoneError, WallRig, require_real_bus
@@ -51,6 +54,7 @@ class _Watched:
     dropped_frames: int | None = None
     blocked_frames: int = 0
     learner: Learner | None = None
+    adaptation: NDArray[np.void] | None = None
 
 
 def run_into(
@@ -106,7 +110,7 @@ def _run_into(
         lost_rows=recorder.lost_rows,
         lateness_us={name: percentile_us(late, share) for name, share in _SHARES.items()},
     )
-    summary = begun.end(rows, loop, watched.learner, interrupted=bool(watched.ended_by))
+    summary = begun.end(rows, loop, watched.learner, watched.adaptation, interrupted=bool(watched.ended_by))
     return RanAtRate(summary, watched.ended_by, late)
 
 
@@ -131,6 +135,7 @@ def _run(rig: WallRig, watched: _Watched, say: Callable[[str], object], ending: 
             watched.refused_frames = rig.can_port.refused
             watched.dropped_frames = rig.dropped_frames
             watched.blocked_frames = rig.controller.gate.blocked_frames
+            watched.adaptation = rig.controller.memory["tick"]["adaptation"].copy()
             watched.learner = rig.live.learner if rig.live is not None else None
 
 

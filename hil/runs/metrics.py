@@ -14,6 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from pkxyz_ctrl.loop.row import ROW
+from pkxyz_ctrl.loop.warnings import Warnings
 from pkxyz_ctrl.safety.modes import Mode
 from pkxyz_ctrl.trajectory import Trajectory
 
@@ -63,6 +64,8 @@ class RowFigures:
     hold_rms_nm: Mapping[str, float] | None
     hold_noise_nm: Mapping[str, float] | None
     estimate_error_nm: Mapping[str, float] | None
+    warnings: tuple[str, ...] = ()
+    """what of the device has changed during the run"""
 
 
 @dataclass(frozen=True)
@@ -117,6 +120,7 @@ class Metrics:
         self._error = _Sums()
         self._estimate = _Sums()
         self._noise = [_Sums() for _ in self._stills]
+        self._warnings = Warnings()
         self.ticks = 0
         self.saturated_ticks = 0
 
@@ -126,6 +130,7 @@ class Metrics:
             raise TypeError(f"a block of rows is expected, got {block.dtype}")
         self.ticks += len(block)
         self.saturated_ticks += int(np.count_nonzero(block["saturated"]))
+        self._warnings.update(block)
         tick = block["reference_tick"]
         t_us = np.where((tick >= 0) & (block["mode"] == Mode.TRACKING), tick * self._period_us, -1)
         if len(t_us) == 0:
@@ -154,6 +159,7 @@ class Metrics:
             hold_rms_nm=self._hold_rms(),
             hold_noise_nm=self._hold_noise(),
             estimate_error_nm=_by_axis(self._estimate.rms()) if scanned else None,
+            warnings=self._warnings.sentences,
         )
 
     def _hold_rms(self) -> dict[str, float] | None:

@@ -10,6 +10,7 @@ from numpy.typing import NDArray
 from hil.lanes import in_process as lanes
 from hil.lanes.lane import Lane
 from hil.recording.recording import RecordingWriter
+from hil.runs.adapted import save
 from hil.runs.learning import Learning
 from hil.runs.metrics import Metrics, RowFigures
 from hil.runs.run_folder import RunFolder, metadata_of
@@ -44,8 +45,15 @@ class Begun:
         """What the recording carries with its rows."""
         return metadata_of(self.scenario, self.lane, self.resolved)
 
-    def end(self, rows: RowFigures, loop: LoopFigures, learner: Learner | None = None, *, interrupted: bool) -> Summary:
+    def end(
+        self, rows: RowFigures, loop: LoopFigures, learner: Learner | None = None,
+        adaptation: NDArray[np.void] | None = None, *, interrupted: bool,
+    ) -> Summary:  # fmt: skip
         """Store what was learnt and write the summary. Raises ``ConfigError`` and ``LearningError``."""
+        if adaptation is not None and self.folder is not None:
+            s = self.scenario
+            origin = {"scenario": s.config.name, "digest": self.resolved["digest"], "plant": s.plant.name}
+            save(self.folder.adapted, adaptation, s.stage, s.controller, origin | {"seed": s.config.seed})
         digest = self.resolved["digest"]
         file = self.folder.learnt if self.folder is not None else None
         learnt = self.learning.close(file, learner, digest) if self.learning is not None else None
@@ -95,7 +103,7 @@ def _run_into(folder: RunFolder, scenario: Scenario, lane: Lane, on_progress: Ca
     rows = begun.metrics.figures()
     if result is None:
         return begun.end(rows, LoopFigures(), interrupted=True)
-    return begun.end(rows, _figures_of(result), result.learner, interrupted=False)
+    return begun.end(rows, _figures_of(result), result.learner, result.adaptation, interrupted=False)
 
 
 def run_in_memory(

@@ -28,12 +28,13 @@ RECORDING, FRAMES, CONFIG, SUMMARY, PICTURE = (
     "report.png",
 )
 LEARNT, LEARNING_PICTURE = "learnt.json", "learning.png"
+ADAPTED = "adapted.json"
 _UNFINISHED = CONFIG + ".part"
 _OURS = {
     RECORDING, FRAMES, CONFIG, SUMMARY, PICTURE, RECORDING + ".journal", RECORDING + ".part", LEARNT, LEARNT_FROM,
-    LEARNING_PICTURE, _UNFINISHED,
+    LEARNING_PICTURE, ADAPTED, _UNFINISHED,
 }  # fmt: skip
-_SEALED = {RECORDING, FRAMES, CONFIG, LEARNT, LEARNT_FROM}
+_SEALED = {RECORDING, FRAMES, CONFIG, LEARNT, LEARNT_FROM, ADAPTED}
 _TABLE = re.compile(r"reference\.\d+\.csv")
 _EARLIER = ".earlier"
 """Folder inside, where an earlier run waits until the new one has recorded something."""
@@ -55,6 +56,7 @@ class RunFolder:
         self.summary = path / SUMMARY
         self.picture = path / PICTURE
         self.learnt = path / LEARNT
+        self.adapted = path / ADAPTED
         self.learning_picture = path / LEARNING_PICTURE
         self._earlier = path / _EARLIER
         self._replace = replace

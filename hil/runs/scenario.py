@@ -7,7 +7,7 @@
 import difflib
 import hashlib
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, NamedTuple, Self
@@ -147,10 +147,11 @@ def load_scenario(
     bus: str | None = None,
     faults: Sequence[Fault] = (),
     learning: dict[str, str] | None = None,
+    adapted: str | Path | None = None,
 ) -> Scenario:
     """Read a scenario and all that it names, with what the caller wants otherwise (paths from the
-    working folder). ``faults`` come on top of the scenario's own. The ``config.toml`` of a run is a
-    scenario, too, with all that it named inside.
+    working folder). ``faults`` come on top of the scenario's own; ``adapted`` names what an earlier run
+    has learnt of the device. The ``config.toml`` of a run is a scenario, too, with all that it named inside.
 
     Raises ``ConfigError`` with one line for each thing that is wrong, over all the files; ``TrajectoryError``, which is
     one, for a reference that the stage can't follow.
@@ -165,7 +166,13 @@ def load_scenario(
         data["learning"] = {key: value for key, value in own.items() if key != "file"} | learning
     scenario = config.parse(data, ScenarioConfig, str(source))
     scenario = scenario.model_copy(update={"faults": (*scenario.faults, *faults)})
-    return _resolved(scenario, source, held, from_here=tuple(given), learning_from_here=learning is not None)
+    loaded = _resolved(scenario, source, held, from_here=tuple(given), learning_from_here=learning is not None)
+    if adapted is None:
+        return loaded
+    from hil.runs.adapted import begun_with  # which few runs need
+
+    begun = begun_with(Path(adapted), loaded.stage, loaded.controller, loaded.bus, loaded.trajectory)
+    return replace(loaded, controller=begun)
 
 
 def build_scenario(data: Mapping[str, Any], folder: str | Path = ".") -> Scenario:

@@ -10,7 +10,7 @@ if TYPE_CHECKING:
 
 def error_lines(rows: "RowFigures", errors_are_of: str) -> Iterator[str]:
     """A line for each figure of three axes that every run has: error while scanning, and in holds about the set-point
-    and about the mean."""
+    and about the mean; and what of the device has changed."""
     by = ", by the estimate" if errors_are_of == "estimate" else ""
     for measured, words in (
         (rows.rms_error_nm, "rms error while scanning"),
@@ -19,6 +19,7 @@ def error_lines(rows: "RowFigures", errors_are_of: str) -> Iterator[str]:
     ):
         if measured:
             yield f"{words}{by}, x / y / z: {' / '.join(f'{value:.2f}' for value in measured.values())} nm"
+    yield from (f"warning: {words}" for words in rows.warnings)
 
 
 def where_to_read(faults: Iterable[str]) -> str | None:

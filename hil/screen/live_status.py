@@ -6,6 +6,7 @@ from typing import TextIO
 import numpy as np
 from numpy.typing import NDArray
 
+from pkxyz_ctrl.loop.warnings import in_words
 from pkxyz_ctrl.safety.modes import Mode
 from pkxyz_ctrl.safety.trips import explain
 
@@ -22,6 +23,7 @@ class LiveStatus:
         self._moves = self._out.isatty()
         self._every = max(1, round(_EVERY_S / period_s))
         self._mode = -1
+        self._warning = 0
         self._seen = self._missed = 0
         self._width = 0
 
@@ -36,6 +38,11 @@ class LiveStatus:
             self._say(f"{self._seen * self._period_s:9.3f} s  {Mode(mode).name.lower().replace('_', '-')}")
             if mode == Mode.FAULT:
                 self._say(f"{'':11}  {explain(int(row['trips'][0]))}")
+        warning = int(row["warning"][0])
+        if warning != self._warning:
+            self._warning = warning
+            words = in_words(warning, float(row["warning_share"][0])) or "what had changed is back"
+            self._say(f"{self._seen * self._period_s:9.3f} s  warning: {words}")
         if self._moves and (self._seen % self._every == 0 or self._seen >= self._ticks):
             self._move()
 

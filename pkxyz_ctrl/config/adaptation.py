@@ -1,13 +1,42 @@
 """What adaptation may learn, and how fast."""
 
-from typing import Annotated
+from typing import Annotated, Self
 
-from pydantic import Field
+import numpy as np
+from pydantic import Field, model_validator
 
 from pkxyz_ctrl.config.files import FrozenModel
 
 Positive = Annotated[float, Field(gt=0)]
 Spread = Annotated[float, Field(gt=0, le=0.5)]
+
+
+NUMBERS = (
+    "comb_gain_1", "comb_gain_2", "comb_gain_3", "slider_stiffness_1", "slider_stiffness_2", "slider_stiffness_3",
+    "crank_stiffness_1", "crank_stiffness_2", "crank_stiffness_3", "link_stiffness", "fringe", "lift", "damping",
+    "sense_delay_s", "sense_bend_s2",
+)  # fmt: skip
+"""What is learnt, in the order of ``core.adaptation``: relative errors but for the last two, fringe and lift."""
+_COUNT = len(NUMBERS)
+Finite = Annotated[float, Field(allow_inf_nan=False)]
+Values = Annotated[tuple[Finite, ...], Field(min_length=_COUNT, max_length=_COUNT)]
+
+
+class Start(FrozenModel):
+    """What an earlier run has learnt, in the units of ``NUMBERS``."""
+
+    values: Values
+    covariance: Annotated[tuple[Values, ...], Field(min_length=_COUNT, max_length=_COUNT)]
+
+    @model_validator(mode="after")
+    def _is_one(self) -> Self:
+        covariance = np.array(self.covariance)
+        spread = np.sqrt(np.abs(np.diag(covariance)))
+        if not (spread > 0.0).all() or not np.allclose(covariance, covariance.T, rtol=1e-6, atol=0.0):
+            raise ValueError("the covariance is not one: not symmetric, or without variance")
+        if np.linalg.eigvalsh(covariance / np.outer(spread, spread)).min() < -1e-6:
+            raise ValueError("the covariance is not one: it has a negative eigenvalue")
+        return self
 
 
 class Adaptation(FrozenModel):
@@ -23,6 +52,8 @@ class Adaptation(FrozenModel):
     """force up the fingers by pull"""
     damping: Annotated[float, Field(gt=0, le=5)] = 0.2
     sense_delay_s: Annotated[float, Field(gt=0, le=100e-6)] = 5e-6
+    start: Start | None = None
+    """of an earlier run; none: the stage file"""
     most_relative: Annotated[float, Field(gt=0, le=0.5)] = 0.35
     """most that is learnt of pull, springs, fringe and lift"""
     most_damping: Annotated[float, Field(gt=0, le=10)] = 4.0
@@ -48,3 +79,11 @@ class Adaptation(FrozenModel):
     """change of a comb or of springs from which on there is a warning"""
     alone: Annotated[float, Field(gt=0, le=1)] = 0.7
     """share that one cause has to explain to be named"""
+
+    @model_validator(mode="after")
+    def _start_within_bounds(self) -> Self:
+        most = [self.most_relative] * (_COUNT - 3) + [self.most_damping, self.most_delay_s]
+        for name, value, bound in zip(NUMBERS, self.start.values if self.start is not None else (), most, strict=False):
+            if abs(value) > bound * (1.0 + 1e-9):
+                raise ValueError(f"{name} = {value:g} is beyond the {bound:g} that may be learnt")
+        return self

@@ -55,6 +55,8 @@ ADAPTATION = np.dtype(
         ("variance_m2", "f8", (3,)),  # of the innovations, where the model is right
         ("spread", "f8", (PARAMETERS,)),  # how far devices differ, one standard deviation, in units of the parameter
         ("bound", "f8", (PARAMETERS,)),  # most that is learnt, in spreads
+        ("start", "f8", (PARAMETERS,)),  # what is known at the beginning, in spreads, and ...
+        ("start_covariance", "f8", (PARAMETERS, PARAMETERS)),  # ... how well
         ("doubt", "f8"),  # share of an unexpected innovation's square that counts as noise
         ("drift", "f8"),  # variance, in spreads squared, that an update loses
         ("follow", "f8"),  # share by which what acts follows what is learnt, each tick
@@ -66,6 +68,7 @@ ADAPTATION = np.dtype(
         ("alone", "f8"),  # ... least share of what the base leaves that one cause has to explain
         ("calm_ticks", "i4"),  # for so long, and without a limit
         ("base_updates", "i4"),  # after so many what is known becomes the base
+        ("known", "i4"),  # 1: the start is of an earlier run, and changes are counted from there
         ("on", "i4"),
     ],
     align=True,
@@ -122,6 +125,8 @@ def learn(
     """Take in the innovation (3,) of this sample, move the filter's state (9,) about ``origin_m`` along, and carry U to
     the next sample.
     """
+    if state["begun"] == 0:
+        begin(adaptation, state)
     if has_measurement:
         _show(adaptation, state, state["motion"][delay - 1])
     row, near = state["motion"][delay - 1], has_measurement
@@ -170,8 +175,6 @@ def _update(adaptation: np.void, state: np.void, axis: int, innovation_m: float)
     """One step of recursive least squares with the innovation of an axis: nu is -d nu times what theta still lacks."""
     p, learnt, acting = state["covariance"], state["learnt"], state["acting"]
     by, gain, base = state["shown"][axis], state["work"], state["base"]
-    if state["begun"] == 0:
-        begin(state)
     told, missing, since = 0.0, innovation_m, innovation_m
     for i in range(PARAMETERS):
         total = 0.0
@@ -202,12 +205,15 @@ def _update(adaptation: np.void, state: np.void, axis: int, innovation_m: float)
 
 
 @njit(cache=True, error_model="numpy")
-def begin(state: np.void) -> None:
-    """Know no more than the spreads."""
+def begin(adaptation: np.void, state: np.void) -> None:
+    """Know no more than the spreads, or what an earlier run has learnt."""
     state["begun"] = 1
     for i in range(PARAMETERS):
+        state["learnt"][i] = state["acting"][i] = adaptation["start"][i]
         for k in range(PARAMETERS):
-            state["covariance"][i, k] = 1.0 if i == k else 0.0
+            state["covariance"][i, k] = adaptation["start_covariance"][i, k]
+    if adaptation["known"] != 0:
+        set_base(state)
 
 
 @njit(cache=True, error_model="numpy")

@@ -8,6 +8,7 @@ from numpy.typing import NDArray
 from pkxyz_ctrl.config.bus import BusConfig
 from pkxyz_ctrl.config.controller import ControllerConfig
 from pkxyz_ctrl.core import adaptation as learning
+from pkxyz_ctrl.design.device_errors import spreads, within
 from pkxyz_ctrl.design.laws.estimator_gain import (
     innovation_variance,
     measurement_matrix,
@@ -50,18 +51,8 @@ def fill_adaptation(
     record["base_updates"] = max(1, round(config.base_s / bus.period_s))
     record["warn"], record["alone"] = config.warn_relative, config.alone
     record["forget"] = min(1.0, bus.period_s / config.forget_s)
+    start = config.start
+    record["start"] = 0.0 if start is None else np.array(start.values) / record["spread"]
+    record["start_covariance"] = np.eye(learning.PARAMETERS) if start is None else within(start, record["spread"])
+    record["known"] = start is not None
     record["on"] = controller.learn == "online"
-
-
-def spreads(controller: ControllerConfig, stage: Stage) -> Array:
-    """(PARAMETERS,): one standard deviation of each number, in its unit. How a sense chain of a delay tau bends is
-    not known: tau^2 / 2 for a pure delay, tau^2 for a pole.
-    """
-    config = controller.adaptation
-    spread = np.empty(learning.PARAMETERS)
-    spread[learning.COMB : learning.SLIDER] = config.comb_gain
-    spread[learning.SLIDER : learning.FRINGE] = config.stiffness
-    spread[learning.FRINGE], spread[learning.LIFT] = config.fringe, config.lift
-    spread[learning.DAMPING], spread[learning.DELAY] = config.damping, config.sense_delay_s
-    spread[learning.BEND] = max(config.sense_delay_s, stage.sense_delay_s) ** 2
-    return spread

@@ -45,7 +45,9 @@ def designed(**changes):
 
 def fresh(**changes):
     """Law and memory of a tick, both to be written to."""
-    return designed(**changes).copy()[0], np.zeros(1, tick.MEMORY)[0]
+    law, memory = designed(**changes).copy()[0], np.zeros(1, tick.MEMORY)[0]
+    adaptation.begin(law["adaptation"], memory["adaptation"])
+    return law, memory
 
 
 def needed_n(device: Stage, row):

@@ -88,10 +88,10 @@ def driven(law, plant, trajectory):
 
 
 def lacking_n(rows):
-    """(n, 3), what the combs lack by the filter's disturbance, while the loop is closed."""
+    """(n, 3), what the combs lack by the filter's disturbance and by what was learnt, while the loop is closed."""
     closed = rows[LOOP_CLOSED[rows["mode"]] != 0]
     back = np.linalg.inv(stage().jacobian(closed["reference_m"]))
-    return np.einsum("nki,nk->ni", back, closed["disturbance_n"])
+    return np.einsum("nki,nk->ni", back, closed["disturbance_n"] - closed["learnt_n"])
 
 
 LAWS = ["youla", "lqg", "lqg_wide", "pi_notch", "irc", "hinf", "mpc", "robust"]
