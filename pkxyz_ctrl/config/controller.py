@@ -40,6 +40,19 @@ class RegulatorConfig(FrozenModel):
     """
 
 
+class SetPointsConfig(FrozenModel):
+    """How every law but mpc answers to set-points: Bryson weights of the regulator that leads the model along them, the
+    same whatever feeds back.
+    """
+
+    position_error_m: Positive = 10.0e-9
+    velocity_error_m_per_s: Positive = 100.0e-6
+    force_n: Positive = 6.0e-6
+    """1 um to 10 nm in 1.2 ms, 3 % beyond it"""
+    jump_speed_m_per_s: Positive = 15.0e-3
+    """where the reference jumps; faster, and the voltages' slew limit makes a far jump swing over"""
+
+
 class DriveLimitsConfig(FrozenModel):
     """What the controller allows itself at the combs."""
 
@@ -102,6 +115,7 @@ class ControllerConfig(FrozenModel):
     adaptation: Adaptation = Adaptation()
     estimator: EstimatorConfig
     regulator: RegulatorConfig
+    set_points: SetPointsConfig = SetPointsConfig()
     limits: DriveLimitsConfig
     monitors: MonitorConfig
     youla: Youla | None = None

@@ -85,11 +85,13 @@ def net_input(
     position_m: Array,
     force_n: Array,
     force_old_n: Array,
+    apart_n: Array,
+    apart_old_n: Array,
     w: Array,
     w_change: Array,
 ) -> None:
-    """w (3,) and w_old - w (3,) in N at an estimated position, for the comb forces
-    that act now and those that acted before.
+    """w (3,) and w_old - w (3,) in N at an estimated position, for the comb forces that act now and those that acted
+    before; ``apart_n`` (3,) and ``apart_old_n`` of them, at the platform, do not count.
     """
     stiffness, origin = estimator["stiffness_n_per_m"], estimator["operating_point_m"]
     energy_gradient(geometry, elasticity, position_m, w_change)
@@ -98,8 +100,8 @@ def net_input(
         internal = w_change[i]
         for k in range(3):
             internal -= stiffness[i, k] * (position_m[k] - origin[k])
-        w_change[i] = -w[i]
-        w[i] -= internal
+        w_change[i] = apart_n[i] - apart_old_n[i] - w[i]
+        w[i] -= internal + apart_n[i]
     acted = (w_change[0], w_change[1], w_change[2])
     platform_force(geometry, position_m, force_old_n, w_change)
     for i in range(3):
@@ -146,6 +148,8 @@ def predict_far(
     s: Array,
     force_n: Array,
     force_old_n: Array,
+    apart_n: Array,
+    apart_old_n: Array,
     told_n: Array,
     scratch: np.void,
     out: Array,
@@ -162,9 +166,9 @@ def predict_far(
     for i in range(3):
         start[i], end[i] = origin[i] + s[i], origin[i] + out[i]
         middle[i] = 0.5 * (start[i] + end[i]) + bend_s * (s[3 + i] - out[3 + i])
-    net_input(geometry, elasticity, estimator, start, force_n, force_old_n, w, w_change)
-    net_input(geometry, elasticity, estimator, middle, force_n, force_old_n, w_middle, unused)
-    net_input(geometry, elasticity, estimator, end, force_n, force_old_n, w_end, unused)
+    net_input(geometry, elasticity, estimator, start, force_n, force_old_n, apart_n, apart_old_n, w, w_change)
+    net_input(geometry, elasticity, estimator, middle, force_n, force_old_n, apart_n, apart_old_n, w_middle, unused)
+    net_input(geometry, elasticity, estimator, end, force_n, force_old_n, apart_n, apart_old_n, w_end, unused)
     for i in range(3):
         change = w_end[i] - w[i]
         w[i] = (w[i] + 4.0 * w_middle[i] + w_end[i]) / 6.0 + told_n[i]

@@ -34,6 +34,15 @@ _JUMP_M = 1e-9
 
 
 @njit(cache=True, error_model="numpy")
+def jump(period_s: float, now: Array, after: Array, i: int) -> float:
+    """How far the reference jumps along axis ``i`` between two rows (9,) a period apart: 0.0 if it moves there."""
+    v, a = period_s * now[3 + i], period_s * period_s * now[6 + i]
+    way = after[i] - now[i] - v - 0.5 * a
+    speed, bend = period_s * after[3 + i] - v - a, period_s * period_s * after[6 + i] - a
+    return 0.0 if abs(way) <= abs(speed) + abs(bend) + _JUMP_M else way
+
+
+@njit(cache=True, error_model="numpy")
 def ahead(feedback: np.void, now: Array, after: Array, out: Array) -> None:
     """Reference row (9,) at ``lead_s`` past the row ``now``, on the quintic that joins it
     to the row ``after``, one period later.

@@ -1,11 +1,10 @@
 """Any linear feedback law as a state-space system about the reference, compiled.
 
-    w = -(C x + D e),   x+ = A x + B e + U s,   e = y - (r - tau v)
+    w = -(C x + D e),   x+ = A x + B e + U (1 - g) w,   e = y - y_m
 
-e is the measured position less the reference as a sensor of delay tau sees it (m), w a force at the platform (N) that
-joins the feed-forward and acts ``delay_periods`` later. s is the part of w that the stage does not get, because
-authority g is below 1 or combs are at their limits, s = (1 - g) w + slack (N): A - U C is stable, so nothing winds up
-and the law takes over without a jump.
+e is the measured position less the model's answer to the set-points (m), w a force at the platform (N) that joins the
+feed-forward and acts ``delay_periods`` later. Of it g w is asked for, g being the authority: A - U C is stable, so
+nothing winds up while g is below 1, and the law takes over without a jump. What the combs then can't give is in y_m.
 """
 
 import numpy as np
@@ -40,13 +39,11 @@ LINEAR_STATE = np.dtype(
 
 
 @njit(cache=True, error_model="numpy")
-def add_feedback(
-    linear: np.void, state: np.void, seen_m: Array, reference: Array, sense_delay_s: float, share: float, out: Array
-) -> None:
-    """Add share times w to ``out`` (3,) for the position seen (3,) and the reference row (9,) of the same sample."""
+def add_feedback(linear: np.void, state: np.void, seen_m: Array, expected_m: Array, share: float, out: Array) -> None:
+    """Add share times w to ``out`` (3,) for the position seen (3,) and the one expected (3,) of the same sample."""
     order, error = linear["order"], state["error_m"]
     for i in range(3):
-        error[i] = seen_m[i] - (reference[i] - sense_delay_s * reference[3 + i])
+        error[i] = seen_m[i] - expected_m[i]
     for i in range(3):
         total = 0.0
         for k in range(order):
@@ -58,17 +55,15 @@ def add_feedback(
 
 
 @njit(cache=True, error_model="numpy")
-def advance(linear: np.void, state: np.void, slack_n: Array, share: float) -> None:
-    """Time update with error and force of ``add_feedback``, and the slack (3,) and the authority of this tick."""
+def advance(linear: np.void, state: np.void, share: float) -> None:
+    """Time update with error and force of ``add_feedback``, and the authority of this tick."""
     order, x, following, w = linear["order"], state["x"], state["next"], state["w_n"]
     for i in range(order):
         total = 0.0
         for k in range(order):
             total += linear["a"][i, k] * x[k]
         for k in range(3):
-            total += linear["b"][i, k] * state["error_m"][k] + linear["unwind"][i, k] * (
-                slack_n[k] + (1.0 - share) * w[k]
-            )
+            total += linear["b"][i, k] * state["error_m"][k] + linear["unwind"][i, k] * (1.0 - share) * w[k]
         following[i] = total
     for i in range(order):
         x[i] = following[i]

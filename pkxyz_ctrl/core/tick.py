@@ -13,7 +13,17 @@ import numpy as np
 from numba import njit
 from numpy.typing import NDArray
 
-from pkxyz_ctrl.core import adaptation, allocation, feedback, kinematics, linear_law, predictive, voltage, youla
+from pkxyz_ctrl.core import (
+    adaptation,
+    allocation,
+    feedback,
+    kinematics,
+    linear_law,
+    predictive,
+    set_point_model,
+    voltage,
+    youla,
+)
 from pkxyz_ctrl.core import estimator as filtering
 from pkxyz_ctrl.core.elasticity import ELASTICITY, energy_gradient
 from pkxyz_ctrl.core.linear3 import inverse3, multiply3_transposed
@@ -37,6 +47,7 @@ LAW = np.dtype(
         ("sense", SENSE),
         ("estimator", filtering.ESTIMATOR),
         ("feedback", feedback.FEEDBACK),
+        ("set_points", set_point_model.SET_POINTS),
         ("linear", linear_law.LINEAR_LAW),
         ("youla", youla.YOULA),
         ("adaptation", adaptation.ADAPTATION),
@@ -51,9 +62,11 @@ LAW = np.dtype(
 OPEN_LOOP, STATE_FEEDBACK, LINEAR, PREDICTIVE = 0, 1, 2, 3
 """What feeds back: nothing, the filter's state through gains, a linear law of the user's choice on what was measured,
 or a plan that somebody made from the estimate; without one the filter's state as before.
+
+A plan answers to set-points, too. For the others ``set_point_model`` does, and what feeds back sees none of them.
 """
 
-DELAY_MAX = 2
+DELAY_MAX = set_point_model.DELAY_MAX
 
 SCRATCH = np.dtype(
     [
@@ -61,6 +74,7 @@ SCRATCH = np.dtype(
         ("inverse", "f8", (3, 3)),
         ("state", "f8", (9,)),
         ("row", "f8", (9,)),
+        ("aim", "f8", (3, 9)),
         ("next_n", "f8", (3,)),
         ("position_m", "f8", (3,)),
         ("w_n", "f8", (3,)),
@@ -71,6 +85,7 @@ SCRATCH = np.dtype(
         ("upper_n", "f8", (3,)),
         ("far", filtering.FAR),
         ("allocation", allocation.SCRATCH),
+        ("nothing", "f8", (3,)),  # stays 0
     ],
     align=True,
 )
@@ -89,6 +104,7 @@ MEMORY = np.dtype(
         ("seen_m", "f8", (3,)),  # the measurement, or the estimate in its place
         ("linear", linear_law.LINEAR_STATE),
         ("youla", youla.YOULA_STATE),
+        ("set_point_model", set_point_model.SET_POINT_MODEL),
         ("adaptation", adaptation.ADAPTATION_STATE),
         ("plan_n", "f8", (3,)),  # force at the platform that a plan adds to the feed-forward of this tick
         ("plan_known", "i4"),
@@ -145,7 +161,7 @@ def estimate(law: np.void, memory: np.void, has_measurement: bool) -> None:
         )
     position, w, w_change = scratch["position_m"], scratch["w_n"], scratch["w_change_n"]
     acting, acted, start = scratch["acting_n"], scratch["acted_n"], scratch["state"]
-    ahead, told = state["ahead"], learnt["told_n"]
+    ahead, told, none = state["ahead"], learnt["told_n"], scratch["nothing"]
     for i in range(9):
         start[i] = state["filtered"][i]
     for i in range(3):
@@ -155,15 +171,17 @@ def estimate(law: np.void, memory: np.void, has_measurement: bool) -> None:
         voltage.forces_of_counts(drive, memory["count"][age], acting)
         voltage.forces_of_counts(drive, memory["count"][age + 1], acted)
         filtering.midway(estimator, start, position)
-        filtering.net_input(law["geometry"], law["elasticity"], estimator, position, acting, acted, w, w_change)
+        filtering.net_input(
+            law["geometry"], law["elasticity"], estimator, position, acting, acted, none, none, w, w_change
+        )
         if online:
             adaptation.tell(learnt, age)
             for i in range(3):
                 w[i] += told[i]
         filtering.predict(estimator, start, w, w_change, ahead)
         if filtering.goes_far(estimator, start, ahead):
-            far = scratch["far"]
-            filtering.predict_far(law["geometry"], law["elasticity"], estimator, start, acting, acted, told, far, ahead)
+            far, geometry, elasticity = scratch["far"], law["geometry"], law["elasticity"]
+            filtering.predict_far(geometry, elasticity, estimator, start, acting, acted, none, none, told, far, ahead)
         for i in range(9):  # an assignment of whole arrays costs ten times as much: numba looks whether they overlap
             start[i] = ahead[i]
             if step == 0:
@@ -171,19 +189,21 @@ def estimate(law: np.void, memory: np.void, has_measurement: bool) -> None:
 
 
 @njit(cache=True, error_model="numpy")
-def act(law: np.void, memory: np.void, here: Array, now: Array, after: Array, later: Array) -> bool:
-    """Law, allocation and voltages for the reference rows (9,) at the sample, at the start and the end of the interval
-    of action, and a period after that.
+def act(law: np.void, memory: np.void, now: Array, after: Array, later: Array) -> bool:
+    """Law, allocation and voltages for the reference rows (9,) at the start and the end of the interval of action, and
+    a period after that.
 
     Writes demand, comb forces, slack and the new counts. Returns whether a comb force met a limit.
     """
     geometry, gains, drive, scratch = law["geometry"], law["feedback"], law["drive"], memory["scratch"]
     demand, force, count = memory["demand_n"], memory["force_n"], memory["count"]
     j, inverse, row, applied = scratch["pulls"], scratch["inverse"], scratch["row"], scratch["w_n"]
-    following = scratch["next_n"]
-    feedback.ahead(gains, after, later, row)
+    following, kind = scratch["next_n"], law["kind"]
+    set_points, model, aim = law["set_points"], memory["set_point_model"], scratch["aim"]
+    set_point_model.approach(set_points, model, gains["period_s"], now, after, later, aim)
+    feedback.ahead(gains, aim[1], aim[2], row)
     feedforward(law, row, following)
-    feedback.ahead(gains, now, after, row)
+    feedback.ahead(gains, aim[0], aim[1], row)
     kinematics.pulls(geometry, row[0:3], j)
     inverse3(j, inverse)
     energy_gradient(geometry, law["elasticity"], row[0:3], demand)
@@ -192,7 +212,7 @@ def act(law: np.void, memory: np.void, here: Array, now: Array, after: Array, la
     learnt, online = memory["adaptation"], law["adaptation"]["on"] != 0
     if online:
         adaptation.note(
-            law["adaptation"], learnt, geometry, law["elasticity"], gains["damping_n_s_per_m"], now, row, inverse, j,
+            law["adaptation"], learnt, geometry, law["elasticity"], gains["damping_n_s_per_m"], aim[0], row, inverse, j,
             demand,
         )  # fmt: skip
     last, before = memory["feedforward_n"], scratch["w_n"]
@@ -201,7 +221,7 @@ def act(law: np.void, memory: np.void, here: Array, now: Array, after: Array, la
         following[i] = following[i] if known else demand[i]
         before[i] = last[i] if known else demand[i]
         last[i] = demand[i]
-    feedback.sampled_target(gains, now, demand, before, row)
+    feedback.sampled_target(gains, aim[0], demand, before, row)
     memory["feedforward_known"] = 1
     feedback.add_held_share(last, before, following, share, demand)
     if online:
@@ -212,19 +232,20 @@ def act(law: np.void, memory: np.void, here: Array, now: Array, after: Array, la
         for i in range(3):
             before[i] = held[i] if known else demand[i]
             held[i] = demand[i]
-        feedback.sampled_target(gains, now, demand, before, row)
-    kind, origin = law["kind"], law["estimator"]["operating_point_m"]
-    if kind == STATE_FEEDBACK:
-        feedback.add_feedback(gains, origin, memory["estimate"]["ahead"], row, share, demand)
-        if law["youla"]["taps"] > 0:
-            youla.add_feedback(law["youla"], memory["youla"], share, demand)
-    elif kind == LINEAR:
-        tau = law["estimator"]["sense_delay_s"]
-        linear_law.add_feedback(law["linear"], memory["linear"], memory["seen_m"], here, tau, share, demand)
-    elif kind == PREDICTIVE and memory["plan_known"] != 0:
+        feedback.sampled_target(gains, aim[0], demand, before, row)
+    origin = law["estimator"]["operating_point_m"]
+    if kind != PREDICTIVE:
+        led = 1.0 if set_point_model.is_astray(model, origin, row) else share
+        feedback.add_feedback(set_points, origin, model["state"], row, led, demand)
+        _feed_back(law, memory, share)
+        for i in range(3):
+            demand[i] += model["fed_back_n"][i]
+            if online:  # the model is as drawn: what the device differs in, and what makes up for it, is not in it
+                model["fed_back_n"][i] += learnt["added_n"][i]
+    elif memory["plan_known"] != 0:
         for i in range(3):
             demand[i] += share * memory["plan_n"][i]
-    elif kind == PREDICTIVE:
+    else:
         feedback.add_feedback(gains, origin, memory["estimate"]["ahead"], row, share, demand)
     _push(memory)
     voltage.force_limits(drive, count[1], scratch["lower_n"], scratch["upper_n"])
@@ -236,9 +257,44 @@ def act(law: np.void, memory: np.void, here: Array, now: Array, after: Array, la
         memory["slack_n"][i] = demand[i] - applied[i]
     if memory["active_set_steps"] > 1:
         adaptation.disturb(learnt)
+    if kind != PREDICTIVE:
+        _follow(law, memory)
     if kind == LINEAR:
-        linear_law.advance(law["linear"], memory["linear"], memory["slack_n"], share)
+        linear_law.advance(law["linear"], memory["linear"], share)
     return memory["active_set_steps"] > 1
+
+
+@njit(cache=True, error_model="numpy")
+def _feed_back(law: np.void, memory: np.void, share: float) -> None:
+    """Note the force (3,) at the platform by which the feedback answers to what the stage does otherwise than the model
+    of the set-points; none in open loop.
+    """
+    model, ours, origin = memory["set_point_model"], memory["scratch"]["row"], law["estimator"]["operating_point_m"]
+    fed_back = model["fed_back_n"]
+    for i in range(3):
+        fed_back[i] = 0.0
+    if law["kind"] == STATE_FEEDBACK:
+        for i in range(3):
+            ours[i], ours[3 + i] = origin[i] + model["state"][i], model["state"][3 + i]
+        feedback.add_feedback(law["feedback"], origin, memory["estimate"]["ahead"], ours, share, fed_back)
+        if law["youla"]["taps"] > 0:
+            youla.add_feedback(law["youla"], memory["youla"], share, fed_back)
+    elif law["kind"] == LINEAR:
+        seen, expected = memory["seen_m"], model["sample_m"][0]
+        linear_law.add_feedback(law["linear"], memory["linear"], seen, expected, share, fed_back)
+
+
+@njit(cache=True, error_model="numpy")
+def _follow(law: np.void, memory: np.void) -> None:
+    """Tell the model of the set-points which forces are applied: those of the counts, so that no feedback takes their
+    rounding for a disturbance. Open loop stays what it is, the yardstick of all feedback: nobody makes up for it there.
+    """
+    scratch, model, acting = memory["scratch"], memory["set_point_model"], memory["force_n"]
+    if law["kind"] != OPEN_LOOP:
+        acting = scratch["acting_n"]
+        voltage.forces_of_counts(law["drive"], memory["count"][0], acting)
+    geometry, elasticity, estimator = law["geometry"], law["elasticity"], law["estimator"]
+    set_point_model.follow(geometry, elasticity, estimator, model, law["delay_periods"], acting, scratch)
 
 
 @njit(cache=True, error_model="numpy")
@@ -249,14 +305,14 @@ def feedforward(law: np.void, row: Array, out: Array) -> None:
 
 
 @njit(cache=True, error_model="numpy")
-def rest(memory: np.void) -> None:
+def rest(law: np.void, memory: np.void) -> None:
     """The open loop: 0 V on every comb at once, no demand. A release to 0 V is never delayed by the slew limit."""
     _push(memory)
-    release(memory)
+    release(law, memory)
 
 
 @njit(cache=True, error_model="numpy")
-def release(memory: np.void) -> None:
+def release(law: np.void, memory: np.void) -> None:
     """Take back what this tick decided: 0 V goes out instead."""
     for i in range(3):
         memory["count"][0, i] = 0
@@ -269,6 +325,7 @@ def release(memory: np.void) -> None:
     linear_law.clear(memory["linear"])
     youla.clear(memory["youla"])
     adaptation.clear(memory["adaptation"])
+    set_point_model.set_out(law["estimator"], memory["set_point_model"], memory["scratch"]["nothing"])
 
 
 @njit(cache=True, error_model="numpy")
@@ -282,7 +339,10 @@ def _push(memory: np.void) -> None:
 
 @njit(cache=True, error_model="numpy")
 def set_position(law: np.void, memory: np.void, position_m: Array) -> None:
-    """Start the filter at a position (3,) at rest, without disturbance: after homing, and wherever a state is known."""
+    """Start filter and model at a position (3,) at rest, without disturbance: after homing, and wherever a state is
+    known.
+    """
+    set_point_model.set_out(law["estimator"], memory["set_point_model"], position_m)
     for i in range(9):
         known = position_m[i] - law["estimator"]["operating_point_m"][i] if i < 3 else 0.0
         memory["estimate"]["predicted"][i] = known

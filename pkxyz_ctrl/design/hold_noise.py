@@ -20,7 +20,9 @@ def hold_noise_m(
     """Standard deviation (3,) in m of the true position at the samples while the law holds the plant's point.
 
     Sources: noise and quantisation of the sense counts, and the rounding of the drive counts, white or, with noise
-    shaping, its difference. Raises ``LawError`` for an unstable loop.
+    shaping, its difference. Who is told the counts that went out makes up for it: the law's filter, or the model of
+    the set-points, whose regulator then does so and of which the law sees nothing. Raises ``LawError`` for an unstable
+    loop.
     """
     model = linearise(stage, plant.strokes_m)
     sense = measurement_noise(stage, model, bus)
@@ -37,11 +39,18 @@ def hold_noise_m(
     rounded[:plant_n] = plant.b
     if law.told_from is not None:  # its filter knows the counts that went out
         rounded[plant_n + law.told_from : plant_n + law.told_from + 3] = np.eye(3)
+    sensed = _stationary(a, seen @ sense @ seen.T)
+    if law.set_point_gain is not None:
+        n = len(plant.a) - 3 * bus.delay_periods  # without the forces that wait: the model is ahead by these
+        led, gain = plant.a[:n, :n].copy(), np.hstack([law.set_point_gain, np.zeros((3, n - 6))])
+        rounded = np.vstack([plant.a[:n, -3:], np.zeros((3, 3))])
+        a = np.zeros((n + 3, n + 3))
+        a[:n, :n] = led - rounded[:n] @ gain
     if noise_shaping:
         a[:n, n:] = -rounded[:n]
         rounded[n:] = np.eye(3)
-    covariance = _stationary(a, seen @ sense @ seen.T + rounded @ rounding @ rounded.T)
-    return np.sqrt(np.diag(covariance)[:3])
+    covariance = sensed[:3, :3] + _stationary(a, rounded @ rounding @ rounded.T)[:3, :3]
+    return np.sqrt(np.diag(covariance))
 
 
 def rounding_force_n(stage: Stage, bus: BusConfig, model: LinearStage) -> Array:

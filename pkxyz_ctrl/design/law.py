@@ -27,6 +27,8 @@ Array = NDArray[np.float64]
 
 KINDS = {"open_loop": OPEN_LOOP, "lqg": STATE_FEEDBACK, "youla": STATE_FEEDBACK, "mpc": PREDICTIVE}
 """What the tick calls the laws that are not linear ones."""
+RECORDED = ("lqg", "mpc")
+"""Laws that keep the bits of their recordings: a filter with K_0 alone, and the ripple of the smooth feed-forward."""
 
 
 def design_law(stage: Stage, controller: ControllerConfig, bus: BusConfig, *, autostart: bool) -> NDArray[np.void]:
@@ -35,13 +37,14 @@ def design_law(stage: Stage, controller: ControllerConfig, bus: BusConfig, *, au
     """
     _check_limits(stage, controller, bus)
     model = linearise(stage, np.array(controller.operating_strokes_m))
-    if controller.youla is not None:
+    if controller.law not in RECORDED:
         model = replace(model, stiffness_n_per_m=_felt_stiffness(stage, model))
     sampled = sample(model, bus.period_s, amplifier_time_constant_s(stage))
     law = np.zeros(1, cycle.LAW)
     _fill_stage(law["tick"], stage, bus)
     _fill_estimator(law["tick"]["estimator"], stage, controller, bus, model, sampled)
     _fill_feedback(law["tick"]["feedback"], stage, controller, bus, model, sampled)
+    _fill_set_points(law["tick"]["set_points"], controller, sampled)
     _fill_drive(law["tick"]["drive"], stage, controller, bus)
     fill_adaptation(law["tick"], stage, controller, bus, model, sampled)
     _fill_monitors(law["limits"], controller, bus)
@@ -122,9 +125,16 @@ def _fill_feedback(
     law["period_s"] = bus.period_s
     law["ripple_s_per_kg"] = bus.period_s / (12.0 * model.mass_kg)
     law["lead_s"] = 0.5 * bus.period_s + amplifier_time_constant_s(stage)
-    if controller.youla is not None:  # the older laws keep the bits of their recordings
+    if controller.law not in RECORDED:
         law["ripple_s_per_kg"], law["ripple_of_held"] = _ripple_s_per_kg(model, sampled, float(law["lead_s"][0])), 1
     law["authority_force_n"] = controller.regulator.authority_force_n
+
+
+def _fill_set_points(law: Any, controller: ControllerConfig, sampled: SampledStage) -> None:
+    config = controller.set_points
+    law["position_gain_n_per_m"], law["velocity_gain_n_s_per_m"] = regulator_gain(sampled, config)
+    finds_its_way = controller.law == "mpc"  # plans inside the limits
+    law["jump_step_m"] = math.inf if finds_its_way else config.jump_speed_m_per_s * sampled.period_s
 
 
 def _ripple_s_per_kg(model: LinearStage, sampled: SampledStage, lead_s: float) -> float:

@@ -4,7 +4,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from pkxyz_ctrl.core.tick import LINEAR, OPEN_LOOP
-from pkxyz_ctrl.design.lqg_equivalent import lqg_equivalent
+from pkxyz_ctrl.design.lqg_equivalent import lqg_equivalent, set_point_gain
 from pkxyz_ctrl.design.model.discrete_law import DiscreteLaw, LawError
 from pkxyz_ctrl.design.model.loop_plant import NOMINAL, Perturbation
 from pkxyz_ctrl.stage import Stage
@@ -33,13 +33,14 @@ def law_about(
 def _linear(stage: Stage, law: NDArray[np.void], strokes_m: Array) -> DiscreteLaw:
     """The matrices as they stand, times the feedback's authority at this point."""
     numbers = law["tick"][0]
-    linear, n = numbers["linear"], int(numbers["linear"]["order"])
+    linear, feedback, n = numbers["linear"], numbers["feedback"], int(numbers["linear"]["order"])
     holding = stage.holding_forces(stage.forward_kinematics(strokes_m))
-    share = float(np.clip(holding.min() / numbers["feedback"]["authority_force_n"], 0.0, 1.0))
+    share = float(np.clip(holding.min() / feedback["authority_force_n"], 0.0, 1.0))
     return DiscreteLaw(
         float(law["period_us"][0]) * 1e-6,
         linear["a"][:n, :n],
         linear["b"][:n],
         share * linear["c"][:, :n],
         share * linear["d"],
+        set_point_gain=set_point_gain(numbers),
     )

@@ -6,6 +6,8 @@ input is taken at the estimate's own mid-period position, so where the stage's g
 the difference M (x + T/2 v) is part of the prediction.
 """
 
+from dataclasses import replace
+
 import numpy as np
 from numpy.typing import NDArray
 
@@ -42,8 +44,16 @@ def lqg_equivalent(
         gains[:, :6] += softening @ _midway(filter_, gains[:, :6])
     gains *= share
     equivalent = _assemble(filter_, softening, gains, delay, float(law["period_us"][0]) * 1e-6)
+    if numbers["kind"] != PREDICTIVE:
+        equivalent = replace(equivalent, set_point_gain=set_point_gain(numbers))
     taps = numbers["youla"]["tap_n_per_m"][: int(numbers["youla"]["taps"])]
     return with_taps(equivalent, filter_, share * taps) if len(taps) else equivalent
+
+
+def set_point_gain(numbers: np.void) -> Array:
+    """(3,6) of position and velocity: K_s."""
+    set_points = numbers["set_points"]
+    return np.hstack([set_points["position_gain_n_per_m"], set_points["velocity_gain_n_s_per_m"]])
 
 
 def _midway(filter_: np.void, gains: Array) -> Array:
@@ -100,4 +110,4 @@ def with_taps(law: DiscreteLaw, filter_: np.void, taps: Array) -> DiscreteLaw:
         a[order : order + 3], b[order : order + 3] = innovation, np.eye(3)
         a[order + 3 :, order : order + late - 3] = np.eye(late - 3)
     c = np.hstack([law.c, np.zeros((3, late))]) + force
-    return DiscreteLaw(law.period_s, a, b, c, law.d + np.diag(taps[0]), told_from=9, order_max=order + late)
+    return replace(law, a=a, b=b, c=c, d=law.d + np.diag(taps[0]), order_max=order + late)

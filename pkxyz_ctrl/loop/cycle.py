@@ -154,10 +154,10 @@ def respond(law_array: Records, memory_array: Records) -> None:
     law, memory = law_array[0], memory_array[0]
     state, seen, saturated = memory["tick"], memory["input"], 0
     if LOOP_CLOSED[memory["mode"]] != 0:
-        here, now, after, later = memory["here"], memory["now"], memory["after"], memory["later"]
-        saturated = 1 if tick.act(law["tick"], state, here, now, after, later) else 0
+        now, after, later = memory["now"], memory["after"], memory["later"]
+        saturated = 1 if tick.act(law["tick"], state, now, after, later) else 0
     else:
-        tick.rest(state)
+        tick.rest(law["tick"], state)
     trips = _monitor(law, memory, saturated)
     _write_row(law, memory, trips, saturated)
     usable = (seen["sense_status"] & _UNUSABLE) == 0
@@ -362,7 +362,7 @@ def _monitor(law: np.void, memory: np.void, saturated: int) -> int:
     trips = check(law["limits"], memory["monitors"], obs) | seen["trips"]
     if trips != 0 and memory["mode"] != _FAULT:
         _handle(law, memory, _TRIP)
-        tick.release(state)
+        tick.release(law["tick"], state)
     return trips
 
 

@@ -110,11 +110,12 @@ def test_far_ways_are_predicted_by_simpsons_rule(seed):
     exact = solve_ivp(motion, (0.0, bus().period_s), s[:6], rtol=1e-10, atol=1e-14).y[:, -1]
     middle, w, w_change, once, twice = np.empty(3), np.empty(3), np.empty(3), np.empty(9), np.empty(9)
     filtering.midway(record, s, middle)
-    filtering.net_input(law["geometry"], law["elasticity"], record, middle, force, old, w, w_change)
+    none = np.zeros(3)
+    filtering.net_input(law["geometry"], law["elasticity"], record, middle, force, old, none, none, w, w_change)
     filtering.predict(record, s, w, w_change, once)
     twice[:] = once
     room = np.zeros(1, filtering.FAR)[0]
-    filtering.predict_far(law["geometry"], law["elasticity"], record, s, force, old, np.zeros(3), room, twice)
+    filtering.predict_far(law["geometry"], law["elasticity"], record, s, force, old, none, none, none, room, twice)
     assert filtering.goes_far(record, s, once)
     worst = [np.abs((out[:6] - exact) / np.repeat([1e-9, 5e-6], 3)).max() for out in (once, twice)]  # 1 nm a period
     assert worst[1] < min(worst[0] / 3.0, 6.0)

@@ -87,13 +87,14 @@ def test_authority_where_a_comb_would_have_to_push_is_none():
 
 
 def on_the_reference(row):
-    """Law and memory of a tick whose estimate lies on the reference, whose comb forces are free of limits and whose
-    reference acts at once: what ``act`` then commands is its feed-forward alone."""
+    """Law and memory of a tick whose estimate and model lie on the reference, whose comb forces are free of limits and
+    whose reference acts at once: what ``act`` then commands is its feed-forward alone."""
     law, memory = tick_law(), new_tick_memory()
     law["feedback"]["lead_s"] = 0.0
     law["drive"]["count_slew_max"] = law["drive"]["count_max"]
     memory["estimate"]["ahead"][:6] = row[:6]
     memory["estimate"]["ahead"][:3] -= law["estimator"]["operating_point_m"]
+    memory["set_point_model"]["state"][:] = memory["estimate"]["ahead"]
     return law, memory
 
 
@@ -108,7 +109,7 @@ def test_feedforward_is_the_inverse_dynamics_of_the_plant(strokes_m, motion):
     velocity, wanted = motion[:3] * 1e-3, motion[3:] * 1.0
     row = np.concatenate([stage().forward_kinematics(strokes_m), velocity, wanted])
     law, memory = on_the_reference(row)
-    assert not tick.act(law, memory, row, row, row, row)
+    assert not tick.act(law, memory, row, row, row)
     p = plant(config())
     volt2 = memory["force_n"] / law["drive"]["force_gain_n_per_v2"]
     got = np.array(acceleration(p.params[0], p.state[0], volt2, *row[:3], *velocity))
@@ -135,7 +136,7 @@ def test_feedforward_alone_draws_the_reference():
     def motion(t, state):
         row = reference(t)
         law, memory = on_the_reference(row)
-        assert not tick.act(law, memory, row, row, row, row)
+        assert not tick.act(law, memory, row, row, row)
         volt2 = memory["force_n"] / law["drive"]["force_gain_n_per_v2"]
         return np.concatenate([state[3:], acceleration(p.params[0], p.state[0], volt2, *state)])
 

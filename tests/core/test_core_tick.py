@@ -76,17 +76,17 @@ def test_counts_become_the_position_that_they_mean(strokes_m, innovation_m, zero
 
 def test_rest_and_release_are_0_v_and_the_history_moves_on():
     """``rest`` is a tick, ``release`` takes back the tick that was: the counts before it stay where they are."""
-    memory = new_tick_memory()
+    law, memory = tick_law(), new_tick_memory()
     memory["count"][:] = [[30, 31, 32], [20, 21, 22], [10, 11, 12]]
     for name in ("carry_v", "demand_n", "slack_n", "force_n"):
         memory[name][:] = 1.0
     memory["feedforward_known"] = memory["active_set_steps"] = 1
-    tick.rest(memory)
+    tick.rest(law, memory)
     assert memory["count"].tolist() == [[0, 0, 0], [30, 31, 32], [20, 21, 22]]
     assert not any(memory[name].any() for name in ("carry_v", "demand_n", "slack_n", "force_n"))
     assert memory["feedforward_known"] == memory["active_set_steps"] == 0
     memory["count"][0] = 5
-    tick.release(memory)
+    tick.release(law, memory)
     assert memory["count"].tolist() == [[0, 0, 0], [30, 31, 32], [20, 21, 22]]
 
 
@@ -127,7 +127,7 @@ def test_saturation_is_told_and_slack_is_what_is_missing():
         row = np.concatenate([at, np.zeros(6)])
         memory["estimate"]["ahead"][:] = row - np.r_[law["estimator"]["operating_point_m"], np.zeros(6)]
         memory["feedforward_known"] = 0
-        assert bool(tick.act(law, memory, row, row, row, row)) is expected
+        assert bool(tick.act(law, memory, row, row, row)) is expected
         given_n = stage().jacobian(at).T @ memory["force_n"]
         assert memory["demand_n"] == pytest.approx(given_n + memory["slack_n"], rel=1e-12)
         assert bool(np.abs(memory["slack_n"]).max() > 1e-9) is expected

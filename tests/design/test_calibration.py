@@ -218,7 +218,7 @@ def test_a_tick_reads_strokes_and_sets_voltages_by_it():
     row = np.concatenate([at, np.zeros(6)])
     for _ in range(400):  # slewing there
         tick.estimate(law, memory, True)
-        tick.act(law, memory, row, row, row, row)
+        tick.act(law, memory, row, row, row)
         tick.set_position(law, memory, at)
     volts = memory["count"][0] * analog.drive_volt_per_count
     assert volts == pytest.approx(odd().holding_voltages(at), abs=2 * analog.drive_volt_per_count)

@@ -268,6 +268,7 @@ def test_the_linear_equivalent_is_what_the_tick_does(name, delay_periods, stroke
     memory, at = new_tick_memory(), stage().forward_kinematics(strokes_m)
     memory["count"][:] = np.round(stage().holding_voltages(at) / numbers["drive"]["volt_per_count"])
     tick.set_position(numbers, memory, at)
+    memory["set_point_model"]["applied_n"][:] = stage().holding_forces(at)
     row = np.r_[at, np.zeros(6)]
     state, rng = np.zeros(expected.order), np.random.default_rng(2)
     holding = stage().energy_gradient(at)
@@ -276,7 +277,7 @@ def test_the_linear_equivalent_is_what_the_tick_does(name, delay_periods, stroke
         y = rng.normal(size=3) * 1e-9
         memory["measurement_m"][:] = at + y
         tick.estimate(numbers, memory, True)
-        assert not tick.act(numbers, memory, row, row, row, row)
+        assert not tick.act(numbers, memory, row, row, row)
         asked.append(memory["demand_n"] - holding)
         linear.append(-(expected.c @ state + expected.d @ y))
         state = expected.a @ state + expected.b @ y

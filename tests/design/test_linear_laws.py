@@ -9,13 +9,14 @@ import pytest
 import scipy.linalg
 from hypothesis import given, settings
 from hypothesis import strategies as st
-from loop_rig import bus, controller, first_difference, rows_of, setup, shortened, stage
+from loop_rig import MIDDLE, bus, controller, first_difference, rows_of, setup, shortened, stage
 
 from pkxyz_ctrl.config.controller import ControllerConfig
 from pkxyz_ctrl.config.files import CONFIG_DIR, ConfigError, load, parse, plain, read_toml, write_toml
 from pkxyz_ctrl.core import linear_law
 from pkxyz_ctrl.core.tick import LINEAR
 from pkxyz_ctrl.design.law import design_law
+from pkxyz_ctrl.design.law_about import law_about
 from pkxyz_ctrl.design.laws.chosen_law import at_authority, chosen_law, unwinding, with_law
 from pkxyz_ctrl.design.model.discrete_law import DiscreteLaw, LawError
 from pkxyz_ctrl.design.model.loop_plant import loop_plant
@@ -197,7 +198,7 @@ def test_where_there_is_much_feedthrough_it_is_hanus():
 @settings(max_examples=40, deadline=None)
 @given(laws(), st.floats(0.0, 1.0), st.integers(0, 2**32 - 1))
 def test_the_kernel_is_the_law_at_that_authority(law, share, seed):
-    """Ten steps of the compiled law against numpy, with forces of which the combs give the rest to ``slack``."""
+    """Ten steps of the compiled law against numpy."""
     rng = np.random.default_rng(seed)
     unwind, n = unwinding(law, plant()), law.order
     record, state = np.zeros(1, linear_law.LINEAR_LAW)[0], np.zeros(1, linear_law.LINEAR_STATE)[0]
@@ -205,13 +206,13 @@ def test_the_kernel_is_the_law_at_that_authority(law, share, seed):
     record["unwind"][:n], record["order"] = unwind, n
     x, seen_law = np.zeros(n), at_authority(law, unwind, share)
     for _ in range(10):
-        row, error, slack = rng.normal(size=9), 1e-9 * rng.normal(size=3), 1e-6 * rng.normal(size=3)
-        seen, out = row[:3] - 3e-6 * row[3:6] + error, np.zeros(3)
-        error = seen - (row[:3] - 3e-6 * row[3:6])
-        linear_law.add_feedback(record, state, seen, row, 3e-6, share, out)
+        expected, out = rng.normal(size=3), np.zeros(3)
+        seen = expected + 1e-9 * rng.normal(size=3)
+        error = seen - expected
+        linear_law.add_feedback(record, state, seen, expected, share, out)
         assert out == pytest.approx(-(seen_law.c @ x + seen_law.d @ error), rel=1e-9, abs=1e-15)
-        linear_law.advance(record, state, slack, share)
-        x = seen_law.a @ x + seen_law.b @ error + unwind @ slack
+        linear_law.advance(record, state, share)
+        x = seen_law.a @ x + seen_law.b @ error
         assert state["x"][:n] == pytest.approx(x, rel=1e-6, abs=1e-9 * np.abs(x).max())
     linear_law.clear(state)
     assert not state["x"].any()
@@ -277,8 +278,8 @@ def test_the_hold_noise_is_the_calculated_one():
     """The loop's noise as the variances of ``hold_noise`` have it, within the statistics of 0.08 s."""
     from pkxyz_ctrl.design.hold_noise import hold_noise_m
 
-    law, _ = chosen_law(stage(), shipped("pi_notch"), bus())
-    expected = hold_noise_m(stage(), bus(), plant(), law)
+    law = design_law(stage(), shipped("pi_notch"), bus(), autostart=True)
+    expected = hold_noise_m(stage(), bus(), plant(), law_about(stage(), law, MIDDLE))
     rows, _ = rows_of(run_setup(shipped("pi_notch")), "fast")
     still = rows[(rows["t_us"] > 1.0e6)]
     assert still["position_m"].std(axis=0) == pytest.approx(expected, rel=0.25)

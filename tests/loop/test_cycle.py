@@ -8,6 +8,7 @@ from loop_rig import MIDDLE, Cycle, bus, controller_with, counts_at, law, rows_o
 from numpy.typing import NDArray
 
 from hil.runs.metrics import Metrics
+from pkxyz_ctrl.core.tick import set_position
 from pkxyz_ctrl.design.law import design_law
 from pkxyz_ctrl.safety.modes import Event, Mode
 from pkxyz_ctrl.safety.monitors import NodeEvent, SenseStatus
@@ -185,9 +186,8 @@ def in_the_middle() -> Cycle:
     c = tracking(np.tile(np.r_[at, np.zeros(6)], (16, 1)))
     memory, drive = c.memory["tick"][0], c.law["tick"]["drive"][0]
     memory["count"][:] = np.round(stage().holding_voltages(at) / drive["volt_per_count"]).astype(np.int32)
-    for name in ("predicted", "filtered", "ahead"):
-        memory["estimate"][name][:3] = at - c.law["tick"]["estimator"]["operating_point_m"][0]
-        memory["estimate"][name][3:] = 0.0
+    set_position(c.law["tick"][0], memory, at)
+    memory["set_point_model"]["applied_n"][:] = stage().holding_forces(at)
     c.tick(noisy(counts_at(MIDDLE), 0))
     assert c.mode is Mode.TRACKING
     return c

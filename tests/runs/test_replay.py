@@ -162,7 +162,7 @@ def test_one_altered_gain_is_named_by_the_first_signal_that_it_moves(run, tmp_pa
     assert result.notes[0] == "the configuration is not the recorded one"
     assert not any(d.tick < first.tick for d in result.differences)
     other = replay(folder / "recording.parquet", load("controllers", "open_loop", ControllerConfig))
-    assert other.differences[0].signal.startswith("demand_")
+    assert other.differences[0].signal.startswith("estimate_")  # its filter has another stiffness
 
 
 def test_a_recording_that_was_cut_off_replays_as_far_as_it_goes(run, tmp_path):

@@ -5,14 +5,14 @@ import numpy as np
 import scipy.linalg
 from numpy.typing import NDArray
 
-from pkxyz_ctrl.config.controller import RegulatorConfig
+from pkxyz_ctrl.config.controller import RegulatorConfig, SetPointsConfig
 from pkxyz_ctrl.design.model.design_error import DesignError
 from pkxyz_ctrl.design.model.plant_model import SampledStage
 
 Array = NDArray[np.float64]
 
 
-def regulator_gain(sampled: SampledStage, config: RegulatorConfig) -> tuple[Array, Array]:
+def regulator_gain(sampled: SampledStage, config: RegulatorConfig | SetPointsConfig) -> tuple[Array, Array]:
     """K_x (3,3) in N/m and K_v (3,3) in N s/m of w = -K_x x - K_v v, for Bryson weights.
 
     The regulator is designed for the state at the instant at which its force begins to act, which

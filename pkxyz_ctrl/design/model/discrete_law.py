@@ -38,6 +38,8 @@ class DiscreteLaw:
     d: Array
     told_from: int | None = None
     """first of the three states that are told what force was really given, where a law has such"""
+    set_point_gain: Array | None = None
+    """(3,6) of position and velocity: the regulator of the model that is told so, where it is that"""
     order_max: int = ORDER_MAX
     """more where the tick does not run these matrices, but what they are equivalent to"""
 

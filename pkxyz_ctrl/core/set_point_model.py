@@ -1,0 +1,143 @@
+"""The model's answer to the set-points: what the stage would do if nothing but the controller's own forces moved it.
+
+    s+ = Phi s + Gamma w + Gamma_lag (w_old - w),   w = J^T F - f - grad V + K_0 (x - x_0),   demand += f - K_s (s - r)
+
+The filter's model, driven by the comb forces F that were really applied (limits, slew, quantisation and all) less f,
+the feedback's part of them. A regulator K_s leads it to the reference, and the stage gets the same force. A feedback
+that looks at what the stage does otherwise than this model sees what it is there for, and nothing of set-points, jumps
+and limits: how the stage answers to these is K_s's, whatever the feedback is, and the loop's transfer is the feedback's
+alone (two degrees of freedom). Nothing in it is measured, so it can't make a loop unstable.
+
+Where the reference jumps, r goes there at a speed that the voltages can follow: a regulator that met their slew limit
+would brake too late.
+"""
+
+import math
+
+import numpy as np
+from numba import njit
+from numpy.typing import NDArray
+
+from pkxyz_ctrl.core import estimator as filtering
+from pkxyz_ctrl.core.feedback import jump
+
+Array = NDArray[np.float64]
+
+DELAY_MAX = 2
+
+SET_POINTS = np.dtype(
+    [
+        ("position_gain_n_per_m", "f8", (3, 3)),  # K_s, as of the feedback
+        ("velocity_gain_n_s_per_m", "f8", (3, 3)),
+        ("jump_step_m", "f8"),  # most that the reference jumps in a tick
+    ],
+    align=True,
+)
+
+SET_POINT_MODEL = np.dtype(
+    [
+        ("state", "f8", (9,)),  # as the filter's, without disturbance, where the force of this tick begins to act
+        ("sample_m", "f8", (DELAY_MAX + 1, 3)),  # what the sample of this tick, and those after it, would show
+        ("fed_back_n", "f8", (3,)),  # what feedback and adaptation have of this tick's force at the platform
+        ("fed_back_old_n", "f8", (3,)),  # and of the last one's
+        ("applied_n", "f8", (3,)),  # comb forces of the last tick
+        ("short_m", "f8", (3,)),  # where is aimed less where the reference has jumped to
+        ("short_later_m", "f8", (3,)),  # a period later
+    ],
+    align=True,
+)
+
+
+@njit(cache=True, error_model="numpy")
+def set_out(estimator: np.void, model: np.void, position_m: Array) -> None:
+    """Begin at a position (3,), at rest."""
+    for i in range(9):
+        model["state"][i] = position_m[i] - estimator["operating_point_m"][i] if i < 3 else 0.0
+    for i in range(3):
+        model["fed_back_n"][i] = 0.0
+        model["fed_back_old_n"][i] = 0.0
+        model["applied_n"][i] = 0.0
+        model["short_m"][i] = 0.0
+        for age in range(DELAY_MAX + 1):
+            model["sample_m"][age, i] = position_m[i]
+
+
+@njit(cache=True, error_model="numpy")
+def approach(
+    set_points: np.void, model: np.void, period_s: float, now: Array, after: Array, later: Array, aim: Array
+) -> None:
+    """Write the rows ``aim`` (3,9) to be led along: the reference at the start and the end of the interval of action
+    and a period after that, less what is still missing of its jumps.
+    """
+    short, following = model["short_m"], model["short_later_m"]
+    for i in range(9):
+        aim[0, i], aim[1, i], aim[2, i] = now[i], after[i], later[i]
+    for i in range(3):
+        aim[0, i] += short[i]
+        short[i] -= jump(period_s, now, after, i)
+    _step(set_points, short)
+    for i in range(3):
+        aim[1, i] += short[i]
+        following[i] = short[i] - jump(period_s, after, later, i)
+    _step(set_points, following)
+    for i in range(3):
+        aim[2, i] += following[i]
+
+
+@njit(cache=True, error_model="numpy")
+def _step(set_points: np.void, short: Array) -> None:
+    """A tick's share of the way is made."""
+    square = short[0] * short[0] + short[1] * short[1] + short[2] * short[2]
+    most = set_points["jump_step_m"]
+    left = 1.0 - most / math.sqrt(square) if square > most * most else 0.0
+    for i in range(3):
+        short[i] *= left
+
+
+_ROUNDING_M = 1e-12
+
+
+@njit(cache=True, error_model="numpy")
+def is_astray(model: np.void, origin_m: Array, row: Array) -> bool:
+    """Whether the model is elsewhere than the row (9,) by more than rounding. At rest, where combs can't push, the rest
+    of a sum would be a force that they lack.
+    """
+    near = True
+    for i in range(3):
+        near = near and abs(origin_m[i] + model["state"][i] - row[i]) <= _ROUNDING_M
+    return not near
+
+
+@njit(cache=True, error_model="numpy")
+def follow(
+    geometry: np.void,
+    elasticity: np.void,
+    estimator: np.void,
+    model: np.void,
+    delay_periods: int,
+    force_n: Array,
+    scratch: np.void,
+) -> None:
+    """Time update over the period in which this tick's comb forces (3,) act, after those of the last tick. What the
+    feedback had its part in them stands in ``fed_back_n``.
+    """
+    state, sample, applied = model["state"], model["sample_m"], model["applied_n"]
+    fed_back, before = model["fed_back_n"], model["fed_back_old_n"]
+    position, w, w_change, after = scratch["position_m"], scratch["w_n"], scratch["w_change_n"], scratch["state"]
+    filtering.midway(estimator, state, position)
+    filtering.net_input(geometry, elasticity, estimator, position, force_n, applied, fed_back, before, w, w_change)
+    filtering.predict(estimator, state, w, w_change, after)
+    if filtering.goes_far(estimator, state, after):
+        filtering.predict_far(
+            geometry, elasticity, estimator, state, force_n, applied, fed_back, before, scratch["nothing"],
+            scratch["far"], after,
+        )  # fmt: skip
+    tau, origin = estimator["sense_delay_s"], estimator["operating_point_m"]
+    for age in range(DELAY_MAX):
+        for i in range(3):
+            sample[age, i] = sample[age + 1, i]
+    for i in range(3):
+        before[i], applied[i] = fed_back[i], force_n[i]
+        sample[delay_periods, i] = origin[i] + after[i] - tau * after[3 + i]
+    for i in range(9):
+        state[i] = after[i]
