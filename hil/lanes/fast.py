@@ -12,7 +12,7 @@ from numba import njit
 from numpy.typing import NDArray
 
 from hil.plant.truth import observe
-from pkxyz_ctrl.core.tick import PREDICTIVE
+from pkxyz_ctrl.core.demand import PREDICTIVE
 from pkxyz_ctrl.loop.cycle import cycle
 from pkxyz_ctrl.loop.period import Period, period_of
 from pkxyz_ctrl.loop.reference import standing_still

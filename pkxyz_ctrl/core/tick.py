@@ -25,8 +25,9 @@ from pkxyz_ctrl.core import (
     youla,
 )
 from pkxyz_ctrl.core import estimator as filtering
-from pkxyz_ctrl.core.elasticity import ELASTICITY, energy_gradient
-from pkxyz_ctrl.core.linear3 import inverse3, multiply3_transposed
+from pkxyz_ctrl.core.demand import LINEAR, OPEN_LOOP, PREDICTIVE, ask
+from pkxyz_ctrl.core.elasticity import ELASTICITY
+from pkxyz_ctrl.core.linear3 import multiply3_transposed
 
 Array = NDArray[np.float64]
 
@@ -58,13 +59,6 @@ LAW = np.dtype(
     ],
     align=True,
 )
-
-OPEN_LOOP, STATE_FEEDBACK, LINEAR, PREDICTIVE = 0, 1, 2, 3
-"""What feeds back: nothing, the filter's state through gains, a linear law of the user's choice on what was measured,
-or a plan that somebody made from the estimate; without one the filter's state as before.
-
-A plan answers to set-points, too. For the others ``set_point_model`` does, and what feeds back sees none of them.
-"""
 
 DELAY_MAX = set_point_model.DELAY_MAX
 
@@ -195,58 +189,10 @@ def act(law: np.void, memory: np.void, now: Array, after: Array, later: Array) -
 
     Writes demand, comb forces, slack and the new counts. Returns whether a comb force met a limit.
     """
-    geometry, gains, drive, scratch = law["geometry"], law["feedback"], law["drive"], memory["scratch"]
-    demand, force, count = memory["demand_n"], memory["force_n"], memory["count"]
-    j, inverse, row, applied = scratch["pulls"], scratch["inverse"], scratch["row"], scratch["w_n"]
-    following, kind = scratch["next_n"], law["kind"]
-    set_points, model, aim = law["set_points"], memory["set_point_model"], scratch["aim"]
-    set_point_model.approach(set_points, model, gains["period_s"], now, after, later, aim)
-    feedback.ahead(gains, aim[1], aim[2], row)
-    feedforward(law, row, following)
-    feedback.ahead(gains, aim[0], aim[1], row)
-    kinematics.pulls(geometry, row[0:3], j)
-    inverse3(j, inverse)
-    energy_gradient(geometry, law["elasticity"], row[0:3], demand)
-    share = feedback.authority(gains, inverse, demand)
-    feedback.add_motion(gains, row, demand)
-    learnt, online = memory["adaptation"], law["adaptation"]["on"] != 0
-    if online:
-        adaptation.note(
-            law["adaptation"], learnt, geometry, law["elasticity"], gains["damping_n_s_per_m"], aim[0], row, inverse, j,
-            demand,
-        )  # fmt: skip
-    last, before = memory["feedforward_n"], scratch["w_n"]
-    known = memory["feedforward_known"] != 0
-    for i in range(3):
-        following[i] = following[i] if known else demand[i]
-        before[i] = last[i] if known else demand[i]
-        last[i] = demand[i]
-    feedback.sampled_target(gains, aim[0], demand, before, row)
-    memory["feedforward_known"] = 1
-    feedback.add_held_share(last, before, following, share, demand)
-    if online:
-        for i in range(3):
-            demand[i] += learnt["added_n"][i]
-    if gains["ripple_of_held"] != 0:
-        held = memory["held_n"]
-        for i in range(3):
-            before[i] = held[i] if known else demand[i]
-            held[i] = demand[i]
-        feedback.sampled_target(gains, aim[0], demand, before, row)
-    origin = law["estimator"]["operating_point_m"]
-    if kind != PREDICTIVE:
-        led = 1.0 if set_point_model.is_astray(model, origin, row) else share
-        feedback.add_feedback(set_points, origin, model["state"], row, led, demand)
-        _feed_back(law, memory, share)
-        for i in range(3):
-            demand[i] += model["fed_back_n"][i]
-            if online:  # the model is as drawn: what the device differs in, and what makes up for it, is not in it
-                model["fed_back_n"][i] += learnt["added_n"][i]
-    elif memory["plan_known"] != 0:
-        for i in range(3):
-            demand[i] += share * memory["plan_n"][i]
-    else:
-        feedback.add_feedback(gains, origin, memory["estimate"]["ahead"], row, share, demand)
+    share, kind = ask(law, memory, now, after, later), law["kind"]
+    drive, scratch, demand = law["drive"], memory["scratch"], memory["demand_n"]
+    j, inverse, applied = scratch["pulls"], scratch["inverse"], scratch["w_n"]
+    force, count = memory["force_n"], memory["count"]
     _push(memory)
     voltage.force_limits(drive, count[1], scratch["lower_n"], scratch["upper_n"])
     lower, upper = scratch["lower_n"], scratch["upper_n"]
@@ -256,32 +202,12 @@ def act(law: np.void, memory: np.void, now: Array, after: Array, later: Array) -
     for i in range(3):
         memory["slack_n"][i] = demand[i] - applied[i]
     if memory["active_set_steps"] > 1:
-        adaptation.disturb(learnt)
+        adaptation.disturb(memory["adaptation"])
     if kind != PREDICTIVE:
         _follow(law, memory)
     if kind == LINEAR:
         linear_law.advance(law["linear"], memory["linear"], share)
     return memory["active_set_steps"] > 1
-
-
-@njit(cache=True, error_model="numpy")
-def _feed_back(law: np.void, memory: np.void, share: float) -> None:
-    """Note the force (3,) at the platform by which the feedback answers to what the stage does otherwise than the model
-    of the set-points; none in open loop.
-    """
-    model, ours, origin = memory["set_point_model"], memory["scratch"]["row"], law["estimator"]["operating_point_m"]
-    fed_back = model["fed_back_n"]
-    for i in range(3):
-        fed_back[i] = 0.0
-    if law["kind"] == STATE_FEEDBACK:
-        for i in range(3):
-            ours[i], ours[3 + i] = origin[i] + model["state"][i], model["state"][3 + i]
-        feedback.add_feedback(law["feedback"], origin, memory["estimate"]["ahead"], ours, share, fed_back)
-        if law["youla"]["taps"] > 0:
-            youla.add_feedback(law["youla"], memory["youla"], share, fed_back)
-    elif law["kind"] == LINEAR:
-        seen, expected = memory["seen_m"], model["sample_m"][0]
-        linear_law.add_feedback(law["linear"], memory["linear"], seen, expected, share, fed_back)
 
 
 @njit(cache=True, error_model="numpy")
@@ -295,13 +221,6 @@ def _follow(law: np.void, memory: np.void) -> None:
         voltage.forces_of_counts(law["drive"], memory["count"][0], acting)
     geometry, elasticity, estimator = law["geometry"], law["elasticity"], law["estimator"]
     set_point_model.follow(geometry, elasticity, estimator, model, law["delay_periods"], acting, scratch)
-
-
-@njit(cache=True, error_model="numpy")
-def feedforward(law: np.void, row: Array, out: Array) -> None:
-    """Force (3,) at the platform that moves the stage along a reference row (9,): grad V + C v + m a."""
-    energy_gradient(law["geometry"], law["elasticity"], row[0:3], out)
-    feedback.add_motion(law["feedback"], row, out)
 
 
 @njit(cache=True, error_model="numpy")

@@ -11,7 +11,7 @@ from pkxyz_ctrl.config.bus import BusConfig
 from pkxyz_ctrl.config.controller import ControllerConfig, RegulatorConfig
 from pkxyz_ctrl.config.files import ConfigError
 from pkxyz_ctrl.config.laws import Mpc, Youla
-from pkxyz_ctrl.core.tick import LINEAR, OPEN_LOOP, PREDICTIVE, STATE_FEEDBACK
+from pkxyz_ctrl.core.demand import LINEAR, OPEN_LOOP, PREDICTIVE, STATE_FEEDBACK
 from pkxyz_ctrl.design.adaptation import fill_adaptation
 from pkxyz_ctrl.design.drive_limits import count_max, slew_counts
 from pkxyz_ctrl.design.laws.chosen_law import chosen_law, unwinding

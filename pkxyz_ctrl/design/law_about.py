@@ -3,7 +3,7 @@
 import numpy as np
 from numpy.typing import NDArray
 
-from pkxyz_ctrl.core.tick import LINEAR, OPEN_LOOP
+from pkxyz_ctrl.core.demand import LINEAR, OPEN_LOOP
 from pkxyz_ctrl.design.lqg_equivalent import lqg_equivalent, set_point_gain
 from pkxyz_ctrl.design.model.discrete_law import DiscreteLaw, LawError
 from pkxyz_ctrl.design.model.loop_plant import NOMINAL, Perturbation

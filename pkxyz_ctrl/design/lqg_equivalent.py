@@ -11,7 +11,7 @@ from dataclasses import replace
 import numpy as np
 from numpy.typing import NDArray
 
-from pkxyz_ctrl.core.tick import PREDICTIVE
+from pkxyz_ctrl.core.demand import PREDICTIVE
 from pkxyz_ctrl.design.model.discrete_law import DiscreteLaw
 from pkxyz_ctrl.design.model.loop_plant import NOMINAL, Perturbation, held_force_softening
 from pkxyz_ctrl.stage import Stage

@@ -14,7 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from pkxyz_ctrl.compiled.kernel_cache import digest_of_kernels
-from pkxyz_ctrl.core.tick import PREDICTIVE
+from pkxyz_ctrl.core.demand import PREDICTIVE
 from pkxyz_ctrl.export.elf import loaded_bytes
 from pkxyz_ctrl.export.kernels import ExportError, kernels
 from pkxyz_ctrl.export.lowering import Lowered, lower

@@ -11,7 +11,7 @@ import numpy as np
 from numba import njit
 from numpy.typing import NDArray
 
-from pkxyz_ctrl.core import feed_hold, tick, youla
+from pkxyz_ctrl.core import demand, feed_hold, tick, youla
 from pkxyz_ctrl.loop.row import ROW
 from pkxyz_ctrl.safety.modes import (
     LOOP_CLOSED,
@@ -347,7 +347,7 @@ def _monitor(law: np.void, memory: np.void, saturated: int) -> int:
     obs["mode"], obs["sense_status"] = memory["mode"], seen["sense_status"]
     obs["node_events"], obs["overrun"] = seen["node_events"], seen["overrun"]
     obs["saturated"] = saturated
-    obs["solver_ok"] = 0 if law["tick"]["kind"] == tick.PREDICTIVE and state["plan_known"] == 0 else 1
+    obs["solver_ok"] = 0 if law["tick"]["kind"] == demand.PREDICTIVE and state["plan_known"] == 0 else 1
     obs["finite"] = 1 if tick.is_finite(state) else 0
     obs["implausible_combs"] = memory["suspects"]
     tick.unexplained_force(law["tick"], state, obs["unexplained_force_n"])

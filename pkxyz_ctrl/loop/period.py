@@ -7,7 +7,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from pkxyz_ctrl.compiled.direct_call import direct
-from pkxyz_ctrl.core.tick import PREDICTIVE
+from pkxyz_ctrl.core.demand import PREDICTIVE
 from pkxyz_ctrl.loop import cycle as cycling
 
 Records = NDArray[np.void]

@@ -14,9 +14,9 @@ from numpy.typing import NDArray
 
 from pkxyz_ctrl.compiled.direct_call import direct
 from pkxyz_ctrl.core import feedback, predictive
+from pkxyz_ctrl.core.demand import feedforward
 from pkxyz_ctrl.core.kinematics import pulls
 from pkxyz_ctrl.core.linear3 import multiply3, multiply3_transposed
-from pkxyz_ctrl.core.tick import feedforward
 from pkxyz_ctrl.loop import cycle as cycling
 from pkxyz_ctrl.loop.predictive_problem import FORCE_UNIT_N, STROKE_UNIT_M, Problem
 from pkxyz_ctrl.loop.reference import standing_still

@@ -14,7 +14,7 @@ from loop_rig import MIDDLE, bus, controller, first_difference, rows_of, setup, 
 from pkxyz_ctrl.config.controller import ControllerConfig
 from pkxyz_ctrl.config.files import CONFIG_DIR, ConfigError, load, parse, plain, read_toml, write_toml
 from pkxyz_ctrl.core import linear_law
-from pkxyz_ctrl.core.tick import LINEAR
+from pkxyz_ctrl.core.demand import LINEAR
 from pkxyz_ctrl.design.law import design_law
 from pkxyz_ctrl.design.law_about import law_about
 from pkxyz_ctrl.design.laws.chosen_law import at_authority, chosen_law, unwinding, with_law

@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 
 from pkxyz_ctrl.can.codec import Counts
 from pkxyz_ctrl.core import kinematics
-from pkxyz_ctrl.core.tick import OPEN_LOOP
+from pkxyz_ctrl.core.demand import OPEN_LOOP
 from pkxyz_ctrl.loop.reference import reference_rows
 
 FRAME_LIMITS = {"stale_count": 2, "sequence_count": 3, "crc_count": 2, "length_count": 2, "frame_leak_ticks": 1}

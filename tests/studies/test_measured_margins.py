@@ -17,7 +17,7 @@ from hil.lanes.lane import Lane
 from hil.studies.margins.loop import Loop, agreement, as_json, over_changed_plants
 from hil.studies.margins.measured import MeasurementError, at_point, measure, sampled_margins
 from pkxyz_ctrl.config.files import ConfigError, load, parse, plain
-from pkxyz_ctrl.core.tick import LINEAR
+from pkxyz_ctrl.core.demand import LINEAR
 from pkxyz_ctrl.design.law_about import law_about
 from pkxyz_ctrl.design.margins.margins import frequency_grid_hz, margins, peak_sensitivity
 from pkxyz_ctrl.design.margins.tolerances import Tolerances

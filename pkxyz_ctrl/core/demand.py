@@ -1,0 +1,104 @@
+"""The force that is asked for: feed-forward, the model's answer to set-points, and feedback. PURE and compiled."""
+
+import numpy as np
+from numba import njit
+from numpy.typing import NDArray
+
+from pkxyz_ctrl.core import adaptation, feedback, kinematics, linear_law, set_point_model, youla
+from pkxyz_ctrl.core.elasticity import energy_gradient
+from pkxyz_ctrl.core.linear3 import inverse3
+
+Array = NDArray[np.float64]
+
+OPEN_LOOP, STATE_FEEDBACK, LINEAR, PREDICTIVE = 0, 1, 2, 3
+"""What feeds back: nothing, the filter's state through gains, a linear law of the user's choice on what was measured,
+or a plan that somebody made from the estimate; without one the filter's state as before.
+
+A plan answers to set-points, too. For the others ``set_point_model`` does, and what feeds back sees none of them.
+"""
+
+
+@njit(cache=True, error_model="numpy")
+def ask(law: np.void, memory: np.void, now: Array, after: Array, later: Array) -> float:
+    """Write the demand (3,) at the platform for the reference rows (9,) at the start and the end of the interval of
+    action, and a period after that. Returns the feedback's authority. ``law``, ``memory``: the tick's.
+    """
+    geometry, gains, scratch, demand = law["geometry"], law["feedback"], memory["scratch"], memory["demand_n"]
+    j, inverse, row = scratch["pulls"], scratch["inverse"], scratch["row"]
+    following, kind = scratch["next_n"], law["kind"]
+    set_points, model, aim = law["set_points"], memory["set_point_model"], scratch["aim"]
+    set_point_model.approach(set_points, model, gains["period_s"], now, after, later, aim)
+    feedback.ahead(gains, aim[1], aim[2], row)
+    feedforward(law, row, following)
+    feedback.ahead(gains, aim[0], aim[1], row)
+    kinematics.pulls(geometry, row[0:3], j)
+    inverse3(j, inverse)
+    energy_gradient(geometry, law["elasticity"], row[0:3], demand)
+    share = feedback.authority(gains, inverse, demand)
+    feedback.add_motion(gains, row, demand)
+    learnt, online = memory["adaptation"], law["adaptation"]["on"] != 0
+    if online:
+        adaptation.note(
+            law["adaptation"], learnt, geometry, law["elasticity"], gains["damping_n_s_per_m"], aim[0], row, inverse, j,
+            demand,
+        )  # fmt: skip
+    last, before = memory["feedforward_n"], scratch["w_n"]
+    known = memory["feedforward_known"] != 0
+    for i in range(3):
+        following[i] = following[i] if known else demand[i]
+        before[i] = last[i] if known else demand[i]
+        last[i] = demand[i]
+    feedback.sampled_target(gains, aim[0], demand, before, row)
+    memory["feedforward_known"] = 1
+    feedback.add_held_share(last, before, following, share, demand)
+    if online:
+        for i in range(3):
+            demand[i] += learnt["added_n"][i]
+    if gains["ripple_of_held"] != 0:
+        held = memory["held_n"]
+        for i in range(3):
+            before[i] = held[i] if known else demand[i]
+            held[i] = demand[i]
+        feedback.sampled_target(gains, aim[0], demand, before, row)
+    origin = law["estimator"]["operating_point_m"]
+    if kind != PREDICTIVE:
+        led = 1.0 if set_point_model.is_astray(model, origin, row) else share
+        feedback.add_feedback(set_points, origin, model["state"], row, led, demand)
+        _feed_back(law, memory, share)
+        for i in range(3):
+            demand[i] += model["fed_back_n"][i]
+            if online:  # the model is as drawn: what the device differs in, and what makes up for it, is not in it
+                model["fed_back_n"][i] += learnt["added_n"][i]
+    elif memory["plan_known"] != 0:
+        for i in range(3):
+            demand[i] += share * memory["plan_n"][i]
+    else:
+        feedback.add_feedback(gains, origin, memory["estimate"]["ahead"], row, share, demand)
+    return float(share)
+
+
+@njit(cache=True, error_model="numpy")
+def feedforward(law: np.void, row: Array, out: Array) -> None:
+    """Force (3,) at the platform that moves the stage along a reference row (9,): grad V + C v + m a."""
+    energy_gradient(law["geometry"], law["elasticity"], row[0:3], out)
+    feedback.add_motion(law["feedback"], row, out)
+
+
+@njit(cache=True, error_model="numpy")
+def _feed_back(law: np.void, memory: np.void, share: float) -> None:
+    """Note the force (3,) at the platform by which the feedback answers to what the stage does otherwise than the model
+    of the set-points; none in open loop.
+    """
+    model, ours, origin = memory["set_point_model"], memory["scratch"]["row"], law["estimator"]["operating_point_m"]
+    fed_back = model["fed_back_n"]
+    for i in range(3):
+        fed_back[i] = 0.0
+    if law["kind"] == STATE_FEEDBACK:
+        for i in range(3):
+            ours[i], ours[3 + i] = origin[i] + model["state"][i], model["state"][3 + i]
+        feedback.add_feedback(law["feedback"], origin, memory["estimate"]["ahead"], ours, share, fed_back)
+        if law["youla"]["taps"] > 0:
+            youla.add_feedback(law["youla"], memory["youla"], share, fed_back)
+    elif law["kind"] == LINEAR:
+        seen, expected = memory["seen_m"], model["sample_m"][0]
+        linear_law.add_feedback(law["linear"], memory["linear"], seen, expected, share, fed_back)
