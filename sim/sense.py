@@ -16,7 +16,7 @@ from numba import njit
 
 from sim.motion.geometry import strokes
 from sim.motion.layout import KNOTS, SENSE_DRIFT_STREAM, SENSE_STREAM
-from sim.motion.noise import normal
+from sim.motion.noise import normal, total
 from sim.structure.pose import combs_seen
 from sim.surroundings.tones import hum
 
@@ -152,7 +152,7 @@ def sample(params: np.ndarray, state: np.ndarray, counts: np.ndarray) -> None:
         if p["crosstalk_on"] != 0:
             farad += _crosstalk(p, s, i)
         if p["sense_flicker_on"] != 0:
-            farad += p["sense_flicker_f"] * s["sense_flicker"][i].sum()
+            farad += p["sense_flicker_f"] * total(s["sense_flicker"][i])
         if p["tone_count"] > 0:
             farad += hum(p, s, i)
         fine = max(-40000.0, min(40000.0, (farad - p["count_zero_f"]) / p["count_f"]))  # before floor: it makes an int

@@ -65,3 +65,12 @@ def normal(words: np.ndarray, spare: np.ndarray) -> float:
     spare[0] = 1.0
     spare[1] = v * scale
     return float(u * scale)
+
+
+@njit(cache=True, error_model="numpy")
+def total(values: np.ndarray) -> float:
+    """Sum of (n,). numpy's own would bring its library along wherever this is loaded."""
+    value = 0.0
+    for k in range(len(values)):
+        value += values[k]
+    return value

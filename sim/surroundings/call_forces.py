@@ -18,7 +18,7 @@ from sim.motion.layout import (
     FLICKERS,
     SENSE_FLICKER_STREAM,
 )
-from sim.motion.noise import normal
+from sim.motion.noise import normal, total
 from sim.surroundings.tones import sum_tones, turn_tones
 
 
@@ -79,12 +79,12 @@ def surround(p: np.void, s: np.void, dt_us: int) -> None:
         for j in range(3):
             words, spare = s["random"][AMPLIFIER_STREAM], s["spare"][AMPLIFIER_STREAM]
             _add_white(p["amplifier_v_per_rt_hz"], h, words, spare, ripple, j)
-            ripple[0, j] += p["amplifier_flicker_v"] * s["amplifier_flicker"][j].sum()
-            ripple[1, j] -= p["amplifier_flicker_v"] * s["amplifier_flicker"][j].sum() / h
+            ripple[0, j] += p["amplifier_flicker_v"] * total(s["amplifier_flicker"][j])
+            ripple[1, j] -= p["amplifier_flicker_v"] * total(s["amplifier_flicker"][j]) / h
         words, spare = s["random"][AMPLIFIER_FLICKER_STREAM], s["spare"][AMPLIFIER_FLICKER_STREAM]
         relax(p["amplifier_flicker_per_s"], h, words, spare, s["amplifier_flicker"])
         for j in range(3):
-            ripple[1, j] += p["amplifier_flicker_v"] * s["amplifier_flicker"][j].sum() / h
+            ripple[1, j] += p["amplifier_flicker_v"] * total(s["amplifier_flicker"][j]) / h
     if p["sense_flicker_on"] != 0:
         words, spare = s["random"][SENSE_FLICKER_STREAM], s["spare"][SENSE_FLICKER_STREAM]
         relax(p["sense_flicker_per_s"], h, words, spare, s["sense_flicker"])
