@@ -63,6 +63,30 @@ def test_modes_and_gains_of_the_harsh_plant(kind):
     assert modes.noise_alone
 
 
+def test_the_lab_with_its_slow_sense_chain():
+    """A pole at 1.6 kHz takes 7 % off the modes' gains and turns them; beside it mains, flexible modes, 1/f noise."""
+    result, is_ = found("lab"), truth("lab")
+    modes, numbers = result.modes, result.calibrated.calibration
+    assert modes.noise_alone
+    assert modes.frequency_hz == pytest.approx(is_.frequency_hz, rel=0.01)
+    assert abs(modes.sense_corner_hz - 1600.0) < 4.0 * modes.sense_corner_standard_error_hz < 2000.0
+    errors = numbers.standard_error
+    assert abs(numbers.sense_delay_s - 99.5e-6) < 4.0 * errors.sense_delay_s < 20e-6
+    assert numbers.quality_factor == pytest.approx(18.0, rel=0.02)
+    off = np.abs(np.array(numbers.comb_gain) - (1.02, 0.99, 1.015))
+    assert (off < 4.0 * np.array(errors.comb_gain)).all()
+    assert max(errors.comb_gain) < 0.03
+    assert found("harsh").modes.sense_corner_hz is None  # nothing asks for a pole there
+
+
+def test_no_tone_lies_on_a_line_of_the_mains():
+    """It is alike in all periods: 50 Hz of the lab alone made a chi-square of 1.8."""
+    for kind, seconds in (("multisine", 1.0), ("stepped", 0.1)):
+        hz = np.concatenate([p.bins for p in exciting(bench(), MIDDLE, kind, 5e-9, 6).passages]) / seconds
+        assert len(hz) > 60
+        assert not (np.isin(np.round(hz) % 50, 0) | np.isin(np.round(hz) % 60, 0)).any()
+
+
 def test_standard_errors_are_those_of_the_errors():
     """None beyond 4.5 of its standard error; a static gain may differ by 0.2 % more, for the plant drifts meanwhile."""
     modes, is_ = found().modes, truth()

@@ -140,6 +140,8 @@ def _show(found: "Identification", data: dict[str, Any], folder: Path) -> None:
         verdict,
         f"; coherence there at least {fit['least_coherence']:.3f}",
     )
+    if modes.sense_corner_hz is not None and modes.sense_corner_standard_error_hz is not None:
+        say(f"sense chain: a pole at {_pm(modes.sense_corner_hz, modes.sense_corner_standard_error_hz)} Hz")
     _show_gains(found)
     _show_calibration(found)
     if found.outside is None:

@@ -24,6 +24,8 @@ from pkxyz_ctrl.stage import Stage
 
 Array = NDArray[np.float64]
 
+MAINS_HZ = (50, 60)
+
 
 @dataclass(frozen=True)
 class Identification:
@@ -115,13 +117,16 @@ def modes_hz(setup: Setup, strokes_m: Array) -> Array:
 def exciting(
     setup: Setup, strokes_m: Array, kind: Literal["multisine", "stepped"], amplitude_m: float, periods: int
 ) -> Excitation:
-    """All tones at once in periods of 1 s, or, in periods of 0.1 s, one after another; many of them about the modes."""
+    """All tones at once in periods of 1 s, or, in periods of 0.1 s, one after another; many of them about the modes.
+    None lies on a line of the mains, which is alike in all periods and so would pass for an answer.
+    """
     seconds, count, lowest, near = (1.0, 120, 5, 60) if kind == "multisine" else (0.1, 14, 1, 24)
     period_ticks = round(seconds / setup.bus.period_s)
     hz = modes_hz(setup, strokes_m)
     about = np.round(np.linspace(0.85 * hz.min(), 1.15 * hz.max(), near) * seconds).astype(np.int64)
     bins = np.unique(np.r_[tones(period_ticks, count, lowest), about])
-    bins = bins[bins < period_ticks // 2]
+    off_mains = np.all([np.round(bins / seconds) % mains_hz != 0 for mains_hz in MAINS_HZ], axis=0)
+    bins = bins[(bins < period_ticks // 2) & off_mains]
     return excitation(
         kind, bins, period_ticks=period_ticks, periods=periods, amplitude_m=amplitude_m, first_tick=0, seed=setup.seed
     )
@@ -199,6 +204,7 @@ def as_json(found: Identification) -> dict[str, Any]:
             "error_f": _list(zero.standard_error_f),
             "samples": zero.samples,
         },
+        "sense_chain": {"corner_hz": modes.sense_corner_hz, "corner_error_hz": modes.sense_corner_standard_error_hz},
         "fit": {
             "chi_square": modes.chi_square,
             "noise_alone": modes.noise_alone,

@@ -1,11 +1,14 @@
 """Modes of the stage from its measured response: three pairs of poles that all nine entries share, all else free.
 
-    P(z) = sum over i of (B_i + C_i z^-1) z^-n / (1 - 2 Re(p_i) z^-1 + |p_i|^2 z^-2)  +  D z^-n,    p_i = exp(s_i T)
+    P(z) = z^-n [sum over i of (B_i + C_i z^-1) / (1 - 2 Re(p_i) z^-1 + |p_i|^2 z^-2)  +  D  +  E / (1 - a z^-1)]
 
-n = d + 1: what is asked for at a sample acts d periods later and is seen at the sample after that. B_i, C_i and D (3,
-3) are free real matrices: whatever amplifier, delays within a period and faster modes do to the stage's own modes is in
-them, and nothing needs to be assumed of it. The fit is of y to P u, output by output, each tone with the weight of the
-noise there; for given poles it is linear, so only frequencies and dampings are searched for (variable projection).
+p_i = exp(s_i T), n = d + 1: what is asked for at a sample acts d periods later and is seen at the sample after that.
+B_i, C_i, D and E (3, 3) are free real matrices: whatever amplifier, delays within a period and faster modes do to the
+stage's own modes is in them, and nothing needs to be assumed of it. The fit is of y to P u, output by output, each tone
+with the weight of the noise there; for given poles it is linear, so only poles are searched for (variable projection).
+
+a = exp(-2 pi f_c T) is the sense chain, a pole of first order at f_c that the three share. It is left out where it
+explains no more than it would of noise. Where there is one, it takes (1 + s_i / 2 pi f_c) off each mode's numerator.
 
 Two modes may coincide, as x and y of a stage as drawn do at mid-workspace: they move the chains in
 two patterns with one pair of poles, and a third pair would only fit noise. So two pairs are tried as
@@ -33,8 +36,11 @@ STARTS = ((0.97, 1.03, 1.0), (0.9, 1.1, 1.05), (0.97, 1.0, 0.95), (1.1, 1.2, 1.1
 NOISE_ALONE = 1.5
 """Mean square of the weighted residual up to which noise explains it."""
 
+_NO_CORNER = np.zeros(0)
+_CORNER, _FASTEST_CORNER = 0.3, 2.0  # of the sampling rate: where the search for the sense chain's begins, and ends
+
 CONFIDENCE = 0.999
-"""With which two modes that coincide are found as one pair of poles."""
+"""With which two modes that coincide are found as one pair of poles, and the sense chain as a pole."""
 
 
 class FitError(ValueError):
@@ -72,6 +78,9 @@ class ModalFit:
     _coefficients: Array
     _period_s: float
     _delay_periods: int
+    sense_corner_hz: float | None = None
+    """of the sense chain; None where it is too fast to tell"""
+    sense_corner_standard_error_hz: float | None = None
 
     @property
     def noise_alone(self) -> bool:
@@ -85,8 +94,9 @@ class ModalFit:
 
     def response(self, frequency_hz: Array) -> Complex:
         """P (k, 3, 3) in counts per V^2 at frequencies (k,)."""
-        hz, damping = self.frequency_hz[self.apart], self.damping[self.apart]
-        basis = _basis(frequency_hz, hz, damping, self._period_s, self._delay_periods)
+        corner = [] if self.sense_corner_hz is None else [self.sense_corner_hz]
+        poles = np.concatenate([self.frequency_hz[self.apart], self.damping[self.apart], corner])
+        basis = _basis(frequency_hz, poles, self._period_s, self._delay_periods)
         return np.asarray(np.einsum("kb,bij->kij", basis, self._coefficients))
 
 
@@ -116,7 +126,7 @@ def fit_modes(
 
     def columns(modes: Array) -> Array:
         """(2 k 3, unknowns): real and imaginary parts of basis times U, per tone and passage."""
-        basis = _basis(f, *_halves(np.exp(modes)), period_s, delay_periods)
+        basis = _basis(f, np.exp(modes), period_s, delay_periods)
         regressors = np.einsum("kb,kjp->kpbj", basis, u).reshape(3 * len(f), -1)
         return np.concatenate([regressors.real, regressors.imag])
 
@@ -130,27 +140,36 @@ def fit_modes(
         theta = np.stack([_least_squares(matrix * w[:, None], seen[:, i] * w) for i, w in enumerate(weight.T)], axis=1)
         return theta, (seen - matrix @ theta) * weight
 
-    def searched(hz: Array) -> "scipy.optimize.OptimizeResult":
+    def searched(hz: Array, corner_hz: Array) -> "scipy.optimize.OptimizeResult":
+        start = np.log(np.concatenate([hz, np.full(len(hz), start_damping), corner_hz]))
+        highest = np.full(len(start), math.log(0.5 / period_s))
+        highest[2 * len(hz) :] = math.log(_FASTEST_CORNER / period_s)
         return scipy.optimize.least_squares(
-            lambda modes: solved(modes)[1].ravel(),
-            np.log(np.concatenate([hz, np.full(len(hz), start_damping)])),
-            x_scale=0.01,
-            bounds=(math.log(1e-5), math.log(0.5 / period_s)),
+            lambda modes: solved(modes)[1].ravel(), start, x_scale=0.01, bounds=(math.log(1e-5), highest)
         )
 
-    best = searched(np.array(STARTS[0]) * start_hz)
-    for split in STARTS[1:]:
+    def tells(rich: "scipy.optimize.OptimizeResult", poor: "scipy.optimize.OptimizeResult", more: int) -> bool:
+        """Whether ``more`` unknowns explain more than they would of noise."""
+        noise = max(1.0, 2.0 * float(rich.cost) / seen.size)
+        return bool(2.0 * float(poor.cost - rich.cost) >= scipy.stats.chi2.ppf(CONFIDENCE, more) * noise)
+
+    best = searched(np.array(STARTS[0]) * start_hz, _NO_CORNER)
+    for split in STARTS:
         if 2.0 * float(best.cost) < NOISE_ALONE * seen.size:
             break
-        best = min(best, searched(np.array(split) * start_hz), key=lambda found: float(found.cost))
-    modes, shared = _ascending(best.x), np.arange(MODES)
+        tried = [
+            searched(np.array(split) * start_hz, corner) for corner in (_NO_CORNER, np.array([_CORNER / period_s]))
+        ]
+        best = min(best, *tried, key=lambda found: float(found.cost))
+    if len(best.x) == 2 * MODES:
+        late = searched(np.exp(best.x[:MODES]), np.array([_CORNER / period_s]))
+        if tells(late, best, 1 + 9):  # the pole, and E
+            best = late
+    modes, shared = _ascending(best.x, MODES), np.arange(MODES)
     near = int(np.argmin(np.diff(modes[:MODES])))
-    merged = searched(np.exp(np.delete(modes[:MODES], near)))
-    gone = 2 + 3 * 2 * 3  # a frequency, a damping, B and C
-    if 2.0 * float(merged.cost - best.cost) < scipy.stats.chi2.ppf(CONFIDENCE, gone) * max(
-        1.0, 2.0 * float(best.cost) / seen.size
-    ):
-        modes, shared = _ascending(merged.x), np.repeat([0, 1], [2, 1] if near == 0 else [1, 2])
+    merged = searched(np.exp(np.delete(modes[:MODES], near)), np.exp(modes[2 * MODES :]))
+    if not tells(best, merged, 2 + 3 * 2 * 3):  # a frequency, a damping, B and C
+        modes, shared = _ascending(merged.x, MODES - 1), np.repeat([0, 1], [2, 1] if near == 0 else [1, 2])
     theta, residual = solved(modes)
     spare = residual.size - theta.size - len(modes)
     chi_square = float((residual**2).sum() / spare)
@@ -160,8 +179,10 @@ def fit_modes(
     gains_covariance = values_covariance[:18, :18]
     lag_s, lag_standard_error_s = combined(values[18:], values_covariance[18:, 18:])
     static_standard_error, acceleration_standard_error = np.sqrt(np.diag(gains_covariance)).reshape(2, 3, 3)
-    hz, ratio = (half[shared] for half in _halves(np.exp(modes)))
-    of_hz, of_ratio = (half[shared] for half in _halves(np.sqrt(np.diag(covariance))[: len(modes)]))
+    poles, of_poles = np.exp(modes), np.sqrt(np.diag(covariance))[: len(modes)]
+    (*both, corner), (*of_both, of_corner) = _split(poles), _split(of_poles)
+    hz, ratio = (half[shared] for half in both)
+    of_hz, of_ratio = (half[shared] for half in of_both)
     if not (hz.min() > low and hz.max() < high):
         raise FitError(
             f"modes were found at {hz.min():.0f} to {hz.max():.0f} Hz, the tones lie from {low:.0f} to {high:.0f} Hz; "
@@ -184,18 +205,22 @@ def fit_modes(
         _coefficients=_per_input(theta),
         _period_s=period_s,
         _delay_periods=delay_periods,
+        sense_corner_hz=float(corner[0]) if len(corner) else None,
+        sense_corner_standard_error_hz=float(corner[0] * of_corner[0]) if len(corner) else None,
     )
 
 
-def _halves(modes: Array) -> tuple[Array, Array]:
-    """Of frequencies and of dampings, (n,) each, from (2 n,)."""
-    return modes[: len(modes) // 2], modes[len(modes) // 2 :]
+def _split(poles: Array) -> tuple[Array, Array, Array]:
+    """Of frequencies and of dampings, (n,) each, from (2 n,) or (2 n + 1,); last the corner, (0,) or (1,)."""
+    n = len(poles) // 2
+    return poles[:n], poles[n : 2 * n], poles[2 * n :]
 
 
-def _ascending(modes: Array) -> Array:
-    hz, damping = _halves(modes)
+def _ascending(poles: Array, pairs: int) -> Array:
+    hz, damping, corner = _split(poles)
+    assert len(hz) == pairs
     order = np.argsort(hz)
-    return np.concatenate([hz[order], damping[order]])
+    return np.concatenate([hz[order], damping[order], corner])
 
 
 def _least_squares(matrix: Array, right: Array) -> Array:
@@ -203,16 +228,19 @@ def _least_squares(matrix: Array, right: Array) -> Array:
     return np.asarray(scipy.linalg.solve_triangular(r, q.T @ right))
 
 
-def _basis(f: Array, hz: Array, damping: Array, period_s: float, delay_periods: int) -> Complex:
-    """(k, 2 modes + 1) functions of z at frequencies (k,)."""
+def _basis(f: Array, poles: Array, period_s: float, delay_periods: int) -> Complex:
+    """(k, 2 modes + 1) functions of z at frequencies (k,), and one more for the sense chain."""
+    hz, damping, corner = _split(poles)
     back = np.exp(-2j * math.pi * f * period_s)
     s = 2.0 * math.pi * hz * (-damping + 1j * np.sqrt(np.maximum(1.0 - damping**2, 0.0)))
     pole = np.exp(s * period_s)
-    out = np.empty((len(f), 2 * len(hz) + 1), np.complex128)
+    out = np.empty((len(f), 2 * len(hz) + 1 + len(corner)), np.complex128)
     for i, p in enumerate(pole):
         resonance = back ** (delay_periods + 1) / (1.0 - 2.0 * p.real * back + abs(p) ** 2 * back**2)
         out[:, 2 * i], out[:, 2 * i + 1] = resonance, resonance * back
-    out[:, -1] = back ** (delay_periods + 1)
+    out[:, 2 * len(hz)] = back ** (delay_periods + 1)
+    if len(corner):
+        out[:, -1] = back ** (delay_periods + 1) / (1.0 - math.exp(-2.0 * math.pi * corner[0] * period_s) * back)
     return out
 
 
@@ -223,7 +251,7 @@ def _per_input(theta: Array) -> Array:
 
 def _static_gain(modes: Array, theta: Array, period_s: float, delay_periods: int) -> Array:
     """P(z = 1), (3, 3)."""
-    basis = _basis(np.zeros(1), *_halves(np.exp(modes)), period_s, delay_periods)[0].real
+    basis = _basis(np.zeros(1), np.exp(modes), period_s, delay_periods)[0].real
     return np.asarray(np.einsum("b,bij->ij", basis, _per_input(theta)))
 
 
@@ -236,17 +264,20 @@ def combined(values: Array, covariance: Array) -> tuple[float, float]:
 def _sudden(modes: Array, theta: Array, period_s: float, delay_periods: int) -> tuple[Array, Array]:
     """Sum of the modes' numerators, (3, 3), from their residues, and the lag of amplifier and
     sense chain within a period in s as each pair of poles (n,) shows it: it turns a mode's
-    numerators by a common angle, which is taken back.
+    numerators by a common angle, which is taken back, as is what the sense chain does to them.
     """
     coefficients, total, lags_s = _per_input(theta), np.zeros((3, 3)), np.zeros(len(modes) // 2)
-    for i, (hz, d) in enumerate(zip(*_halves(np.exp(modes)), strict=True)):
+    frequencies, dampings, corner = _split(np.exp(modes))
+    sense_s = 0.5 / (math.pi * float(corner[0])) if len(corner) else 0.0
+    for i, (hz, d) in enumerate(zip(frequencies, dampings, strict=True)):
         w = 2.0 * math.pi * hz
         s = w * complex(-d, math.sqrt(1.0 - d * d))
         p = np.exp(s * period_s)
         residue = p ** (1 - delay_periods) * (coefficients[2 * i] + coefficients[2 * i + 1] / p) / (p - p.conjugate())
-        numerator = residue * p**delay_periods * s / (p - 1.0) * (s - s.conjugate())
-        lags_s[i] = -0.5 * float(np.angle((numerator**2).sum())) / s.imag
-        total += (numerator * np.exp(s * max(0.0, lags_s[i]))).real
+        numerator = residue * p**delay_periods * s / (p - 1.0) * (s - s.conjugate()) * (1.0 + s * sense_s)
+        late_s = -0.5 * float(np.angle((numerator**2).sum())) / s.imag
+        total += (numerator * np.exp(s * max(0.0, late_s))).real
+        lags_s[i] = late_s + sense_s
     return total, lags_s
 
 
