@@ -120,10 +120,8 @@ def _recorded_run(scenario: Scenario, setup: Setup, folder: Path, lane: Lane = L
 
 
 def _plant_alone(plant: PlantOnBus, counts: list[list[int]], period_us: int) -> None:
-    for k, row in enumerate(counts):
-        plant.advance_to(period_us * k)
-        plant.drive(row)
-        plant.sample()
+    for k, (a, b, c) in enumerate(counts):
+        plant.exchange(period_us * k, (a, b, c), sample=True)
 
 
 def _forget(block: NDArray[np.void]) -> None:

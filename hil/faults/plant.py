@@ -28,7 +28,7 @@ class FaultyPlant(PlantOnBus):
         self._analog = bus.analog
         self._period_us = bus.period_us
         self._t_us = -1  # of the present sample
-        self._commanded: Sequence[int] = (0, 0, 0)
+        self._commanded: Counts = (0, 0, 0)
         self._random = random.Random(seed)
         self._to_come = sorted((f for f in faults if f.kind != "trip"), key=lambda f: f.at_us, reverse=True)
         self._on: list[Fault] = []
@@ -37,30 +37,33 @@ class FaultyPlant(PlantOnBus):
         self._whole = {name: plant.params[name].copy() for name in _STIFFNESSES}
         self._offset_v = plant.params["amplifier_offset_v"].copy()
 
-    def drive(self, counts: Sequence[int]) -> None:
-        """The converters are told new counts (3,) now."""
-        self._commanded = counts
-        super().drive(self._through_amplifier(counts) if self._on else counts)
-
-    def sample(self) -> Counts:
-        """Sample the sense combs now; here and in ``look`` time passes for the faults."""
-        self._pass_time(self._now_us if self._origin_us is None else self._origin_us)
-        counts = super().sample()
-        return self._through_sense(counts) if self._on else counts
+    def exchange(self, t_us: int, counts: Counts | None, *, sample: bool) -> Counts:
+        """Time passes for the faults with each sample, and in ``look``."""
+        if counts is not None:
+            self._commanded = counts
+        if not sample:
+            return super().exchange(t_us, self._on_converters(counts), sample=False)
+        changed = self._pass_time(t_us, t_us if self._origin_us is None else self._origin_us, counts)
+        sensed = super().exchange(t_us, changed, sample=True)
+        return self._through_sense(sensed) if self._on else sensed
 
     def look(self, t_us: int) -> None:
         """Without a sample, too, time passes for the faults."""
-        self.advance_to(t_us)
         if self._origin_us is not None:
-            self._pass_time(self._origin_us)
+            super().exchange(t_us, self._pass_time(t_us, self._origin_us, None), sample=False)
         super().look(t_us)
 
-    def _pass_time(self, origin_us: int) -> None:
-        self._t_us = self._now_us - origin_us
+    def _pass_time(self, t_us: int, origin_us: int, counts: Counts | None) -> Counts | None:
+        """What the converters take now. A fault that begins or ends leaves the time before it as it was."""
+        self._t_us = t_us - origin_us
         if self._t_us >= self._change_us:
+            super().exchange(t_us, self._on_converters(counts), sample=False)
             self._change()
-        if self._on:
-            super().drive(self._through_amplifier(self._commanded))
+            counts = self._commanded
+        return self._on_converters(self._commanded if self._on else counts)
+
+    def _on_converters(self, counts: Counts | None) -> Counts | None:
+        return self._through_amplifier(counts) if self._on and counts is not None else counts
 
     def _change(self) -> None:
         """Faults begin or end with this sample."""
@@ -81,10 +84,9 @@ class FaultyPlant(PlantOnBus):
             if fault.family == "amplifier" and fault.kind == "offset":
                 offset_v[0, fault.channel] += fault["offset_v"]
         self.plant.params["amplifier_offset_v"] = offset_v
-        super().drive(self._commanded)  # so that an output that is whole again, or off by some volts, shows it now
         self._disturb()
 
-    def _through_amplifier(self, counts: Sequence[int]) -> Counts:
+    def _through_amplifier(self, counts: Counts) -> Counts:
         out = [float(c) for c in counts]
         for fault in self._on:
             if fault.family == "amplifier":

@@ -22,7 +22,7 @@ from hil.faults.injection import Injection, plant_of
 from hil.lanes.blocks import Blocks
 from hil.lanes.setup import Setup
 from hil.node.wired import wired_node
-from hil.plant.on_bus import EXCHANGE
+from hil.plant.on_bus import RECORD
 from hil.plant.truth import TRUTH_BYTES
 from pkxyz_ctrl.can.cob_id import SYNC
 from pkxyz_ctrl.can.frame import Frame
@@ -158,7 +158,7 @@ class _Recorder:
         self._blocks = blocks
         self._rows = blocks.rows.view(np.uint8).data
         self._row = rig.controller.row[:_TRUTH_AT]
-        self._truth = rig.plant.exchange.view(np.uint8).data[:TRUTH_BYTES]
+        self._truth = rig.plant.record.view(np.uint8).data[:TRUTH_BYTES]
         self._plant, self._clock = rig.plant, rig.clock
         self._at = 0
 
@@ -201,7 +201,7 @@ class _Reference:
 
 
 def _exchange_in_blocks(rig: LockstepRig, blocks: Blocks) -> tuple[_Reference, _Recorder]:
-    leads, ends = (dict(d.fields or {})["position_m"][1] for d in (EXCHANGE, ROW))
+    leads, ends = (dict(d.fields or {})["position_m"][1] for d in (RECORD, ROW))
     assert (leads, ends) == (0, _TRUTH_AT), "the truth leads the exchange and ends the row"
     recorder = _Recorder(rig, blocks)
     return _Reference(rig, blocks, recorder), recorder

@@ -18,6 +18,7 @@ from hil.node.amplifier import NmtState
 from hil.node.wired import wired_node
 from hil.plant.on_bus import PlantOnBus
 from hil.plant.truth import TRUTH_BYTES
+from pkxyz_ctrl.can.codec import Counts
 from pkxyz_ctrl.config.bus import CanConfig
 from pkxyz_ctrl.io.can_port import CanPort
 from pkxyz_ctrl.io.clocks import WallClock
@@ -39,13 +40,14 @@ class WitnessedPlant(PlantOnBus):
     def __init__(self, plant: Plant, out: Path) -> None:
         super().__init__(plant)
         self._file = out.open("wb", buffering=0)  # readable while it grows, and whole whatever ends the process
-        self._exchange_bytes = self.exchange.view(np.uint8).data
+        self._record_bytes = self.record.view(np.uint8).data
 
-    def sample(self) -> tuple[int, int, int]:
-        """Sample the sense combs now, and write down what is true."""
-        counts = super().sample()
-        self._file.write(_TRUTH_ROW.pack(self._now_us, bytes(self._exchange_bytes[:TRUTH_BYTES]), *counts))
-        return counts
+    def exchange(self, t_us: int, counts: Counts | None, *, sample: bool) -> Counts:
+        """With each sample, what is true is written down."""
+        sensed = super().exchange(t_us, counts, sample=sample)
+        if sample:
+            self._file.write(_TRUTH_ROW.pack(t_us, bytes(self._record_bytes[:TRUTH_BYTES]), *sensed))
+        return sensed
 
     def close(self) -> None:
         """No more truth."""
@@ -99,8 +101,7 @@ class WallPlant:
         """Where no SYNC comes, keep the plant from falling behind: it would have to catch up at the next."""
         t_us = max(self.clock.now_us, self.wall.now_us - _IN_FLIGHT_US)
         self.clock.run_until(t_us)
-        self.plant.advance_to(t_us)
-        self.plant.settle()
+        self.plant.exchange(t_us, None, sample=False)
 
     def _show(self) -> None:
         shown = (self.node.state, any(self.node.outputs))
@@ -113,9 +114,5 @@ def _warm_up(setup: Setup) -> None:
     """Load the compiled plant before it is waited for."""
     scratch = PlantOnBus(setup.new_plant())
     for t_us in (0, 500, 1000):
-        scratch.advance_to(t_us)
-        scratch.drive((0, 0, 0))
-        scratch.sample()
-    scratch.advance_to(1500)
-    scratch.drive((0, 0, 0))
-    scratch.settle()
+        scratch.exchange(t_us, (0, 0, 0), sample=True)
+    scratch.exchange(1500, (0, 0, 0), sample=False)

@@ -207,16 +207,15 @@ class AmplifierNode:
             self._count_silence(t_us)
             return
         self._sync_expected = self._sync_following[data]
-        self._plant.advance_to(t_us)
-        pending = self._drive.pending
+        outputs, pending = None, self._drive.pending
         if pending is not None:
-            self._apply(pending, t_us)
+            outputs = self._apply(pending, t_us)
         else:
             self._drive.miss()
             self._count_silence(t_us)
         if self._sync_errors.present:
             self._sync_errors.good(t_us)
-        self._sense.on_sync(data, t_us)
+        self._sense.on_sync(data, t_us, outputs)
 
     def _check_sync(self, data: bytes, t_us: int) -> None:
         if data == self._sync_expected or self._is_sync(data, t_us):
@@ -240,11 +239,12 @@ class AmplifierNode:
         """Transmission types 254 and 255: applied on reception."""
         self._drive.receive(data, t_us)
         if self._drive.pending is not None:
-            self._plant.advance_to(t_us)
-            self._apply(self._drive.pending, t_us)
+            outputs = self._apply(self._drive.pending, t_us)
+            if outputs is not None:
+                self._plant.exchange(t_us, outputs, sample=False)
 
-    def _apply(self, counts: Outputs, t_us: int) -> None:
-        """Put counts on the converters; 0 V from anywhere, else no further from what is there than 0x2011 says."""
+    def _apply(self, counts: Outputs, t_us: int) -> Outputs | None:
+        """What the converters take: 0 V from anywhere, else no further from what is there than 0x2011 says."""
         a, b, c = counts
         if a or b or c:
             step = self._step_max
@@ -255,12 +255,12 @@ class AmplifierNode:
                     ErrorCode.DRIVE_STEP, t_us, bytes((sum(1 << comb for comb, is_over in enumerate(over) if is_over),))
                 )
                 self._release_combs()
-                return
+                return None
         self._drive_deadline.set(t_us + self._drive_timeout_us)
         self._drive.pending = None
         self._silent_syncs = 0
         self.outputs = counts
-        self._plant.drive(counts)
+        return counts
 
     def _count_silence(self, t_us: int) -> None:
         """A cycle without a valid drive PDO. After as many as object 0x2010 says it is told, and energised combs are
@@ -287,8 +287,7 @@ class AmplifierNode:
     def _set_outputs(self, counts: Outputs, t_us: int) -> None:
         self._drive.pending = None
         self.outputs = counts
-        self._plant.advance_to(t_us)
-        self._plant.drive(counts)
+        self._plant.exchange(t_us, counts, sample=False)
 
     def _outputs_to_error_value(self) -> None:
         """CiA 401: error mode 1 takes the error value (0x6444, in counts of 0x6411), mode 0 keeps what is there."""
@@ -333,8 +332,7 @@ class AmplifierNode:
     def _refresh(self, index: int) -> None:
         """Bring the process image to the dictionary, which does not see every cycle."""
         if index == 0x6401 and self.state is not NmtState.OPERATIONAL:
-            self._plant.advance_to(self._clock.now_us)
-            self._sense.counts = self._plant.sample()
+            self._sense.counts = self._plant.exchange(self._clock.now_us, None, sample=True)
         if index in (0x6401, 0x2001):
             self._sense.publish()
         elif index == 0x6411:

@@ -6,6 +6,7 @@ from typing import Protocol
 
 from hil.node.alarm import Alarm, Scheduler
 from hil.node.crc import WORDS, crc8h2f, last_byte_table
+from hil.node.drive import Outputs
 from hil.node.heartbeat import HeartbeatProducer
 from hil.node.object_dictionary import ObjectDictionary
 from hil.node.pdo import PdoParameters
@@ -18,11 +19,10 @@ _PROTECTION = 0x2001
 class Plant(Protocol):
     """What the amplifier is wired to: three drive combs, three sense combs."""
 
-    def advance_to(self, t_us: int, /) -> None: ...
-
-    def drive(self, counts: tuple[int, int, int], /) -> None: ...
-
-    def sample(self) -> tuple[int, int, int]: ...
+    def exchange(self, t_us: int, counts: Outputs | None, /, *, sample: bool) -> Outputs:
+        """It is ``t_us``, never earlier than before. The converters take ``counts``, or keep what they have; then, if
+        asked to, the sense combs are sampled. Returns the counts of the last sample.
+        """
 
 
 class SenseTransmitter:
@@ -98,13 +98,17 @@ class SenseTransmitter:
         self._due_us = None
         self._event.cancel()
 
-    def on_sync(self, data: bytes, t_us: int) -> None:
-        """Sample if it is time to; the plant is at ``t_us``. ``data`` of the SYNC: its counter, or nothing."""
+    def on_sync(self, data: bytes, t_us: int, outputs: Outputs | None) -> None:
+        """The SYNC at ``t_us``: the converters take ``outputs``, if there are any, and the sense combs are sampled if
+        it is time to. ``data`` of the SYNC: its counter, or nothing.
+        """
         self._cycle_us = t_us - self._sync_us
         self._sync_us = t_us
-        if not (self._each or self._is_time(data)):
+        is_time = self._each or self._is_time(data)
+        counts = self._plant.exchange(t_us, outputs, sample=is_time)
+        if not is_time:
             return
-        self.counts = counts = self._plant.sample()
+        self.counts = counts
         if self._on_change and counts == self._sent:
             return
         self._due_us = due_us = t_us + self._turnaround_us
@@ -131,8 +135,7 @@ class SenseTransmitter:
         self._heartbeat.ride(now_us, self._cycle_us)
 
     def _on_event(self, now_us: int) -> None:
-        self._plant.advance_to(now_us)
-        self.counts = self._plant.sample()
+        self.counts = self._plant.exchange(now_us, None, sample=True)
         self._transmit()
         self._event.set(now_us + self._event_us)
 

@@ -111,9 +111,7 @@ def sampled(*texts, ticks=40, counts=(9000, 9000, 9000)):
         plant = FaultyPlant(run.new_plant(), some, run.bus, seed=5)
         seen, volts = [], []
         for k in range(ticks):
-            plant.advance_to(1000 + 200 * k)
-            plant.drive(counts)
-            seen.append(plant.sample())
+            seen.append(plant.exchange(1000 + 200 * k, counts, sample=True))
             volts.append(plant.plant.voltage_v)
         found.append((np.array(seen), np.array(volts)))
     (seen, volts), (seen_whole, volts_whole) = found
@@ -194,9 +192,7 @@ def test_a_stuck_amplifier_keeps_its_voltage_and_a_slow_one_moves_by_so_much_a_p
     plant = FaultyPlant(run.new_plant(), run.faults, run.bus, seed=5)
     volts = []
     for k in range(40):
-        plant.advance_to(200 * k)
-        plant.drive((9000, 9000, 9000) if k < 15 else (0, 0, 0))
-        plant.sample()
+        plant.exchange(200 * k, (9000, 9000, 9000) if k < 15 else (0, 0, 0), sample=True)
         volts.append(plant.plant.voltage_v)
     volts = np.array(volts)
     assert volts[5:, 0] == pytest.approx(np.full(35, volts[5, 0]), abs=0.01)
@@ -209,9 +205,7 @@ def test_forces_and_stiffness_act_for_their_time_only():
     plant = FaultyPlant(run.new_plant(), run.faults, run.bus, seed=5)
     forces, leaf = [], []
     for k in range(40):
-        plant.advance_to(200 * k)
-        plant.drive((0, 0, 0))
-        plant.sample()
+        plant.exchange(200 * k, (0, 0, 0), sample=True)
         forces.append(plant.plant.external_force_n[0])
         leaf.append(plant.plant.params["leaf_n_per_m"][0, 0])
     assert np.flatnonzero(forces).tolist() == list(range(10, 15))

@@ -9,6 +9,7 @@ from hil.bus.clock import Lockstep
 from hil.bus.wire import Wire
 from hil.node.amplifier import AmplifierNode, NmtState
 from hil.node.sense import Plant
+from hil.plant.on_bus import PlantOnBus
 from pkxyz_ctrl.can.driver import AmplifierDriver
 from pkxyz_ctrl.can.driver_config import DriverConfig
 from pkxyz_ctrl.can.frame import Frame
@@ -27,6 +28,7 @@ class Bench:
 
     def __init__(self, plant: Plant, *, fd: bool = True, protection: bool = True) -> None:
         self.clock = Lockstep()
+        self.plant = plant
         self.wire = Wire(self.clock, 1_000_000, 5_000_000 if fd else None)
         self.period_us = 200 if fd else 500
         self.seen: list[tuple[int, Frame]] = []
@@ -150,7 +152,7 @@ def test_with_the_real_plant_the_stage_moves_and_falls_back() -> None:
         sense_scale_f_per_count=68e-18,
         sense_offset_f=4.14e-12,
     )
-    bench = Bench(plant)
+    bench = Bench(PlantOnBus(plant))
     bench.clock.run_until(5000)
     bench.start()
     at_rest = bench.cycle((10_000, 10_000, 10_000))
@@ -161,5 +163,5 @@ def test_with_the_real_plant_the_stage_moves_and_falls_back() -> None:
     for frame in bench.driver.stop(bench.clock.now_us):
         bench.master.send(frame)
     bench.clock.run_until(bench.clock.now_us + 2000)
-    plant.advance_to(bench.clock.now_us)
+    bench.plant.exchange(bench.clock.now_us, None, sample=False)
     assert plant.voltage_v == pytest.approx([0.0] * 3, abs=1e-2)

@@ -80,13 +80,12 @@ def test_the_controllers_codec_reads_the_sense_pdo() -> None:
 
 def test_drive_is_applied_before_the_sample_and_at_the_same_instant() -> None:
     rig = operational()
-    order: list[tuple[object, ...]] = []
-    rig.plant.advance_to = lambda t_us: order.append(("advance", t_us))  # type: ignore[method-assign]
-    rig.plant.drive = lambda counts: order.append(("drive", counts))  # type: ignore[method-assign]
-    rig.plant.sample = lambda: order.append(("sample",)) or ZERO  # type: ignore[method-assign,func-returns-value]
+    seen: list[tuple[object, ...]] = []
+    exchange = rig.plant.exchange
+    rig.plant.exchange = lambda *what, sample: seen.append((*what, sample)) or exchange(*what, sample=sample)  # type: ignore
     rig.drive((7, 8, 9))
     rig.sync()
-    assert order == [("advance", rig.now_us), ("drive", (7, 8, 9)), ("sample",)]
+    assert seen == [(rig.now_us, (7, 8, 9), True)]
 
 
 def test_the_last_of_two_drive_pdos_counts() -> None:

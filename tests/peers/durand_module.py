@@ -126,8 +126,8 @@ class DurandModule:
 
     def _sample(self) -> None:
         if self.node.nmt.state == StateEnum.OPERATIONAL:
-            self._plant.advance_to(self._clock.now_us)
-            for comb, count in zip(COMBS, self._plant.sample(), strict=True):
+            sensed = self._plant.exchange(self._clock.now_us, None, sample=True)
+            for comb, count in zip(COMBS, sensed, strict=True):
                 self.node.object_dictionary.write(0x6401, comb, count)
 
     def _drive(self, value: int) -> None:
@@ -137,8 +137,7 @@ class DurandModule:
 
     def _put(self, counts: tuple[int, int, int]) -> None:
         self.outputs = counts
-        self._plant.advance_to(self._clock.now_us)
-        self._plant.drive(counts)
+        self._plant.exchange(self._clock.now_us, counts, sample=False)
 
     def _on_state(self, state: StateEnum) -> None:
         if state != StateEnum.OPERATIONAL and any(self.outputs):

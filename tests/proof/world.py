@@ -117,10 +117,12 @@ class Plant:
         self.counts: Counts = (0, 0, 0)
         self._sample = sense_counts_at_rest()
 
-    def advance_to(self, t_us: int) -> None:
-        pass
+    def exchange(self, t_us: int, counts: Counts | None, *, sample: bool) -> Counts:
+        if counts is not None:
+            self._drive(counts)
+        return self._sample
 
-    def drive(self, counts: Counts) -> None:
+    def _drive(self, counts: Counts) -> None:
         before, self.counts = self.counts, (int(counts[0]), int(counts[1]), int(counts[2]))
         if not all(0 <= count <= MAXIMUM for count in counts):
             raise ViolationError(f"comb counts {counts} beyond 0..{MAXIMUM}")
@@ -128,9 +130,6 @@ class Plant:
             raise ViolationError(f"a step from {before} to {counts}, beyond {STEP} in a tick")
         if any(counts) and self._world.node.state is not NmtState.OPERATIONAL:
             raise ViolationError(f"{counts} driven while the node is {self._world.node.state.name}")
-
-    def sample(self) -> Counts:
-        return self._sample
 
 
 class World:

@@ -414,15 +414,15 @@ class AppliesAtOnce(_OtherDrive):
         super().on_frame(frame, t_us)
         if frame.can_id == 0x30A and (pending := self._drive.pending) is not None:
             self.outputs = pending
-            self._plant.drive(pending)
+            self._plant.exchange(t_us, pending, sample=False)
 
 
 class Saturates(AmplifierNode):
     """outputs, with voltage: scaling"""
 
-    def _apply(self, counts: tuple[int, int, int], t_us: int) -> None:
+    def _apply(self, counts: tuple[int, int, int], t_us: int) -> tuple[int, int, int] | None:
         a, b, c = (min(count, 600) for count in counts)
-        super()._apply((a, b, c), t_us)
+        return super()._apply((a, b, c), t_us)
 
 
 class Silent(AmplifierNode):
@@ -474,11 +474,12 @@ class StillPlant:
     def __init__(self) -> None:
         self.t_us = 0
 
-    def advance_to(self, t_us: int) -> None:
-        self.t_us = t_us
+    def exchange(self, t_us: int, counts: tuple[int, int, int] | None, *, sample: bool) -> tuple[int, int, int]:
+        if counts is not None:
+            self.drive(counts)
+        if sample:
+            self.t_us = t_us
+        return self.t_us % 32768, -(self.t_us % 32769), 5
 
     def drive(self, counts: tuple[int, int, int]) -> None:
         assert min(counts) >= 0
-
-    def sample(self) -> tuple[int, int, int]:
-        return self.t_us % 32768, -(self.t_us % 32769), 5

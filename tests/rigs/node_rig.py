@@ -36,10 +36,16 @@ class RecordingPlant:
         self.t_us = 0
         self.driven: list[tuple[int, tuple[int, int, int]]] = []
         self.sampled_us: list[int] = []
+        self.sensed = (0, 0, 0)
 
-    def advance_to(self, t_us: int) -> None:
+    def exchange(self, t_us: int, counts: tuple[int, int, int] | None, *, sample: bool) -> tuple[int, int, int]:
         assert t_us >= self.t_us, "time runs one way"
         self.t_us = t_us
+        if counts is not None:
+            self.drive(counts)
+        if sample:
+            self.sensed = self.sample()
+        return self.sensed
 
     def drive(self, counts: tuple[int, int, int]) -> None:
         self.driven.append((self.t_us, counts))

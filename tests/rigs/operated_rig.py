@@ -59,7 +59,7 @@ class OperatedRig:
                 plant.look(self.lockstep.clock.now_us)
             plant.was_sampled = False
             for name, *_ in TRUTH_FIELDS:
-                row[name] = plant.exchange[name][0]
+                row[name] = plant.record[name][0]
             for each in self.every_tick:
                 each()
             try:
