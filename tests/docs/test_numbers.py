@@ -16,6 +16,8 @@ from pkxyz_ctrl import Stage
 from pkxyz_ctrl.config.files import load
 from pkxyz_ctrl.design.margins.tolerances import Tolerances
 from pkxyz_ctrl.mechanics.modes import modes
+from pkxyz_ctrl.mechanics.published import entries
+from pkxyz_ctrl.mechanics.reproduction import reproduction_table
 
 ROOT = Path(__file__).parents[2]
 
@@ -133,6 +135,8 @@ def test_measured_figures_of_the_readme_are_those_of_the_benchmarks() -> None:
     assert f"{value['control.gain_1262']:.1f} dB, -2 degrees" in text
     assert f"within 10 nm after {value['control.step_settle']:.1f} ms" in text
     assert f"{value['control.step_overshoot']:.0f} % overshoot" in text
+    jump = f"jump of the set-point {value['control.jump_settle']:.1f} ms, {value['control.jump_overshoot']:.0f} %"
+    assert jump in text
     assert f"{value['control.circle']:.2f} % of the diameter" in text
     assert f"{value['control.raster']:.3f} % of a line" in text
     assert f"({value['lockstep.realtime']:.0f} times real time)" in text
@@ -170,3 +174,48 @@ def test_the_worst_sampled_plants_are_as_bad_as_told(law: str) -> None:
     if law != "youla":
         assert cells[2].split(", ")[2].startswith({"robust": "8.7", "lqg": "2.5"}[law])
         assert "Ms is 8.7 on the worst of these plants, 2.5 for `lqg`" in text
+
+
+def test_what_the_page_says_of_the_paper() -> None:
+    """Beside the table of all numbers: those that the text of the page repeats."""
+    rows = reproduction_table(entries(), Stage.load("printed"), Stage.load("reconstructed"))
+    ours = {(row.where, row.quantity): row.reconstructed for row in rows}
+    text = page("docs/understand/mechanics.md")
+    for (where, quantity), words in {
+        ("Eq. 8", "lambda_1 at rest, origin moved 100 um"): "λ₁ is {:.0f} um at rest",
+        ("Eq. 19", "K_zz with pivots on all three chains"): "then K_zz is {:.3f} N/mm instead of",
+        ("Eq. 16, 26", "K_xx with the four leaves of a spring counted once"): "K_xx is {:.4f} N/mm instead of",
+        ("Eq. 34", "pull-in stroke, overlap taken off the root"): "Corrected it is {:.0f} um for the folded springs",
+        ("IV.D", "pull-in stroke, all that the comb works against"): "and {:.0f} um with all that a lifting comb",
+        ("IV.D", "comb force at 130 V"): "comb gives {:.2f} mN at 130 V",
+        ("IV", "cube within the workspace"): "{:.2f} um standing on its corner",
+    }.items():
+        found = ours[where, quantity]
+        assert found is not None
+        assert words.format(found) in text
+    frequencies = [ours["Eq. 40", quantity] for quantity in ("f_x = f_y", "f_z")]
+    assert "gives {:.1f} and {:.1f} Hz".format(*frequencies) in text
+    stage = Stage.load("reconstructed")
+    volts = stage.holding_voltages(stage.forward_kinematics([25e-6] * 3))[0]
+    assert text.count(f"{volts:.1f} V") == 2
+    assert f"# V: {volts:.1f} on each comb" in page("README.md")
+
+
+def test_what_a_count_of_voltage_moves() -> None:
+    stage, count_v = Stage.load("reconstructed"), 200 / 32767
+    heights = np.linspace(15e-6, 25e-6, 2001)
+    volts = np.array([stage.holding_voltages([0.0, 0.0, z])[0] for z in heights])
+    moved = (np.interp(133.0 + count_v, volts, heights) - np.interp(133.0, volts, heights)) * 1e9
+    assert f"A count is {count_v * 1e3:.1f} mV, at 133 V about {moved:.1f} nm of height" in page(
+        "docs/understand/laws.md"
+    )
+
+
+def test_where_the_changed_plants_stand() -> None:
+    stage = Stage.load("reconstructed")
+    strokes = np.array([case.strokes_m for case in load("tolerances", "wide", Tolerances).cases()])
+    volts = stage.holding_voltages(stage.forward_kinematics(strokes))
+    span_um = f"{strokes.min() * 1e6:.0f} to {strokes.max() * 1e6:.0f} um"
+    assert f"strokes from {span_um} ({volts.min():.0f} to {volts.max():.0f} V to hold)" in page(
+        "docs/understand/margins.md"
+    )
