@@ -1,6 +1,7 @@
 # make sil    close the loop over the simulated bus: runs/raster-lockstep-1/ holds recording, summary and picture
 # make test   run every test, the linter and the type checker
 # make test-socketcan  controller and plant in two processes over the kernel's CAN sockets, in a guest that has them
+# make test-firmware  a million ticks of the exported controller, here and on an emulated Cortex-M7: the bits of Python?
 # make bench  measure what the docs promise and print it
 # make mutate change one thing at a time in gate, modes, monitors, comb law and codec: does a test notice? SECONDS=1200
 # make prove  every state that shipped controller and node can reach under any law with faults: EXPLORED="two one"
@@ -12,7 +13,7 @@
 PYTHON ?= python3
 BIN := .venv/bin
 
-.PHONY: sil test test-socketcan bench docs docs-site wheel clean mutate fuzz kills prove coverage
+.PHONY: sil test test-socketcan test-firmware bench docs docs-site wheel clean mutate fuzz kills prove coverage
 
 sil: .venv/.ready
 	$(BIN)/pkxyz sil
@@ -25,6 +26,10 @@ test: .venv/.ready
 
 test-socketcan: .venv/.ready
 	$(BIN)/python tests/socketcan/run.py
+
+TICKS ?= 1000000
+test-firmware: .venv/.ready
+	$(BIN)/python tests/firmware/run.py $(TICKS)
 
 bench: .venv/.ready
 	$(BIN)/pkxyz bench

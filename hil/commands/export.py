@@ -46,7 +46,7 @@ def export(
         from hil.runs.scenario import load_scenario
 
         loaded = load_scenario(scenario, stage=stage, controller=controller, bus=bus)
-        require_exportable(loaded.setup().law, loaded.controller.name)
+        require_exportable(loaded.setup().law, loaded.controller.name, target)
         manifest = write(path, target, _exported(loaded, ticks))
     except ExportError as error:
         raise ConfigError(str(error)) from None

@@ -31,6 +31,9 @@ PORT = Path(__file__).parent / "port"
 REFERENCE_MAX_BYTES = 2 << 20
 """Of a microcontroller's flash; a board that streams its reference needs no more than some rows."""
 
+BUSY_MOST = 0.8
+"""Share of a period that the longest tick may take: frames, interrupts and caches want the rest."""
+
 
 class Exported(NamedTuple):
     """What is to be exported: the law (1,), the reference's rows (n,), inputs (m,) of a self-test, names for people."""
@@ -50,8 +53,14 @@ def target_of(name: str) -> Target:
     return TARGETS[name]
 
 
-def require_exportable(law: Records, name: str) -> None:
-    """Raises ``ExportError`` for a law that does not go whole."""
+def require_exportable(law: Records, name: str, target: str) -> None:
+    """Raises ``ExportError`` for a law that does not go whole, or not in time."""
+    period_us, most_us = int(law["period_us"][0]), target_of(target).tick_most_us
+    if period_us * BUSY_MOST < most_us:
+        raise ExportError(
+            f"a period of {period_us} us is too short for {target}, where the longest tick takes {most_us} us; give a "
+            f"bus of {most_us / BUSY_MOST:.0f} us or more, or another target"
+        )
     if law["tick"]["kind"][0] == PREDICTIVE:
         raise ExportError(
             f"controller {name!r} solves a problem in the middle of a tick, and the solver does not go with it yet; "
@@ -62,7 +71,7 @@ def require_exportable(law: Records, name: str) -> None:
 def write(out: Path, target_name: str, exported: Exported) -> dict[str, Any]:
     """Write the folder, which must be empty or not there; returns its manifest. Raises ``ExportError``, ``OSError``."""
     target = target_of(target_name)
-    require_exportable(exported.law, exported.controller)
+    require_exportable(exported.law, exported.controller, target_name)
     size = exported.reference.nbytes
     if not target.is_hosted and size > REFERENCE_MAX_BYTES:
         rows = REFERENCE_MAX_BYTES // exported.reference.itemsize

@@ -60,18 +60,21 @@ def _functions(listing: str) -> dict[str, list[str]]:
     return bodies
 
 
+_PUSHED = re.compile(r"\t(?:stmdb\tsp!, |push\t)\{([^}]*)\}")
+_PUSHED_FLOATS = re.compile(r"\tvpush\t\{([^}]*)\}")
+_RESERVED = re.compile(r"\tsubw?\tsp, (?:sp, )?#(\d+)|\tstrd?(?:\.w)?\t.*\[sp, #-(\d+)\]!")
+
+
 def _frame(body: list[str]) -> int:
-    """Bytes pushed and reserved anywhere in a function; a register range counts whole."""
+    """Bytes pushed and reserved anywhere in a function."""
     size = 0
     for line in body:
-        if match := re.search(r"\t(?:stmdb\tsp!, |push\t)\{([^}]*)\}", line):
+        if match := _PUSHED.search(line):
             size += 4 * _registers(match[1])
-        elif match := re.search(r"\tvpush\t\{([^}]*)\}", line):
+        elif match := _PUSHED_FLOATS.search(line):
             size += (8 if "d" in match[1] else 4) * _registers(match[1])
-        elif (match := re.search(r"\tsubw?\tsp, (?:sp, )?#(\d+)", line)) or (
-            match := re.search(r"\tstr(?:d)?\.?w?\t.*\[sp, #-(\d+)\]!", line)
-        ):
-            size += int(match[1])
+        elif match := _RESERVED.search(line):
+            size += int(match[1] or match[2])
     return size
 
 

@@ -40,6 +40,7 @@ from pkxyz_ctrl.export.targets import TARGETS
 from pkxyz_ctrl.export.words import FNV_OFFSET, FNV_PRIME, canonical
 from pkxyz_ctrl.loop import cycle as cycling
 from pkxyz_ctrl.loop.reference import reference_rows
+from pkxyz_ctrl.loop.row import ROW
 from pkxyz_ctrl.safety.modes import Mode
 from pkxyz_ctrl.safety.trips import Trip
 
@@ -63,8 +64,8 @@ class Law(NamedTuple):
     memory: Records
 
 
-def main() -> int:
-    """Everything; prints what was found."""
+def main(ticks: int) -> int:
+    """Everything, with at least so many ticks; prints what was found."""
     begin_s = time.monotonic()
     SCRATCH.mkdir(exist_ok=True)
     failures: list[str] = []
@@ -72,7 +73,7 @@ def main() -> int:
         work = Path(folder)
         host, board = exported("host", work), exported("cortex-m7", work)
         failures += own_test(host)
-        laws = played()
+        laws = played(ticks)
         failures += covered(laws)
         library = shared(host / "pkxyz.o", host)
         failures += compared_here(laws, library)
@@ -104,21 +105,22 @@ def own_test(host: Path) -> list[str]:
     return [] if done.returncode == 0 else ["the self-test of the exported folder"]
 
 
-def played() -> list[Law]:
+def played(ticks: int) -> list[Law]:
     """Every shipped law that goes, through all its segments in Python."""
     names = sorted(path.stem for path in (CONFIG_DIR / "controllers").glob("*.toml"))
     setups = [setup_of(name) for name in names]
     going = [s for s in setups if s.law["tick"]["kind"][0] != PREDICTIVE]
-    going += [dataclasses.replace(s, bus=s.bus.model_copy(update={"delay_periods": 2})) for s in going[:1]]
-    each = -(-TICKS_LEAST // TICKS // len(going))
+    lqg = next(s for s in going if s.controller.name == "lqg")
+    going.append(dataclasses.replace(lqg, bus=lqg.bus.model_copy(update={"delay_periods": 2})))
+    each = -(-ticks // TICKS // len(going))
     found = []
     begin_s = time.monotonic()
     for seed, setup in enumerate(going):
         memory = cycling.new_memory(Mode.IDLE)
         run = list(segments(setup.law, setup.trajectory, setup.bus.period_us, each, seed, memory))
-        found.append(Law(f"{setup.controller.name}, {setup.bus.name}", run, memory))
-    ticks = sum(len(segment.rows) for law in found for segment in law.segments)
-    print(f"Python: {ticks} ticks of {len(found)} laws, {time.monotonic() - begin_s:.0f} s")
+        found.append(Law(f"{setup.controller.name}, {setup.bus.name}, delay {setup.bus.delay_periods}", run, memory))
+    done = sum(len(segment.rows) for law in found for segment in law.segments)
+    print(f"Python: {done} ticks of {len(found)} laws, {time.monotonic() - begin_s:.0f} s")
     return found
 
 
@@ -138,7 +140,8 @@ def covered(laws: list[Law]) -> list[str]:
     missing = [f"mode {mode.name}" for mode in Mode if not any((r["mode"] == mode).any() for r in rows)]
     tripped = np.bitwise_or.reduce([np.bitwise_or.reduce(r["trips"] & ~r["outside_trips"]) for r in rows])
     missing += [f"trip {trip.name}" for trip in Trip if not trip & (int(tripped) | FROM_OUTSIDE)]
-    if not any(np.isnan(r["demand_n"]).any() for r in rows):
+    floats = [name for name in ROW.names or () if ROW[name].base.kind == "f"]
+    if not any(np.isnan(r[name]).any() for r in rows for name in floats):
         missing.append("NaN")
     if not any((r["overrun"] > 0).any() for r in rows):
         missing.append("overruns")
@@ -200,13 +203,13 @@ def changed_constant(ir: str) -> str:
 
 
 def changed_order(ir: str) -> str:
-    """a + (b + c) in place of (a + b) + c, in the matrix by vector of ``feedback.add_motion``."""
-    begin = re.search(r"^define [^\n]*8feedback10add_motion", ir, re.MULTILINE)
+    """a + (b + c) in place of (a + b) + c, in ``kinematics.stroke``."""
+    begin = re.search(r"^define [^\n]*10kinematics6stroke", ir, re.MULTILINE)
     assert begin is not None
     end = ir.index("\n}\n", begin.start())
     body = ir[begin.start() : end]
     pattern = r"(%\S+) = fadd double (%\S+), (%\S+)\n((?:.*\n)*?)(.*)(%\S+) = fadd double \1, (%\S+)\n"
-    changed, count = re.subn(pattern, r"\4  \1 = fadd double \3, \7\n\5\6 = fadd double \2, \1\n", body, count=1)
+    changed, count = re.subn(pattern, r"\4\1 = fadd double \3, \7\n\5\6 = fadd double \2, \1\n", body, count=1)
     assert count == 1
     return ir[: begin.start()] + changed + ir[end:]
 
@@ -345,7 +348,7 @@ def built(board: Path, tools: Tools) -> list[str]:
         if done.returncode != 0:
             return [f"linking {out}: {done.stderr[-400:]}"]
     done = tools.run("qemu-system-arm", *QEMU, "-kernel", "selftest.elf", cwd=board)
-    print(f"Cortex-M7: {done.stdout.strip()}")
+    print(f"Cortex-M7: {(done.stdout + done.stderr).strip()}")
     failures += [] if done.returncode == 0 else ["the self-test on the board"]
     listing = tools.run("arm-none-eabi-objdump", "-d", "--no-show-raw-insn", "board.elf", cwd=board).stdout
     bound, way = stack_bound(listing, "pkxyz_cycle")
@@ -356,4 +359,4 @@ def built(board: Path, tools: Tools) -> list[str]:
 
 if __name__ == "__main__":
     choose_kernel_cache()
-    sys.exit(main())
+    sys.exit(main(int(sys.argv[1]) if len(sys.argv) > 1 else TICKS_LEAST))

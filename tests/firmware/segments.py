@@ -200,6 +200,8 @@ def steps(trouble: Trouble, random: np.random.Generator) -> None:
 def no_numbers(trouble: Trouble, random: np.random.Generator) -> None:
     rows = trouble.reference["motion"][_stretch(random, 100)]
     rows[:, random.integers(0, 9)] = random.choice([np.nan, np.inf, -np.inf, 1e308, 1e-310])
+    if random.random() < 0.5:
+        trouble.reference["added_m"][_stretch(random, 100)] = random.choice([np.nan, np.inf, -np.inf, 1e-310])
 
 
 def excited(trouble: Trouble, random: np.random.Generator) -> None:
