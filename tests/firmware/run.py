@@ -359,4 +359,5 @@ def built(board: Path, tools: Tools) -> list[str]:
 
 if __name__ == "__main__":
     choose_kernel_cache()
+    sys.stdout.reconfigure(line_buffering=True)  # type: ignore[union-attr]
     sys.exit(main(int(sys.argv[1]) if len(sys.argv) > 1 else TICKS_LEAST))

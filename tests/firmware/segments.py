@@ -152,6 +152,14 @@ def commands(trouble: Trouble, random: np.random.Generator) -> None:
     trouble.inputs["event"][at] = random.integers(-2, len(Event) + 2, len(at))
 
 
+def switches(trouble: Trouble, random: np.random.Generator) -> None:
+    """What is asked for beside events, whatever the record has for it."""
+    where = _stretch(random, TICKS)
+    known = {"event", "sense_status", "node_events", "overrun", "sense_count", "trips"}
+    for name in sorted(set(cycling.INPUT.names or ()) - known):
+        trouble.inputs[name][where] = random.integers(0, 2)
+
+
 def holds(trouble: Trouble, random: np.random.Generator) -> None:
     at = _at(random, 0.02)
     trouble.inputs["event"][at] = random.choice([Event.HOLD, Event.TRACK, Event.TRACK, Event.DISABLE], len(at))
@@ -225,6 +233,6 @@ def unbelieving(trouble: Trouble, random: np.random.Generator) -> None:
 
 
 KINDS: tuple[Callable[[Trouble, np.random.Generator], None], ...] = (
-    frames, bursts, node, overruns, outside, commands, holds, any_counts, rail, frozen, jump, jumps, drift, far, steps,
-    no_numbers, excited, narrow, unbelieving,
+    frames, bursts, node, overruns, outside, commands, switches, holds, any_counts, rail, frozen, jump, jumps, drift,
+    far, steps, no_numbers, excited, narrow, unbelieving,
 )  # fmt: skip
