@@ -15,7 +15,7 @@ class Target(NamedTuple):
     an operating system and its C library. ``has_double``: doubles in hardware. ``compiler``, ``flags``,
     ``link``: what the Makefile calls, with what; ``port``: the file that stands in for the board's own.
     ``tick_most_us``: what the longest tick takes, where that is long, by ``make test-firmware`` and one instruction
-    a cycle: 22 480 at 480 MHz on a Cortex-M7, 619 640 at 168 MHz on a Cortex-M4.
+    a cycle: 22 520 at 480 MHz on a Cortex-M7, 619 640 at 168 MHz on a Cortex-M4.
     """
 
     triple: str | None
