@@ -1,7 +1,9 @@
 # make sil    close the loop over the simulated bus: runs/raster-lockstep-1/ holds recording, summary and picture
+# make live   operate the simulated stage: a page and clients, until Ctrl-C
 # make test   run every test, the linter and the type checker
 # make test-socketcan  controller and plant in two processes over the kernel's CAN sockets, in a guest that has them
 # make test-firmware  a million ticks of the exported controller, here and on an emulated Cortex-M7: the bits of Python?
+# make test-page  a headless Chromium, fetched if there is none, drives the page of pkxyz serve
 # make bench  measure what the docs promise and print it
 # make mutate change one thing at a time in gate, modes, monitors, comb law and codec: does a test notice? SECONDS=1200
 # make prove  every state that shipped controller and node can reach under any law with faults: EXPLORED="two one"
@@ -13,10 +15,13 @@
 PYTHON ?= python3
 BIN := .venv/bin
 
-.PHONY: sil test test-socketcan test-firmware bench docs docs-site wheel clean mutate fuzz kills prove coverage
+.PHONY: sil live test test-socketcan test-firmware test-page bench docs docs-site wheel clean mutate fuzz kills prove coverage
 
 sil: .venv/.ready
 	$(BIN)/pkxyz sil
+
+live: .venv/.ready
+	$(BIN)/pkxyz serve
 
 test: .venv/.ready
 	$(BIN)/ruff check .
@@ -30,6 +35,9 @@ test-socketcan: .venv/.ready
 TICKS ?= 1000000
 test-firmware: .venv/.ready
 	$(BIN)/python tests/firmware/run.py $(TICKS)
+
+test-page: .venv/.ready
+	$(BIN)/python tests/page/run.py
 
 bench: .venv/.ready
 	$(BIN)/pkxyz bench

@@ -30,11 +30,12 @@ def serve(
 
     What it prints is the address of the page; what stands behind # in it lets people in, so keep it to yourself.
     """
-    from hil.server.serving import Served, serve
+    from hil.server.serving import Served, bus_of_its_own, serve
     from pkxyz_ctrl.config.bus import BusConfig
     from pkxyz_ctrl.config.files import load
 
-    config = load("buses", bus or _SIMULATED_BUS, BusConfig)
+    bus = bus or bus_of_its_own(name, _SIMULATED_BUS)
+    config = load("buses", bus, BusConfig)
     is_simulated = config.can is not None and config.can.interface == "pkxyz-unix"
     say_if_compiling(quiet=as_json)
     if host not in ("127.0.0.1", "localhost", "::1"):
@@ -43,7 +44,7 @@ def serve(
     def tell(url: str) -> None:
         print(json.dumps({"url": url}) if as_json else f"the stage is at {url}", flush=True)
 
-    served = Served(name, stage, controller, plant, bus or _SIMULATED_BUS, on_silence, host, port, is_simulated)
+    served = Served(name, stage, controller, plant, bus, on_silence, host, port, is_simulated)
     raise typer.Exit(serve(served, tell))
 
 

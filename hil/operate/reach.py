@@ -83,8 +83,21 @@ class Reach:
         """How far along an axis (0, 1, 2) one can go from a position that is held, in m; 0 where it isn't held."""
         way = np.zeros(3)
         way[axis] = math.copysign(self._span_m, direction)
+        return self.share(position_m, way) * self._span_m
+
+    def share(self, position_m: Array, way_m: Array) -> float:
+        """What share of a way (3,) one can go from a position that is held; 0 where it isn't held."""
         geometry, elastic = self._stage.geometry, self._stage.elasticity
-        return float(_share(geometry, elastic, self._limits, np.ascontiguousarray(position_m), way)) * self._span_m
+        return float(_share(geometry, elastic, self._limits, np.ascontiguousarray(position_m), way_m))
+
+    def outline(self, position_m: Array, first: int, second: int, points: int = 72) -> Array:
+        """What can be held in the plane of two axes through a position that is held: its border (points, 3)."""
+        border = np.tile(np.asarray(position_m, np.float64), (points, 1))
+        for n, angle in enumerate(np.linspace(0.0, 2.0 * math.pi, points, endpoint=False)):
+            way = np.zeros(3)
+            way[first], way[second] = self._span_m * math.cos(angle), self._span_m * math.sin(angle)
+            border[n] += self.share(position_m, way) * way
+        return border
 
     def range_along(self, position_m: Array, axis: int) -> tuple[float, float] | None:
         """Least and greatest coordinate of an axis that can be held, the others as they are; None if none is found."""

@@ -23,7 +23,7 @@ _SAID_MOST, _BLOCKS_MOST = 400, 4
 _FIELDS = frozenset(name for name in ROW.names or () if ROW[name].base.kind in "fi")
 _AXES = ("x", "y", "z")
 _LIMITS = ("velocity_m_per_s", "acceleration_m_per_s2", "jerk_m_per_s3")
-_FREE = frozenset({"stop", "release", "subscribe", "take_control", "give_control", "preview"})
+_FREE = frozenset({"stop", "release", "subscribe", "take_control", "give_control", "preview", "body"})
 """What needs no control: nothing of it moves anything, or it stops what moves."""
 
 
@@ -130,7 +130,9 @@ class Desk:
             raise AskedWrongError(
                 "take control first: " + ("nobody has it" if self.holder is None else "another client has it")
             )
-        if what == "stop":
+        if what == "release":
+            self._command(client, what, message, tag)
+        elif what == "stop":
             self.link.stop()
             self._feeding = None
             client.tell(_answer(tag, "stop", "done", "the loop was told to stop"))
@@ -145,6 +147,10 @@ class Desk:
         elif what == "preview":
             path = await self._planned(message)
             client.tell({"preview": {"tag": tag, **_shown(path)}})
+        elif what == "body":
+            newest = self.link.newest()
+            target = np.zeros(3) if newest is None else newest["session"]["target_m"].copy()
+            client.tell({"body": await self._plan(self._planner.body, target)})
         elif what == "path":
             await self._send_path(client, message, tag)
         else:

@@ -11,6 +11,7 @@ from numpy.typing import NDArray
 from pydantic import Field, TypeAdapter
 
 from hil.operate.commands import PATH_ROWS
+from hil.operate.reach import Reach
 from hil.runs.scenario import load_scenario
 from hil.server.link import Link
 from pkxyz_ctrl.config.bus import BusConfig
@@ -28,6 +29,7 @@ _AHEAD_ROWS = 5000
 _BLOCKS_AT_ONCE = 16
 _SHOWN_POINTS = 3000
 _LEADING = ("hold", "move")
+_MIDDLE_M = (0.0, 0.0, 18e-6)
 
 
 class _Segments(FrozenModel):
@@ -73,6 +75,15 @@ class Planner:
         self.period_us = load("buses", bus, BusConfig).period_us
         self.stage = Stage(config)
         self._drive = DriveLimits(limits.voltage_max_v, limits.slew_max_v_per_s, self.period_us)
+        self._reach = Reach(self.stage, self._drive)
+
+    def body(self, position_m: Array) -> dict[str, list[list[float]]]:
+        """What the combs hold, as outlines in the three planes through a position, or through the middle above rest."""
+        inside = position_m if self._reach.holds(position_m) and position_m[2] > 0 else np.array(_MIDDLE_M)
+        return {
+            f"{'xyz'[a]}{'xyz'[b]}": self._reach.outline(inside, a, b)[:, [a, b]].tolist()
+            for a, b in ((0, 1), (0, 2), (1, 2))
+        }
 
     def of_scenario(self, name: str) -> StagePath:
         """The reference of a shipped scenario: names only, as a client can't be let into our files."""

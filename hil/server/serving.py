@@ -11,6 +11,7 @@ import time
 from collections.abc import Callable
 from dataclasses import dataclass
 
+import tomlkit
 import uvicorn
 
 from hil.server.app import app_of
@@ -19,7 +20,7 @@ from hil.server.link import Link
 from hil.server.paths import Planner
 from pkxyz_ctrl.client import place
 from pkxyz_ctrl.client.protocol import TEXT_MAX_BYTES
-from pkxyz_ctrl.config.files import ConfigError
+from pkxyz_ctrl.config.files import ConfigError, find
 
 _ENDS_S = 3.0
 _LOOPBACK = ("127.0.0.1", "localhost", "::1")
@@ -132,6 +133,8 @@ def _run(server: uvicorn.Server, bound: socket.socket, children: _Children, is_n
 
 def _start(children: _Children, served: Served) -> None:
     common = ["--bus", served.bus, "--stage", served.stage]
+    if (left := place.read(served.name, "plant")) is not None:  # of a server that was killed before it had a loop
+        os.kill(left["pid"], signal.SIGTERM)
     if served.is_simulated:
         pid = children.start("plant", "plant", *common, "--plant", served.plant)
         place.write(served.name, "plant", {"pid": pid})
@@ -139,6 +142,16 @@ def _start(children: _Children, served: Served) -> None:
         "loop", "operate", *common, "--controller", served.controller, "--name", served.name, "--on-silence",
         served.on_silence,
     )  # fmt: skip
+
+
+def bus_of_its_own(name: str, shipped: str) -> str:
+    """A shipped bus among processes, with a folder that no other stage uses: the file of it."""
+    folder = place.folder() / f"{name}.wire"
+    bus = tomlkit.parse(find("buses", shipped).read_text(encoding="utf-8"))
+    bus["can"]["channel"] = str(folder)  # type: ignore[index]
+    file = place.folder() / f"{name}.bus.toml"
+    file.write_text(tomlkit.dumps(bus), encoding="utf-8")
+    return str(file)
 
 
 def _end_loop(name: str) -> None:

@@ -1,0 +1,202 @@
+// The page: hands what the server says to its parts, and what is clicked to the server.
+
+import { History } from "./history.js";
+import { Link } from "./link.js";
+import { Plane } from "./plane.js";
+import { Scope } from "./scope.js";
+
+const FIELDS = ["reference_m", "estimate_m", "voltage_v", "disturbance_n"];
+const FREE = new Set(["stop", "release"]);
+const AXES = ["x", "y", "z"];
+const JOG_MS = 60;  // a jog is said again: at least 10 times a second
+const at = (id) => document.getElementById(id);
+const history = new History(FIELDS, 1 << 15);
+const scope = new Scope(at("plot"), history);
+const plane = new Plane(at("plane"), history);
+let mine = false, held = false, status = null, hello = {}, previewTag = null;
+
+// -- what the server says
+
+const link = new Link({
+  open() { link.say({ do: "subscribe", fields: FIELDS, precision: "f4" }); },
+  hello(value) {
+    hello = value;
+    if (value.period_us) scope.periodS = value.period_us * 1e-6;
+    document.title = value.stage ? `${value.stage}: stage` : "Stage";
+    if (value.period_us) bodyOf();
+  },
+  block(block) { history.take(block); },
+  status: show,
+  control(value) { mine = value.yours; held = value.held; showControl(); },
+  answer,
+  event(value) { if (value.kind === "fault" && !value.old) log("fault", value.words.split("\n")[0], "aborted"); },
+  preview(value) {
+    plane.ghost = value.points_m;
+    at("scan-words").textContent = `${value.duration_s.toFixed(2)} s; from (${um(value.low_m)}) to (${um(value.high_m)}) um; the combs can follow`;
+  },
+  body(value) { plane.body = value; },
+  gone() { mine = held = false; history.clear(); endJog(); showControl(); at("words").textContent = "no connection to the server"; document.querySelector(".state").dataset.activity = "gone"; },
+});
+
+function bodyOf() { link.say({ do: "body" }); }
+
+function show(value) {
+  status = value;
+  plane.status = value;
+  document.querySelector(".state").dataset.activity = value.alive === false ? "gone" : value.activity;
+  at("words").textContent = value.alive === false && value.t_s ? "the loop has stopped ticking" : value.words;
+  at("mode").textContent = value.mode ? `${value.mode}: ${value.mode_words}` : "";
+  if (value.position_m) for (const [n, axis] of AXES.entries()) {
+    at(`set-${axis}`).textContent = (value.setpoint_m[n] * 1e6).toFixed(4);
+    at(`now-${axis}`).textContent = (value.position_m[n] * 1e6).toFixed(4);
+    at(`err-${axis}`).textContent = value.driven ? (value.error_m[n] * 1e9).toFixed(1) : "-";
+  }
+  const facts = value.t_s === undefined ? [] : [
+    ["in position", value.in_position ? "yes" : "no"], ["homed", value.homed ? "yes" : "no"],
+    ["bus load", `${(100 * value.bus_load).toFixed(0)} %`], ["missed ticks", value.missed_ticks], ["running", clock(value.t_s)], ["clients", value.clients],
+  ];
+  at("facts").replaceChildren(...facts.map(([name, v]) => { const d = document.createElement("div"); const b = document.createElement("b"); b.textContent = v; d.append(b, name); return d; }));
+  combs(value);
+  at("fault").hidden = !value.last_fault;
+  at("fault-words").textContent = value.last_fault || "";
+  at("progress").hidden = !["scanning", "paused"].includes(value.activity);
+  at("progress").value = value.progress || 0;
+}
+
+function combs(value) {
+  if (!value.voltage_v) return;
+  const most = hello.voltage_max_v || 200;
+  if (!at("comb-0")) at("combs").innerHTML = [0, 1, 2].map((n) => `<div class="comb"><span>${n + 1}</span><div class="bar"><i id="comb-${n}"></i></div><span id="volt-${n}"></span></div>`).join("") + '<p class="hint" id="headroom"></p>';
+  value.voltage_v.forEach((v, n) => {
+    const bar = at(`comb-${n}`);
+    bar.style.transform = `scaleX(${Math.min(1, v / most)})`; bar.className = v > 0.9 * most ? "high" : "";
+    at(`volt-${n}`).textContent = `${v.toFixed(1)} V`;
+  });
+  at("headroom").textContent = `headroom ${value.headroom_v.toFixed(1)} V of ${most} V${value.saturated ? "; at a limit" : ""}`;
+}
+
+function answer({ tag, verb, state, words }) {
+  if (tag === previewTag && state === "refused") at("scan-words").textContent = words;
+  if (["done", "refused", "aborted"].includes(state) && verb !== "take_control" && verb !== "give_control") log(verb || "", words, state);
+}
+
+function log(verb, words, state) {
+  const line = document.createElement("li");
+  line.className = state;
+  line.textContent = `${verb.replace("_", "-")} ${state}${words ? `: ${words}` : ""}`;
+  at("log").prepend(line);
+  while (at("log").children.length > 60) at("log").lastChild.remove();
+}
+
+function showControl() {
+  at("control").textContent = mine ? "Give control" : held ? "Another has control" : "Take control";
+  at("control").disabled = held && !mine;
+  for (const button of document.querySelectorAll("[data-do], #move button, #scan button[name=''], #scan button:not([name]), td button"))
+    button.disabled = !mine && !FREE.has(button.dataset.do);
+}
+
+// -- what is asked
+
+function ask(message, command, python) {
+  at("as-command").textContent = `$ ${command}`;
+  at("as-python").textContent = python;
+  return link.say(message);
+}
+
+function verb(name) { ask({ do: name }, `pkxyz ask ${name.replace("_", "-")}`, `stage.${name}()`); }
+
+function number(text) { return text.trim() === "" ? null : Number(text.replace(",", ".")) * 1e-6; }
+
+function moveTo(target) {
+  const given = Object.entries(target).filter(([, v]) => v !== null && Number.isFinite(v));
+  if (!given.length) return;
+  const words = given.map(([key, v]) => `${key[0]}=${+v.toPrecision(9)}`);
+  ask({ do: "move", ...Object.fromEntries(given) }, `pkxyz ask move ${words.join(" ")}`, `stage.move_to(${words.join(", ")})`);
+}
+
+function moveBy(axis, way) {
+  ask({ do: "move", relative: true, [`${axis}_m`]: way }, `pkxyz ask move --by ${axis}=${way}`, `stage.move_by(${axis}=${way})`);
+}
+
+let jogTimer = null;
+function jog(axis, direction) {
+  const step = Number(at("step").value);
+  if (step) return moveBy(axis, direction * step);
+  const speed = Number(at("speed").value);
+  endJog();
+  ask({ do: "jog", axis, direction, velocity_m_per_s: speed }, "pkxyz ask jog (held keys only)", `stage.jog("${axis}", ${direction}, 1.0, velocity_m_per_s=${speed})`);
+  jogTimer = setInterval(() => link.say({ do: "jog_again" }), JOG_MS);
+}
+function endJog() { if (jogTimer !== null) { clearInterval(jogTimer); jogTimer = null; link?.say({ do: "jog_end" }); } }
+
+function segments() {
+  const f = new FormData(at("scan")), value = (name) => Number(String(f.get(name)).replace(",", "."));
+  const limits = { velocity_max_m_per_s: 0.5e-3, acceleration_max_m_per_s2: 0.5, jerk_max_m_per_s3: 300 };
+  return [
+    { kind: "move", to_m: status?.target_m ?? hello.middle_m, ...limits },
+    { kind: "raster", line_length_m: value("length") * 1e-6, lines: value("lines"), line_pitch_m: value("pitch") * 1e-6, layers: 1, layer_pitch_m: 1e-6, line_rate_hz: value("rate"), ...limits },
+  ];
+}
+
+// -- the page's own parts
+
+const axes = at("axes");
+for (const axis of AXES) {
+  const row = document.createElement("tr");
+  row.innerHTML = `<td class="name" style="color: var(--${axis})">${axis}</td><td class="value"><span id="set-${axis}">-</span> <small>um</small></td>
+    <td class="value"><span id="now-${axis}">-</span> <small>um</small></td><td class="value"><span id="err-${axis}">-</span> <small>nm</small></td>
+    <td><button data-jog="${axis}" data-way="-1"></button></td><td><button data-jog="${axis}" data-way="1"></button></td>`;
+  axes.append(row);
+}
+function jogLabels() {
+  const step = at("step").selectedOptions[0].textContent, speed = at("speed").selectedOptions[0].textContent;
+  for (const button of document.querySelectorAll("[data-jog]"))
+    button.textContent = `${button.dataset.way > 0 ? "+" : "-"}${Number(at("step").value) ? step : speed}`;
+}
+for (const button of document.querySelectorAll("[data-jog]")) {
+  button.addEventListener("pointerdown", (event) => { button.setPointerCapture(event.pointerId); jog(button.dataset.jog, Number(button.dataset.way)); });
+  for (const end of ["pointerup", "pointercancel", "lostpointercapture"]) button.addEventListener(end, endJog);
+}
+const KEYS = { ArrowLeft: ["x", -1], ArrowRight: ["x", 1], ArrowDown: ["y", -1], ArrowUp: ["y", 1], PageDown: ["z", -1], PageUp: ["z", 1] };
+addEventListener("keydown", (event) => {
+  if (event.target.matches("input, select")) return;
+  if (event.code === "Space") { event.preventDefault(); stop(); }
+  const key = KEYS[event.key];
+  if (key && mine) { event.preventDefault(); if (!event.repeat) jog(...key); }
+});
+addEventListener("keyup", endJog);
+addEventListener("blur", endJog);
+document.addEventListener("visibilitychange", () => { if (document.hidden) endJog(); });
+
+function stop() { ask({ do: "stop" }, "pkxyz ask stop", "stage.stop()"); }
+at("stop").onclick = stop;
+at("control").onclick = () => link.say({ do: mine ? "give_control" : "take_control" });
+for (const button of document.querySelectorAll("[data-do]")) button.onclick = () => verb(button.dataset.do);
+at("move").onsubmit = (event) => { event.preventDefault(); const f = new FormData(at("move")); moveTo(Object.fromEntries(AXES.map((a) => [`${a}_m`, number(f.get(`${a}_m`))]))); };
+at("middle").onclick = () => moveTo(Object.fromEntries(AXES.map((a, n) => [`${a}_m`, hello.middle_m?.[n] ?? null])));
+at("scan").onsubmit = (event) => { event.preventDefault(); preview(); ask({ do: "path", segments: segments() }, "pkxyz ask path segments.json", `stage.follow(segments=${JSON.stringify(segments())})`); };
+at("scan").elements.preview.onclick = preview;
+function preview() { previewTag = link.say({ do: "preview", segments: segments() }); }
+
+at("step").onchange = at("speed").onchange = jogLabels;
+at("view").onchange = () => { plane.view = at("view").value; };
+at("shown").onchange = () => { scope.what = at("shown").value; scope.rebuild(); };
+at("span").onchange = () => { scope.spanS = Number(at("span").value); };
+function setTrigger() { const axis = AXES.indexOf(at("trigger").value); scope.trigger = axis < 0 ? null : { axis, level: number(at("level").value) ?? 0 }; }
+at("trigger").onchange = at("level").onchange = setTrigger;
+function toggles(id, set) { at(id).onclick = () => { const on = at(id).getAttribute("aria-pressed") !== "true"; at(id).setAttribute("aria-pressed", on); set(on); }; }
+toggles("hold", (on) => { scope.held = on; });
+toggles("spectrum", (on) => { scope.inSpectrum = on; scope.rebuild(); });
+at("csv").onclick = () => save(URL.createObjectURL(new Blob([scope.csv()], { type: "text/csv" })), "scope.csv");
+at("png").onclick = () => save(scope.png(), "scope.png");
+function save(url, name) { const a = document.createElement("a"); a.href = url; a.download = name; a.click(); }
+
+at("theme").onclick = () => paint(document.documentElement.dataset.theme === "dark" ? "light" : "dark");
+function paint(theme) { document.documentElement.dataset.theme = theme; localStorage.setItem("theme", theme); scope.rebuild(); }
+const um = (m) => m.map((v) => (v * 1e6).toFixed(2)).join(", ");
+const clock = (s) => (s < 60 ? `${s.toFixed(1)} s` : `${Math.floor(s / 60)} min ${Math.floor(s % 60)} s`);
+
+jogLabels();
+showControl();
+paint(localStorage.getItem("theme") ?? (matchMedia("(prefers-color-scheme: dark)").matches ? "dark" : "light"));
+setInterval(() => { scope.draw(); plane.draw(); }, 1000 / 30);

@@ -1,0 +1,94 @@
+// The scope: what is shown, from when, and whether it waits for a trigger. The trigger looks at set-points, whatever is shown.
+
+import { spectrum } from "./spectrum.js";
+
+const SHOWN = {
+  error: { unit: "nm", scale: 1e9, lines: [["error", (h, a, n) => h.value("estimate_m", a, n) - h.value("reference_m", a, n)]] },
+  position: { unit: "um", scale: 1e6, lines: [["", (h, a, n) => h.value("estimate_m", a, n)], ["set-point", (h, a, n) => h.value("reference_m", a, n)]] },
+  voltage: { unit: "V", scale: 1, names: ["1", "2", "3"], lines: [["comb", (h, a, n) => h.value("voltage_v", a, n)]] },
+  disturbance: { unit: "uN", scale: 1e6, lines: [["disturbance", (h, a, n) => h.value("disturbance_n", a, n)]] },
+};
+const POINTS = 2000;
+
+export class Scope {
+  constructor(place, history) {
+    this.place = place; this.history = history;
+    this.what = "error"; this.spanS = 2; this.periodS = 5e-4;
+    this.held = false; this.inSpectrum = false; this.trigger = null;
+    new ResizeObserver(() => this.plot?.setSize(this.size())).observe(place);
+  }
+
+  size() { return { width: Math.max(200, this.place.clientWidth), height: 280 }; }
+
+  /** Everything anew: another quantity, another axis, other colours. */
+  rebuild() {
+    const shown = SHOWN[this.what], css = getComputedStyle(document.documentElement);
+    const colour = (name) => css.getPropertyValue(name).trim();
+    const series = [{ label: this.inSpectrum ? "Hz" : "s" }];
+    for (const [label, , ] of shown.lines) {
+      ["x", "y", "z"].forEach((axis, a) => series.push({
+        label: `${label} ${shown.names ? shown.names[a] : axis}`.trim(), stroke: colour(`--${axis}`), width: label === "set-point" ? 1 : 1.4,
+        dash: label === "set-point" ? [4, 3] : undefined, points: { show: false },
+        value: (_, v) => (v == null ? "" : v.toPrecision(4)),
+      }));
+    }
+    const axes = ["", this.inSpectrum ? `${shown.unit}/rtHz` : shown.unit].map((label) => ({
+      label, stroke: colour("--soft"), grid: { stroke: colour("--line"), width: 1 }, ticks: { stroke: colour("--line") }, labelSize: 16, size: label ? 58 : 32,
+    }));
+    const scales = this.inSpectrum ? { x: { time: false, distr: 3 }, y: { distr: 3 } } : { x: { time: false } };
+    this.plot?.destroy();
+    this.plot = new window.uPlot({ ...this.size(), series, axes, scales, cursor: { drag: { x: true, y: true } } }, this.data(), this.place);
+  }
+
+  data() {
+    const { history } = this, shown = SHOWN[this.what];
+    const count = Math.min(Math.round(this.spanS / this.periodS), history.rows - 1);
+    let end = history.end - 1;
+    if (this.trigger) {
+      const at = history.trigger(this.trigger.axis, this.trigger.level, end - Math.floor(count / 2));
+      if (at >= 0) end = at + Math.floor(count / 2);
+      this.zero = at >= 0 ? at : end;
+    } else this.zero = end;
+    const first = Math.max(history.begin, end - count + 1);
+    if (end - first < 16) return [[0], ...shown.lines.flatMap(() => [[null], [null], [null]])];
+    if (this.inSpectrum) return this.spectra(shown, first, end);
+    const step = Math.max(1, Math.ceil((end - first) / POINTS));
+    const rows = [];
+    for (let n = first + ((step - (first % step)) % step); n <= end; n += step) rows.push(n);
+    const time = rows.map((n) => (n - this.zero) * this.periodS);
+    return [time, ...shown.lines.flatMap(([, value]) => [0, 1, 2].map((axis) => rows.map((n) => this.extreme(value, axis, n, step, end) * shown.scale)))];
+  }
+
+  /** Of the rows that share a point, the one that is farthest from the first: a spike is not lost. */
+  extreme(value, axis, n, step, end) {
+    let best = value(this.history, axis, n);
+    if (step === 1) return best;
+    const base = best;
+    for (let k = n + 1; k < Math.min(n + step, end); k++) {
+      const v = value(this.history, axis, k);
+      if (Math.abs(v - base) > Math.abs(best - base)) best = v;
+    }
+    return best;
+  }
+
+  spectra(shown, first, end) {
+    let hz;
+    const lines = shown.lines.flatMap(([, value]) => [0, 1, 2].map((axis) => {
+      const values = Float64Array.from({ length: end - first }, (_, k) => value(this.history, axis, first + k) * shown.scale);
+      const [f, density] = spectrum(values, this.periodS);
+      hz = f;
+      return density;
+    }));
+    return [hz, ...lines];
+  }
+
+  draw() { if (!this.held && this.plot) this.plot.setData(this.data(), true); }
+
+  csv() {
+    const names = this.plot.series.map((s, n) => (n === 0 ? `time_${s.label}` : `${s.label.replace(/\s+/g, "_")}_${SHOWN[this.what].unit}`));
+    const rows = this.plot.data[0].map((_, n) => this.plot.data.map((column) => column[n]).join(","));
+    return `${names.join(",")}\n${rows.join("\n")}\n`;
+  }
+
+  png() { return this.plot.ctx.canvas.toDataURL("image/png"); }
+}

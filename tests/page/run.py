@@ -1,0 +1,126 @@
+"""The page of ``pkxyz serve``, driven by a headless Chromium as a person would: ``make test-page``.
+
+It fetches Debian's package (100 MB, once) where the system has no Chromium. Pictures of it go to a folder.
+"""
+
+import faulthandler
+import json
+import os
+import signal
+import subprocess
+import sys
+import tempfile
+import time
+from pathlib import Path
+
+from chromium import Browser
+
+import pkxyz_ctrl
+from pkxyz_ctrl.client.reply import RefusedError
+
+_STUCK_S = 240.0
+
+
+def activity(browser: Browser, *wanted: str, timeout_s: float = 60.0) -> None:
+    names = json.dumps(wanted)
+    browser.until(f"{names}.includes(document.querySelector('.state').dataset.activity)", timeout_s)
+
+
+def logged(browser: Browser, words: str) -> None:
+    browser.until(f"document.querySelector('#log').innerText.includes({json.dumps(words)})")
+
+
+def fill(browser: Browser, selector: str, value: str) -> None:
+    browser.run(f"document.querySelector({json.dumps(selector)}).value = {json.dumps(value)}")
+
+
+def operate(browser: Browser, url: str, pictures: Path) -> None:
+    """Everything that a person does in a morning."""
+    browser.open(url)
+    activity(browser, "off", timeout_s=120)
+    assert "#" not in browser.run("location.href"), "the token stays in no history"
+    browser.picture(pictures / "off.png")
+    assert browser.run("document.querySelector('[data-do=home]').disabled"), "read-only until control is taken"
+    browser.click("#control")
+    browser.until("document.querySelector('#control').innerText === 'Give control'")
+    try:
+        pkxyz_ctrl.connect(name="page").__enter__()
+        raise AssertionError("a second one got control")
+    except RefusedError as refused:
+        assert "another client has control" in str(refused)  # noqa: PT017
+    browser.click("[data-do=home]")
+    logged(browser, "home done")
+    browser.click("[data-do=enable]")
+    logged(browser, "enable done")
+    browser.click("#middle")
+    logged(browser, "move done")
+    activity(browser, "holding")
+    assert "stage.move_to(x=0, y=0, z=0.0000192495269)" in browser.text("#as-python")
+    fill(browser, "#move [name=x_m]", "50")
+    browser.click("#move button:not([type])")
+    logged(browser, "x = 50 um is asked for, limits")
+    fill(browser, "#scan [name=lines]", "200")
+    fill(browser, "#scan [name=pitch]", "0.02")
+    browser.click("#scan button:not([name])")
+    activity(browser, "scanning")
+    fill(browser, "#shown", "position")
+    browser.run("document.querySelector('#shown').onchange()")
+    time.sleep(0.5)
+    browser.picture(pictures / "scan.png")
+    browser.click("[data-do=pause]")
+    activity(browser, "paused")
+    browser.click("[data-do=resume]")
+    activity(browser, "scanning")
+    browser.press(" ")  # Space: stop
+    browser.run("dispatchEvent(new KeyboardEvent('keydown', {code: 'Space'}))")
+    activity(browser, "holding")
+    logged(browser, "path aborted")
+    browser.click("#theme")
+    browser.click("#spectrum")
+    time.sleep(1.0)
+    browser.picture(pictures / "spectrum-dark.png")
+    browser.click("[data-do=release]")
+    activity(browser, "fault")
+    browser.until("!document.querySelector('#fault').hidden && document.body.innerText.includes('Stopped by hand')")
+    browser.picture(pictures / "fault.png")
+    browser.click("#fault [data-do=clear]")
+    activity(browser, "off")
+    for verb in ("home", "enable"):
+        browser.click(f"[data-do={verb}]")
+        activity(browser, "off" if verb == "home" else "holding")
+    browser.until("document.body.innerText.includes('enable done')")
+
+
+def main() -> None:
+    pictures = Path(sys.argv[1]) if len(sys.argv) > 1 else Path(tempfile.mkdtemp(prefix="pkxyz-page-"))
+    pictures.mkdir(parents=True, exist_ok=True)
+    begin_s = time.monotonic()
+    faulthandler.dump_traceback_later(_STUCK_S, exit=False)
+    serving = subprocess.Popen(
+        [sys.executable, "-m", "hil", "serve", "--name", "page", "--port", "0", "--json"],
+        stdout=subprocess.PIPE, text=True,
+    )  # fmt: skip
+    try:
+        assert serving.stdout is not None
+        url = json.loads(serving.stdout.readline())["url"]
+        with tempfile.TemporaryDirectory() as profile, Browser(Path(profile)) as browser:
+            operate(browser, url, pictures)
+            assert browser.hosts == {url.split("/")[2]}, browser.hosts
+            assert browser.errors == [], browser.errors
+            fill(browser, "#step", "0")
+            browser.run("document.querySelector('#step').onchange(); document.querySelector('#middle').click()")
+            logged(browser, "move done")
+            browser.run("dispatchEvent(new KeyboardEvent('keydown', {key: 'ArrowRight'}))")
+            activity(browser, "jogging")
+        with pkxyz_ctrl.connect(name="page") as stage:  # the tab is closed: control is free, and the jog has ended
+            time.sleep(0.4)
+            assert stage.status.activity == "holding", stage.status.words
+            stage.park()
+    finally:
+        serving.send_signal(signal.SIGINT)
+        serving.wait(20)
+    print(f"the page does what it should, in {time.monotonic() - begin_s:.0f} s; pictures are in {pictures}{os.sep}")
+
+
+if __name__ == "__main__":
+    main()
