@@ -142,10 +142,9 @@ class Browser:
 
     def click(self, selector: str, hold_s: float = 0.0) -> None:
         """Press the mouse on an element, and let it go."""
-        box = self.run(
-            f"(() => {{ const e = document.querySelector({json.dumps(selector)});"
-            " e.scrollIntoView({block: 'center'}); const r = e.getBoundingClientRect(); return [r.x + r.width / 2, r.y + r.height / 2]; })()"
-        )
+        found = f"const e = document.querySelector({json.dumps(selector)})"
+        middle = "const r = e.getBoundingClientRect(); return [r.x + r.width / 2, r.y + r.height / 2]"
+        box = self.run(f"(() => {{ {found}; e.scrollIntoView({{block: 'center'}}); {middle}; }})()")
         for kind in ("mousePressed", "mouseReleased"):
             x, y = box
             self.call("Input.dispatchMouseEvent", type=kind, x=x, y=y, button="left", clickCount=1)
