@@ -112,7 +112,6 @@ class LockstepRig:
         start(self.clock, self.port, self.controller)
         before = self.wire.statistics()
         reference, record = _exchange_in_blocks(self, blocks)
-        missed = 0
         try:
             clock: Clock = self.clock
             taking: Callable[[int], object] = record
@@ -121,7 +120,7 @@ class LockstepRig:
             if not self.controller.can.driver.protection:
                 clock = _Draining(clock, self._endpoint, self.controller)
             with _seldom_collected():
-                missed = run(clock, self.port, self.controller, reference, blocks.ticks, taking)
+                run(clock, self.port, self.controller, reference, blocks.ticks, taking)
         except ControllerKilledError:
             assert injection is not None
             injection.outlive(blocks.ticks)
@@ -129,7 +128,7 @@ class LockstepRig:
             record.finish()
             if self.log is not None:
                 self.log.close()
-        return missed + self.controller.missing_sense, self.wire.bus_load(before)
+        return self.controller.missed_ticks, self.wire.bus_load(before)
 
 
 def _injection_of(rig: LockstepRig) -> Injection:

@@ -50,6 +50,7 @@ class _Watched:
     elapsed_s: float = 0.0
     faults: tuple[str, ...] = ()
     lateness_us: list[int] = dataclasses.field(default_factory=list)
+    missed_ticks: int = 0
     refused_frames: int = 0
     dropped_frames: int | None = None
     blocked_frames: int = 0
@@ -97,10 +98,10 @@ def _run_into(
     recording = Recording.open(folder.recording)
     if begun.learning is not None:
         begun.learning.errors.look_at(recording)
-    rows, missed = _figures(recording, begun.metrics)
+    rows = _figures(recording, begun.metrics)
     late, period_s = watched.lateness_us, scenario.bus.period_s
     loop = LoopFigures(
-        missed_ticks=missed,
+        missed_ticks=watched.missed_ticks,
         faults=watched.faults,
         realtime_factor=recording.ticks * period_s / watched.elapsed_s if watched.elapsed_s else None,
         errors_are_of="estimate",
@@ -132,6 +133,7 @@ def _run(rig: WallRig, watched: _Watched, say: Callable[[str], object], ending: 
             watched.elapsed_s = time.monotonic() - begin_s
             watched.faults = tuple(rig.controller.faults)
             watched.lateness_us = rig.ticks.lateness_us
+            watched.missed_ticks = rig.controller.missed_ticks
             watched.refused_frames = rig.can_port.refused
             watched.dropped_frames = rig.dropped_frames
             watched.blocked_frames = rig.controller.gate.blocked_frames
@@ -149,15 +151,10 @@ def _wait_for_others(rig: WallRig, say: Callable[[str], object], ending: Ending,
         time.sleep(_LOOK_S)
 
 
-def _figures(recording: Recording, metrics: Metrics) -> tuple[RowFigures, int]:
-    """Figures of the recorded rows, and how many ticks were missed. Nobody here knows the truth, so errors are those
-    of the estimate.
-    """
-    missed = 0
-    fields = ("mode", "reference_tick", "saturated", "reference_m", "estimate_m", "overrun", "sense_status")
+def _figures(recording: Recording, metrics: Metrics) -> RowFigures:
+    """Figures of the recorded rows. Nobody here knows the truth, so errors are those of the estimate."""
+    fields = ("mode", "reference_tick", "saturated", "reference_m", "estimate_m")
     for rows in recording.rows(fields):
         rows["position_m"] = rows["estimate_m"]
         metrics.update(rows)
-        missed += int(rows["overrun"].sum()) + int((rows["sense_status"] & 1).sum())
-    figures = dataclasses.replace(metrics.figures(), estimate_error_nm=None)
-    return figures, missed
+    return dataclasses.replace(metrics.figures(), estimate_error_nm=None)

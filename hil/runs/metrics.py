@@ -30,7 +30,7 @@ METRICS: dict[str, str] = {
     "learning_factor_true": "the same of the true position",
     "ticks": "ticks recorded",
     "saturated_ticks": "ticks in which a comb force met a bound",
-    "missed_ticks": "ticks that were skipped because one before took too long",
+    "missed_ticks": "ticks that were skipped, late on the wire, or without the sample that the amplifier owed",
     "faults": "number of faults",
     "refused_frames": "frames that the interface did not take, at rate",
     "dropped_frames": "frames that a bus among processes lost, at rate",

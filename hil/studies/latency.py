@@ -148,7 +148,8 @@ def measure(period_us: int, seconds: float, cyclictest: str | None = None) -> La
         result = Latency(period_us, go_real_time(), setup.ticks, 0, clock.lateness_us, watch.cycle_us, None)
         settle_memory()
         try:
-            result.missed_ticks = run(watch, amplifier, controller, lambda tick: reference, setup.ticks, watch.stop)
+            run(watch, amplifier, controller, lambda tick: reference, setup.ticks, watch.stop)
+            result.missed_ticks = controller.missed_ticks
         except Ended as end:
             result.ended_by = end.signal_number
             result.ticks = sum(watch.cycle_us)

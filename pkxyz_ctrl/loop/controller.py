@@ -52,7 +52,8 @@ class Controller:
         self.driver = AmplifierDriver(bus.can.driver, gate.count_slew_max)
         self.gate = TransmitGate(gate)
         self.faults: list[str] = []
-        self.missing_sense = 0
+        self.missed_ticks = 0
+        """skipped, late on the wire, or without the sample that the node owed"""
         self.law = law
         self.memory = cycling.new_memory(Mode.BOOT)
         self._send = send
@@ -152,9 +153,10 @@ class Controller:
         """
         if self._clearing:
             self._event = int(Event.CLEAR) if self.mode == Mode.FAULT else self._event
+        self.missed_ticks += overrun
         c1, c2, c3, status = self._sense.take()
         if status & 1:
-            self.missing_sense += int(NODE_EXPECTED[self.mode])  # a node that we took out of operation owes none
+            self.missed_ticks += int(NODE_EXPECTED[self.mode])  # a node that we took out of operation owes none
         else:
             self._others.forget(self._begun_us)
         if self._blocked:

@@ -61,9 +61,8 @@ def start(clock: Clock, port: Port, controller: Controller) -> None:
 
 def run(
     clock: Clock, port: Port, controller: Controller, reference: Reference, ticks: int, record: Callable[[int], object]
-) -> int:
-    """Run ``ticks`` periods from the next instant of ``clock``; returns how many were
-    missed: skipped, or late on the wire.
+) -> None:
+    """Run ``ticks`` periods from the next instant of ``clock``. The controller counts those that are missed.
 
     Deadlines are absolute: a tick that begins late shifts no other, and ticks that are past are skipped whole. Other
     frames than the one that is waited for do not put the deadline off, however many there are.
@@ -72,16 +71,15 @@ def run(
     answer_us, heartbeat_us = controller.can.sense_deadline_us, controller.can.heartbeat_deadline_us
     begin, receive, compute, finish = controller.begin, controller.receive, controller.compute, controller.finish
     wait_until, spend, receive_frame, unsent = clock.wait_until, clock.spend, port.receive, port.unsent
-    missed, t_us = 0, clock.now_us + period_us
+    t_us = clock.now_us + period_us
     for tick in range(ticks):
         wait_until(t_us)
         overrun = 0
         if clock.now_us - t_us >= period_us:
             overrun = (clock.now_us - t_us) // period_us
             t_us += overrun * period_us
-            missed += overrun
         if unsent():
-            missed += 1
+            controller.missed_ticks += 1
         begin(t_us)
         deadline_us = t_us + answer_us
         while (frame := receive_frame(deadline_us)) is not None:
@@ -92,4 +90,3 @@ def run(
         finish(clock.now_us, t_us + heartbeat_us)
         record(tick)
         t_us += period_us
-    return missed

@@ -38,7 +38,7 @@ _NEVER_US = 1 << 61
 # What nothing that decides reads: words, statistics, copies for SDO.
 UNREAD = {
     ("Controller", "faults"),
-    ("Controller", "missing_sense"),
+    ("Controller", "missed_ticks"),
     ("Controller", "_reference"),
     ("Controller", "_drive_counts"),  # written by compute, read by finish; in between no state is taken
     ("TransmitGate", "blocked_frames"),
