@@ -32,6 +32,7 @@ METRICS: dict[str, str] = {
     "saturated_ticks": "ticks in which a comb force met a bound",
     "missed_ticks": "ticks that were skipped, late on the wire, or without the sample that the amplifier owed",
     "faults": "number of faults",
+    "warnings": "number of things that the device has changed in",
     "refused_frames": "frames that the interface did not take, at rate",
     "dropped_frames": "frames that a bus among processes lost, at rate",
     "blocked_frames": "frames that our own gate held back, at rate",
