@@ -18,7 +18,6 @@ from collections.abc import Iterator
 from pathlib import Path
 from typing import NamedTuple
 
-sys.path.append(str(Path(__file__).parents[1] / "rigs"))  # where pytest has not put it
 import numpy as np
 from debian import fetched
 from disassembly import fused_instructions, stack_bound
@@ -316,7 +315,8 @@ class Tools(NamedTuple):
     environment: dict[str, str]
 
     def run(self, name: str, *words: str, cwd: Path) -> subprocess.CompletedProcess[str]:
-        program = name if self.folder is None else str(self.folder / name)
+        fetched_one = None if self.folder is None else self.folder / name
+        program = str(fetched_one) if fetched_one is not None and fetched_one.is_file() else name
         return subprocess.run(
             [program, *words], cwd=cwd, env=self.environment, check=False, capture_output=True, text=True, timeout=600
         )
