@@ -85,6 +85,13 @@ def test_combs_that_are_sensed_two_per_cent_too_large_make_errors_of_that_size()
     assert found["known.error_nm"] < 2.0
 
 
+def test_a_handle_that_is_thicker_by_1_um_leaves_60_nm_that_nothing_inside_can_see():
+    thicker = process(
+        handle_m=SHIPPED.handle_m.model_copy(update=dict.fromkeys(("wafer", "bowl", "die"), 0.0) | {"mean": 1e-6})
+    )
+    assert 45.0 < loops(thicker).device(0)["known.error_nm"] < 75.0
+
+
 def test_a_part_is_its_devices_one_on_each_wafer():
     asked = loops(known=False)
     numbers = asked.numbers(1)
