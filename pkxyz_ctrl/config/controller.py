@@ -11,6 +11,8 @@ from pkxyz_ctrl.safety.thresholds import (
     FORCE_CHANGE_MAX_N,
     FORCE_CHANGE_SHARE,
     FORCE_TREND_S,
+    INNOVATION_MEMORY_S,
+    INNOVATION_SHARE_M_PER_N,
     RESIDUAL_MAX_M,
     UNEXPLAINED_FORCE_MAX_N,
 )
@@ -70,6 +72,10 @@ class MonitorConfig(FrozenModel):
     innovation_max_m: Positive
     residual_max_m: Positive = RESIDUAL_MAX_M
     """Most that a stroke may be from where it was expected; beyond it the measurement is not used."""
+    innovation_share_m_per_n: Annotated[float, Field(ge=0)] = INNOVATION_SHARE_M_PER_N
+    """More of both while the commanded forces change."""
+    innovation_memory_s: Positive = INNOVATION_MEMORY_S
+    """So long a change counts."""
     unexplained_force_max_n: Positive = UNEXPLAINED_FORCE_MAX_N
     """Most that a comb's force may be off; where the defaults of this and the next three come from is said there."""
     force_change_max_n: Positive = FORCE_CHANGE_MAX_N

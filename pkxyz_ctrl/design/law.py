@@ -193,8 +193,9 @@ def _fill_drive(law: Any, stage: Stage, controller: ControllerConfig, bus: BusCo
 
 
 def _fill_monitors(limits: Any, controller: ControllerConfig, bus: BusConfig) -> None:
-    for name, value in controller.monitors.model_dump(exclude={"force_trend_s"}).items():
+    for name, value in controller.monitors.model_dump(exclude={"force_trend_s", "innovation_memory_s"}).items():
         limits[name] = value
+    limits["force_forget_share"] = min(1.0, bus.period_s / controller.monitors.innovation_memory_s)
     limits["force_trend_share"] = min(1.0, bus.period_s / controller.monitors.force_trend_s)
     limits["sense_count_min"], limits["sense_count_max"] = -32768, 32767
     limits["voltage_step_max_v"] = (slew_counts(controller, bus) + 0.5) * bus.analog.drive_volt_per_count

@@ -273,7 +273,7 @@ def _suspects(law: np.void, memory: np.void) -> int:
     """Combs whose strokes are not to be believed, one bit each, and what the innovation would be; none in open loop."""
     if LOOP_CLOSED[memory["mode"]] == 0:
         return 0
-    combs: int = implausible_combs(law["limits"], memory["tick"]["residual_m"])
+    combs: int = implausible_combs(law["limits"], memory["monitors"], memory["tick"]["residual_m"])
     if combs != 0:
         origin, predicted = law["tick"]["estimator"]["operating_point_m"], memory["tick"]["estimate"]["predicted"]
         for i in range(3):

@@ -52,6 +52,8 @@ LIMITS: Final = np.dtype(
         ("stroke_max_m", "f8"),
         ("innovation_max_m", "f8", (3,)),
         ("residual_max_m", "f8"),
+        ("innovation_share_m_per_n", "f8"),  # so much more of both while the commanded forces change ...
+        ("force_forget_share", "f8"),  # ... of which a tick forgets this much
         ("unexplained_force_max_n", "f8"),
         ("force_change_max_n", "f8"),  # of the unexplained force about its trend ...
         ("force_change_share", "f8"),  # ... and this much of the change of the commanded force
@@ -97,6 +99,8 @@ MONITOR_MEMORY: Final = np.dtype(
         ("residual_level", "i8", (3,)),
         ("unexplained_trend_n", "f8", (3,)),
         ("commanded_trend_n", "f8", (3,)),
+        ("commanded_n", "f8", (3,)),  # forces of the last tick
+        ("moved_n", "f8"),  # by how much, all in all, they have changed of late
         ("stale", "i4"),
         ("range", "i4", (3,)),
         ("frozen", "i4", (3,)),
@@ -210,19 +214,38 @@ def _clear_loop(memory: np.void) -> None:
         memory["unexplained_force"][i] = 0
         memory["unexplained_trend_n"][i] = 0.0
         memory["commanded_trend_n"][i] = 0.0
+        memory["commanded_n"][i] = 0.0
+    memory["moved_n"] = 0.0
 
 
 @njit(cache=True, error_model="numpy")
-def implausible_combs(limits: np.void, residual_m: NDArray[np.float64]) -> int:
+def _note_motion(limits: np.void, memory: np.void, obs: np.void) -> None:
+    """Add this tick's change of the commanded forces, which begin to act now, to what is remembered of them."""
+    moved_n = memory["moved_n"] * (1.0 - limits["force_forget_share"])
+    for i in range(3):
+        moved_n += abs(obs["commanded_force_n"][i] - memory["commanded_n"][i])
+        memory["commanded_n"][i] = obs["commanded_force_n"][i]
+    memory["moved_n"] = moved_n if moved_n < np.inf else 0.0  # what is not finite leaves no trace
+
+
+@njit(cache=True, error_model="numpy")
+def _of_motion_m(limits: np.void, memory: np.void) -> float:
+    """What an imperfect device may be off by, beside noise, as its forces change."""
+    return float(limits["innovation_share_m_per_n"] * memory["moved_n"])
+
+
+@njit(cache=True, error_model="numpy")
+def implausible_combs(limits: np.void, memory: np.void, residual_m: NDArray[np.float64]) -> int:
     """Combs whose measured stroke is further from the expected one than plausible, bit 0 for comb 1.
 
     ``residual_m`` (3,): measured less expected strokes. While any bit is set the measurement is not to be used. Combs
     that are less than a third as far off as the worst one are only dragged along by it, and not named.
     """
     combs: int = 0
+    allowed_m = limits["residual_max_m"] + _of_motion_m(limits, memory)
     widest = max(abs(residual_m[0]), abs(residual_m[1]), abs(residual_m[2]))
     for i in range(3):
-        beyond = not abs(residual_m[i]) <= limits["residual_max_m"]  # NaN counts as beyond
+        beyond = not abs(residual_m[i]) <= allowed_m  # NaN counts as beyond
         if beyond and not abs(residual_m[i]) < widest / 3.0:
             combs |= 1 << i
     return combs
@@ -318,9 +341,10 @@ def _check_forces(limits: np.void, memory: np.void, obs: np.void) -> int:
 def _check_loop(limits: np.void, memory: np.void, obs: np.void) -> int:
     """What has a meaning only while the loop is closed."""
     trips: int = 0
-    too_fast = False
+    too_fast, of_motion_m = False, _of_motion_m(limits, memory)
+    _note_motion(limits, memory, obs)
     for i in range(3):
-        beyond = not abs(obs["innovation_m"][i]) <= limits["innovation_max_m"][i]
+        beyond = not abs(obs["innovation_m"][i]) <= limits["innovation_max_m"][i] + of_motion_m
         memory["innovation"][i] = _consecutive(memory["innovation"][i], beyond)
         trips |= _reached(memory["innovation"][i], limits["innovation_count"], _INNOVATION_X << i)
         too_fast = too_fast or not abs(obs["voltage_step_v"][i]) <= limits["voltage_step_max_v"]

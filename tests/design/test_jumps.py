@@ -100,8 +100,6 @@ def test_no_jump_that_the_check_accepts_ends_in_a_fault(law, plant):
     """From tenths of a micrometre to the ends of the workspace."""
     largest = [(largest_um(height_m, axis), height_m, axis) for height_m, axis in LARGEST]
     for by_um, height_m, axis in [*JUMPS, *largest]:
-        if law == "mpc" and plant == "mild" and by_um > 30.0:
-            continue
         rows, result, _ = jumped(law, plant, by_um, height_m, axis)
         assert result.faults == (), f"{by_um} um along {'xyz'[axis]}"
         assert rows["mode"][-1] == Mode.TRACKING

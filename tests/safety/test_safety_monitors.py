@@ -26,6 +26,9 @@ Changes = dict[str, Any]
 COUNTS = [name for name in LIMITS.names or () if name.endswith("_count")]
 
 
+UNMOVED = np.zeros(1, MONITOR_MEMORY)[0]
+
+
 class Bench:
     """A memory, its limits, and healthy ticks in which a test changes single fields."""
 
@@ -357,20 +360,45 @@ def test_a_stroke_is_implausible_from_just_beyond_the_limit() -> None:
     assert limit == 0.7e-6
     for comb in range(3):
         for value in (math.nextafter(limit, 1.0), -math.nextafter(limit, 1.0), math.nan, math.inf, -math.inf):
-            assert implausible_combs(limits[0], np.array(beyond(comb, value))) == 1 << comb
-    assert implausible_combs(limits[0], np.array([limit, -limit, 0.0])) == 0
-    assert implausible_combs(limits[0], np.array([1.0, math.nan, -1.0])) == 0b111
+            assert implausible_combs(limits[0], UNMOVED, np.array(beyond(comb, value))) == 1 << comb
+    assert implausible_combs(limits[0], UNMOVED, np.array([limit, -limit, 0.0])) == 0
+    assert implausible_combs(limits[0], UNMOVED, np.array([1.0, math.nan, -1.0])) == 0b111
+
+
+def test_what_the_model_may_be_off_by_grows_with_the_change_of_force_and_is_forgotten() -> None:
+    """Three combs that change by 1 mN each allow 1.5 um more of innovation and residual at the next sample, and a tenth
+    less with each tick. A force that stays, however large, allows nothing."""
+    limits = only("innovation_count", 1)
+    assert limits["innovation_share_m_per_n"][0] == 5e-4
+    limits["force_forget_share"] = 0.1
+    for after, more_m in ((1, 1.5e-6), (2, 1.35e-6), (11, 1.5e-6 * 0.9**10), (400, 0.0)):
+        for factor, expected in ((1.0 - 1e-9, Trip(0)), (1.0 + 1e-9, Trip.INNOVATION_Y)):
+            bench = Bench(limits=limits)
+            for _ in range(after):
+                bench.tick({"commanded_force_n": 1e-3})
+            seen = beyond(1, factor * (0.5e-6 + more_m))
+            assert bench.tick({"commanded_force_n": 1e-3, "innovation_m": seen}) == expected
+        if more_m:
+            residual_m = np.array(beyond(2, 0.7e-6 + 0.89 * more_m))
+            assert implausible_combs(limits[0], bench.memory[0], residual_m) == 0
+            assert implausible_combs(limits[0], UNMOVED, residual_m) == 0b100
+
+
+def test_a_change_of_force_that_is_no_number_allows_nothing() -> None:
+    bench = Bench(limits=only("innovation_count", 1))
+    bench.tick({"commanded_force_n": math.nan})
+    assert bench.tick({"innovation_m": beyond(1, 0.51e-6)}) == Trip.INNOVATION_Y
 
 
 def test_a_comb_that_is_only_dragged_along_is_not_named() -> None:
     limits = monitor_limits()[0]
-    assert implausible_combs(limits, np.array([9e-6, -2.9e-6, 1.1e-6])) == 0b001
-    assert implausible_combs(limits, np.array([9e-6, -3.0e-6, 3.1e-6])) == 0b111
-    assert implausible_combs(limits, np.array([-1.2e-6, 0.9e-6, 3.5e-6])) == 0b101
+    assert implausible_combs(limits, UNMOVED, np.array([9e-6, -2.9e-6, 1.1e-6])) == 0b001
+    assert implausible_combs(limits, UNMOVED, np.array([9e-6, -3.0e-6, 3.1e-6])) == 0b111
+    assert implausible_combs(limits, UNMOVED, np.array([-1.2e-6, 0.9e-6, 3.5e-6])) == 0b101
 
 
 def test_a_residual_limit_that_was_never_filled_in_believes_nothing() -> None:
-    assert implausible_combs(np.zeros(1, LIMITS)[0], np.full(3, 1e-12)) == 0b111
+    assert implausible_combs(np.zeros(1, LIMITS)[0], UNMOVED, np.full(3, 1e-12)) == 0b111
 
 
 @pytest.mark.parametrize("comb", [0, 1, 2])
@@ -412,7 +440,7 @@ def test_a_comb_that_the_worst_one_drags_along_is_not_named(worst: int, other: i
     for share, named in ((0.3, [worst]), (0.34, [worst, other])):
         residual_m = np.zeros(3)
         residual_m[worst], residual_m[other] = -6e-6, share * 6e-6
-        assert implausible_combs(limits, residual_m) == sum(1 << comb for comb in named)
+        assert implausible_combs(limits, UNMOVED, residual_m) == sum(1 << comb for comb in named)
 
 
 def test_opening_the_loop_forgets_what_only_the_loop_can_do() -> None:
