@@ -104,9 +104,7 @@ def test_the_harsh_plant_at_full_stroke_is_no_fault(law, motion):
     assert Trip(int(np.bitwise_or.reduce(rows["trips"]))) == Trip(0)
     assert rows["mode"][-1] == Mode.TRACKING
     # two-sided: it is a poor device, and the limit is not far off for nothing
-    # youla's filter is told what it has learnt of the device, which leaves a tenth
-    low_n, high_n = (10e-6, 60e-6) if law == "youla" else (0.2e-3, 0.3e-3)
-    assert low_n < np.abs(lacking_n(rows)).max() < high_n
+    assert 0.2e-3 < np.abs(lacking_n(rows)).max() < 0.3e-3
 
 
 @pytest.mark.parametrize(
