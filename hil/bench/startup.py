@@ -43,7 +43,7 @@ def sil() -> list[Figure]:
             cpu_s.append(after.children_user + after.children_system - before.children_user - before.children_system)
         by_package = _import_seconds(_run(Path(folder) / "imports", "-X", "importtime"))
         ratios = [first / again for first, again in (_twice(Path(folder) / f"twice-{k}") for k in range(REPEATS))]
-        helped_s = [_help() for _ in range(REPEATS)]
+        helped_s = [_help(Path(folder)) for _ in range(REPEATS)]
     most = ", ".join(f"{package} {s:.2f}" for package, s in by_package.most_common(_SHOWN))
     return [
         Figure("sil.wall", min(wall_s), "s", 5.0, "at most", statistics.median(wall_s),
@@ -61,7 +61,7 @@ def sil() -> list[Figure]:
 def _run(folder: Path, *flags: str) -> str:
     """Run the command into ``folder``; returns what it wrote to its standard error."""
     command = [sys.executable, *flags, "-c", _COMMAND, "sil", "--out", str(folder), "--json"]
-    done = subprocess.run(command, capture_output=True, text=True, check=False)
+    done = subprocess.run(command, capture_output=True, text=True, check=False, env=_as_installed(folder.parent))
     if not (folder / PICTURE).is_file():
         raise RuntimeError(f"pkxyz sil left no picture (exit code {done.returncode}): {done.stderr[-2000:]}")
     return done.stderr
@@ -70,15 +70,24 @@ def _run(folder: Path, *flags: str) -> str:
 def _twice(folder: Path) -> tuple[float, float]:
     """Processor seconds of the command in a new process, and of the same command once more in that process."""
     command = [sys.executable, "-c", _TWICE, str(folder)]
-    done = subprocess.run(command, capture_output=True, text=True, check=True)
+    done = subprocess.run(command, capture_output=True, text=True, check=True, env=_as_installed(folder.parent))
     first_s, again_s = map(float, done.stdout.split())
     return first_s, again_s
 
 
-def _help() -> float:
+def _as_installed(folder: Path) -> dict[str, str]:
+    """The environment of an installed package, whose bytecode is kept: here in ``folder``, filled by the first run. A
+    shell that forbids to write bytecode would have our modules compiled anew at each start.
+    """
+    kept = {name: value for name, value in os.environ.items() if name != "PYTHONDONTWRITEBYTECODE"}
+    return kept | {"PYTHONPYCACHEPREFIX": str(folder / "bytecode")}
+
+
+def _help(folder: Path) -> float:
     """Seconds of the clock on the wall until the list of commands has been printed."""
     begin_s = time.perf_counter()
-    subprocess.run([sys.executable, "-c", _COMMAND, "--help"], capture_output=True, check=True)
+    command = [sys.executable, "-c", _COMMAND, "--help"]
+    subprocess.run(command, capture_output=True, check=True, env=_as_installed(folder))
     return time.perf_counter() - begin_s
 
 
