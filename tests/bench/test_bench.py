@@ -197,4 +197,6 @@ def test_what_the_law_reaches_stands_beside_the_open_loop(monkeypatch: pytest.Mo
         assert f"{open_loop:.2f}" in f.detail.partition("; ")[2]
     assert found["beside.raster_lab"].target > 100.0  # what nobody knew of the device
     assert 0.3 < found["beside.raster_nominal"].value < 5.0
-    assert found["beside.raster_lab_identified"].value < found["beside.raster_lab"].value
+    # what an identification finds beforehand, the law learns on its way; without feedback it makes a difference
+    assert abs(found["beside.raster_lab_identified"].value - found["beside.raster_lab"].value) < 0.5
+    assert found["beside.raster_lab_identified"].target < 0.1 * found["beside.raster_lab"].target
