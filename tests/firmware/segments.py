@@ -203,6 +203,7 @@ def far(trouble: Trouble, random: np.random.Generator) -> None:
 
 def steps(trouble: Trouble, random: np.random.Generator) -> None:
     trouble.reference["motion"][_stretch(random, 900), : random.integers(1, 4)] += random.normal(0.0, 3e-6)
+    trouble.law["limits"]["saturation_count"] = 3  # a step asks for all that there is, but not for long
 
 
 def no_numbers(trouble: Trouble, random: np.random.Generator) -> None:
