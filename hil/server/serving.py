@@ -21,6 +21,7 @@ from hil.server.paths import Planner
 from pkxyz_ctrl.client import place
 from pkxyz_ctrl.client.protocol import TEXT_MAX_BYTES
 from pkxyz_ctrl.config.files import ConfigError, find
+from pkxyz_ctrl.config.refused import reason
 
 _ENDS_S = 3.0
 _LOOPBACK = ("127.0.0.1", "localhost", "::1")
@@ -176,7 +177,7 @@ def _bound(host: str, port: int) -> socket.socket:
         bound.listen(128)  # whoever is told the address may connect at once, and waits until the server is there
     except OSError as error:
         bound.close()
-        raise ConfigError(f"--port {port}: {error.strerror}; give another, or 0 for any that is free") from None
+        raise ConfigError(f"--port {port}: {reason(error)}; give another, or 0 for any that is free") from None
     return bound
 
 

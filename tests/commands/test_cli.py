@@ -109,7 +109,7 @@ def test_a_run_leaves_its_folder_and_exit_code_0_and_the_next_one_gets_the_next_
     assert summary.keys() - printed.keys() == {"files", "seal"}  # what the folder holds, besides
     assert {name: summary[name] for name in printed} == printed
     assert {item.name for item in folder.iterdir()} == {
-        "recording.parquet", "frames.log", "config.toml", "summary.json", "report.png",
+        "recording.parquet", "frames.log", "config.toml", "summary.json", "report.png", "adapted.json",
     }  # fmt: skip
     assert set(summary) >= {
         "scenario", "lane", "seed", "digest", "ticks", "missed_ticks", "saturated_ticks", "faults", "bus_load",

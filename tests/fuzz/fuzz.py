@@ -173,9 +173,10 @@ def fuzz_driver(rng: random.Random, frames: int) -> int:
     for _ in range(frames):
         t_us += rng.choice((0, 1, 50, 200, 5000)) if rng.random() < 0.5 else 0
         frame = traffic.frame()
-        if helpful and replies and rng.random() < 0.8:
-            asked = replies[-1]
-            frame = _answer(asked, answers) or frame
+        if helpful and driver.state is DriverState.TRYING and rng.random() < 0.2:
+            frame = Frame(0x70A, b"\x7f")  # it misses our heartbeat
+        elif helpful and replies and rng.random() < 0.8:
+            frame = _answer(replies[-1], answers) or frame
         out = list(driver.receive(frame, t_us))
         if rng.random() < 0.3:
             out += driver.poll(t_us)
@@ -207,7 +208,7 @@ def _answer(asked: Frame, answers: dict[bytes, Frame]) -> Frame | None:
         return None
     if asked.data[0] != 0x40:
         return Frame(0x58A, b"\x60" + asked.data[1:4] + bytes(4))
-    return answers.get(asked.data[1:4])
+    return answers.get(asked.data[1:4]) or Frame(0x58A, b"\x43" + asked.data[1:4] + bytes(4))
 
 
 def fuzz_gate(rng: random.Random, frames: int, gate_type: type[TransmitGate] = TransmitGate) -> int:

@@ -9,6 +9,8 @@ SOURCES = House.of(ROOT).sources
 LONGEST = 60
 LONGER = {
     "hil.commands.mechanics.design": "thirteen options of a command, each with its help",
+    "hil.commands.run.run": "options of a command, each with its help",
+    "hil.commands.sil.sil": "options of a command, each with its help",
     "hil.commands.studies.identify.identify": "options of a command, each with its help",
     "hil.commands.studies.margins.margins": "options of a command, each with its help",
     "hil.commands.studies.montecarlo.montecarlo": "options of a command, each with its help",

@@ -10,6 +10,7 @@ ALLOWED = {
     ("hil/studies/spread/workers.py", "pickle"): "between this program's own processes and the cluster that was named",
     ("hil/studies/latency.py", "subprocess"): "cyclictest: from PATH, or the path that was given on the command line",
     ("hil/bench/startup.py", "subprocess"): "this program, timed",
+    ("hil/server/serving.py", "subprocess"): "this program: the loop and the plant, in processes of their own",
     ("pkxyz_ctrl/export/kernels.py", "subprocess"): "this program, where numba leaves what it compiles unoptimised",
 }
 _CALLS = {"eval", "exec", "compile", "__import__", "import_module", "run_path", "run_module", "system", "popen"}

@@ -188,6 +188,7 @@ def in_the_middle() -> Cycle:
     memory["count"][:] = np.round(stage().holding_voltages(at) / drive["volt_per_count"]).astype(np.int32)
     set_position(c.law["tick"][0], memory, at)
     memory["set_point_model"]["applied_n"][:] = stage().holding_forces(at)
+    c.memory["monitors"]["commanded_n"][0] = stage().holding_forces(at)  # no force has changed of late
     c.tick(noisy(counts_at(MIDDLE), 0))
     assert c.mode is Mode.TRACKING
     return c

@@ -17,8 +17,15 @@ DRAWING = sorted(
     and "drawings" not in path.parts  # docs/drawings/canvas.py has two themes of its own
     and re.search("matplotlib|pictures.style", path.read_text(encoding="utf-8"))
 )
-SHADES = {"docs/figures/margins.py": 1, "hil/pictures/faults.py": 3, "hil/pictures/report.py": 1}
-"""Colours that mean something in one picture alone: a law's, degrees of lateness, the area under a line."""
+SHADES = {
+    "docs/figures/margins.py": 1,
+    "hil/pictures/faults.py": 3,
+    "hil/pictures/report.py": 1,
+    "hil/pictures/wafer/overview.py": 1,
+}
+"""Colours that mean something in one picture alone: a law's, degrees of lateness, the area under a line, a share half
+way between bad and good.
+"""
 
 
 def style_of_its_own(source: str) -> list[str]:

@@ -83,7 +83,14 @@ SATURATED = {("TransmitGate", "_syncs"): 2, ("AmplifierNode", "_silent_syncs"): 
 DICTIONARY_UNREAD = {0x1001, 0x1003, 0x2000, 0x2001, 0x6401, 0x6411}
 
 # Of the controller's record, what the law computes with and writes down is left out: any law is explored.
-_MONITORS_UNREAD = ("unexplained_trend_n", "commanded_trend_n", "frozen", "frozen_sense_count")
+_MONITORS_UNREAD = (
+    "unexplained_trend_n",
+    "commanded_trend_n",
+    "commanded_n",
+    "moved_n",
+    "frozen",
+    "frozen_sense_count",
+)
 
 CONSTANT_KINDS = {"OtherTraffic", "PdoParameters", "ProcessCodec", "NodeObjects", "ObjectDictionary"}
 CONSTANT = {

@@ -4,6 +4,7 @@ import math
 from types import SimpleNamespace
 from typing import Any
 
+import numpy as np
 import pytest
 import z3
 from symbolic import DisprovedError, Number, Truth, of, paths, prove, rebuilt, truth, unknown
@@ -52,21 +53,21 @@ def prove_clamp(old: str = "", new: str = "") -> int:
         unknown(name, low, 32767) for name, low in (("last", 0), ("slew", 1), ("most", 0))
     )
     assume = [is_last, is_slew, is_most, last.z <= most.z]
-    floors = [0]
+    wholes = [0]
 
-    def floor(value: Any) -> Number:
-        floors[0] += 1
-        return Number(z3.BitVec(f"floor_{floors[0]}", 64))  # any integer: a floor of what is not known
+    def whole(value: Any) -> Number:
+        wholes[0] += 1
+        return Number(z3.BitVec(f"whole_{wholes[0]}", 64))  # any integer: what is left of what is not known
 
     replaced = {
-        "math": SimpleNamespace(sqrt=lambda x: Anything(), floor=floor),
+        "math": SimpleNamespace(sqrt=lambda x: Anything()), "np": SimpleNamespace(int32=whole, void=np.void),
         "min": smallest, "max": largest, "range": lambda n: [0],
     }  # fmt: skip
     function = rebuilt(voltage.counts_for_forces, replaced, old, new)
     proven = 0
 
     def call() -> list[Any]:
-        floors[0] = Anything.seen = 0
+        wholes[0] = Anything.seen = 0
         drive = {
             "count_slew_max": slew,
             "count_max": most,
@@ -107,9 +108,7 @@ def test_the_clamp_s_proof_fails_for_a_planted_defect(old: str, new: str) -> Non
 
 
 def test_a_number_that_is_none_stays_within_the_limits_too() -> None:
-    """What the proof takes a floor for is an integer: a voltage that is not a number never gets as far."""
-    import numpy as np
-
+    """What the proof takes a conversion for is an integer: a voltage that is not a number never gets as far."""
     drive = np.zeros(1, voltage.DRIVE)
     drive["force_gain_n_per_v2"], drive["volt_per_count"] = 1e-8, 200 / 32767
     drive["count_max"], drive["count_slew_max"], drive["noise_shaping"] = 30000, 1000, 1
@@ -141,10 +140,10 @@ def prove_step(claim: str, old: str = "", new: str = "") -> int:
         node._drive = SimpleNamespace(pending=())
         node._drive_deadline = SimpleNamespace(set=lambda t: setattr(node, "watched", True), cancel=lambda: None)
         node._drive_timeout_us, node.watched = 0, False
-        node._plant = SimpleNamespace(drive=lambda counts: setattr(node, "driven", counts))
         node._release_combs = lambda *a: setattr(node, "driven", (0, 0, 0))
         node._outputs_to_error_value = lambda *a: setattr(node, "driven", (0, 0, 0))
-        apply(node, (n["a"], n["b"], n["c"]), 0)
+        taken = apply(node, (n["a"], n["b"], n["c"]), 0)
+        node.driven = node.driven if taken is None else taken
         return node
 
     for path in paths(call, [condition for _, condition in made.values()]):

@@ -45,9 +45,10 @@ class Linked:
     def _start(self) -> None:
         self.node.power_on()
         self.send(self.driver.start(self.clock.now_us))
-        for _ in range(100):
+        while self.driver.state is not DriverState.OPERATIONAL and self.clock.now_us < 500_000:
             self.pass_time(1000)
             self.send(self.driver.poll(self.clock.now_us))
+            self._beat()
         assert self.driver.state is DriverState.OPERATIONAL, self.driver.failure
         assert self.node.state is NmtState.OPERATIONAL
         self.mode = Mode.ENABLED
@@ -91,12 +92,15 @@ class Linked:
             passed = self.send((self.driver.drive(counts, self.clock.now_us),), drive)
             if not passed:
                 self.driver.revoke_drive()
+        self._beat()
+        self.pass_time(PERIOD_US - 100)
+        return passed
+
+    def _beat(self) -> None:
         heartbeat = self.driver.heartbeat_due(self.clock.now_us)
         if heartbeat is not None:
             self.send((heartbeat,))
             self.driver.heartbeat_sent(self.clock.now_us)
-        self.pass_time(PERIOD_US - 100)
-        return passed
 
     def worst_step(self) -> int:
         """Largest change of a count from one voltage to the next, releases to 0 V excepted."""

@@ -18,7 +18,7 @@ def in_the_middle() -> Rows:
     """60 ticks under feedback at mid-workspace: noise, lost frames, a jump that saturates the combs, a fault."""
     at = stage().forward_kinematics(MIDDLE)
     reference = np.tile(np.r_[at, np.zeros(6)], (80, 1))
-    reference[47:, 2] -= 12e-6
+    reference[47:, 2] -= 20e-6
     c = Cycle(law(autostart=False), reference, Mode.ENABLED)
     memory, drive = c.memory["tick"][0], c.law["tick"]["drive"][0]
     memory["count"][:] = np.round(stage().holding_voltages(at) / drive["volt_per_count"]).astype(np.int32)

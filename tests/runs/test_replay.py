@@ -253,9 +253,8 @@ def test_a_tail_that_is_missing_is_no_whole_recording(folder_of_a_run, tmp_path)
     """Cut by 30 per cent at a row, in sound Parquet: once that was "identical"."""
     rows, metadata = rows_of(folder_of_a_run / "recording.parquet")
     path = written(tmp_path / "sealed_anew", rows[:350], metadata)
-    shutil.copy(folder_of_a_run / "reference.4.csv", path.parent)
-    shutil.copy(folder_of_a_run / "summary.json", path.parent)
-    shutil.copy(folder_of_a_run / "config.toml", path.parent)
+    for name in ("reference.4.csv", "summary.json", "config.toml", "adapted.json"):
+        shutil.copy(folder_of_a_run / name, path.parent)
     result = replay(path)
     assert result.identical
     assert result.damages == ["frames.log is missing", "recording.parquet is not as the run left it"]
