@@ -71,19 +71,19 @@ def draw_wafer(
 
 
 def _map(plot: Axes, process: Process, columns: Columns, share: float) -> None:
-    """Each die's share over all wafers; where there is one wafer only, its good and bad dies."""
+    """Which part of each die fails over all wafers; where there is one wafer only, its good and bad dies."""
     places, where = np.unique(np.stack([columns["x_m"], columns["y_m"]], axis=1), axis=0, return_inverse=True)
     held = np.bincount(where, weights=columns[ALL]) / np.bincount(where)
     half = 0.47e3 * process.wafer.die_m
-    digits = 1 if held.min() > 0.9 and held.min() < 1.0 else 0
+    digits = 1 if 0.9 < held.min() < 1.0 else 0
     least = min(0.98, float(held.min()), share)
     for (x, y), value in zip(places * 1e3, held, strict=True):
         colour = _SHARE((value - least) / (1.0 - least))
         plot.fill([x - half, x + half, x + half, x - half], [y - half, y - half, y + half, y + half], color=colour)
-        plot.annotate(f"{100 * value:.{digits}f}", (x, y), ha="center", va="center", fontsize=TINY_PT, color=INK)
+        plot.annotate(f"{100 * (1.0 - value):.{digits}f}", (x, y), ha="center", va="center", fontsize=TINY_PT, color=INK)
     plot.add_patch(Circle((0, 0), 0.5e3 * process.wafer.diameter_m, fill=False, color=FAINT))
     plot.set_aspect("equal")
-    dress(plot, "x (mm)", "y (mm)", "share by place on the wafer (%)", grid="")
+    dress(plot, "x (mm)", "y (mm)", "where they fail (% of each die)", grid="")
 
 
 def _bars(plot: Axes, shares: Mapping[str, Share]) -> None:
@@ -109,18 +109,18 @@ def _spreads(plot: Axes, process: Process, columns: Columns) -> None:
         room = 0.08 * (most - least) or 1.0
         begin, length = least - room, most - least + 2.0 * room
         count, edges = np.histogram(values, 60, (begin, begin + length))
-        heights = 0.75 * count / max(1, count.max())
+        heights = 0.55 * count / max(1, count.max())
         plot.fill_between((edges[:-1] - begin) / length, row, row + heights, step="mid", color=BLUE, alpha=0.8, lw=0)
         for end in ends:
             at = (end - begin) / length
-            plot.plot([at, at], [row, row + 0.75], color=BAD, lw=1.4)
-            plot.annotate(f" {_shown(name, end)} ", (at, row + 0.4), ha="left" if end == bound.min else "right",
+            plot.plot([at, at], [row, row + 0.6], color=BAD, lw=1.4)
+            plot.annotate(f" {_shown(name, end)} ", (at, row + 0.32), ha="left" if end == bound.min else "right",
                           fontsize=TINY_PT, color=BAD)  # fmt: skip
         plot.annotate(_shown(name, mid), ((mid - begin) / length, row - 0.02), ha="center", va="top",
                       fontsize=TINY_PT, color=MUTED)  # fmt: skip
     plot.set_yticks(range(len(names)), [_words(name) for name in names])
     plot.set_xticks([])
-    plot.set_ylim(-0.35, len(names) + 0.15)
+    plot.set_ylim(-0.35, len(names) - 0.2)
     dress(plot, title="figures, their medians, and where they have to lie", grid="")
 
 
@@ -129,7 +129,7 @@ def _gains(plot: Axes, found: Causes) -> None:
     order = sorted(gain, key=lambda name: gain[name])
     plot.barh([_words(name) for name in order], [gain[name] for name in order], color=BLUE, height=0.6)
     plot.axvline(0.0, color=FAINT, lw=0.8)
-    dress(plot, f"points of the share ({found.share:.1%}) won", title="if it had no spread", grid="x")
+    dress(plot, f"points of the share won ({found.share:.1%} here)", title="if it had no spread", grid="x")
 
 
 def _heat(plot: Axes, found: Causes) -> None:
