@@ -17,6 +17,7 @@ PAGE = ROOT / "README.md"
 PLANTS = {
     "nominal": ("raster", "nominal: as the stage file says"),
     "mild": ("raster_mild", "mild: some per cent of mismatch, 200 ppm of sense gain"),
+    "lab": ("raster_lab", "lab: a good stage on a good table in a real room, 100 us of sense filter"),
     "harsh": ("raster_harsh", "harsh: 10 % mismatch, strong parasitic mode, charging, drift"),
 }
 LAWS = ("open_loop", "youla", "lqg")
