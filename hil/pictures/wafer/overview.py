@@ -80,7 +80,8 @@ def _map(plot: Axes, process: Process, columns: Columns, share: float) -> None:
     for (x, y), value in zip(places * 1e3, held, strict=True):
         colour = _SHARE((value - least) / (1.0 - least))
         plot.fill([x - half, x + half, x + half, x - half], [y - half, y - half, y + half, y + half], color=colour)
-        plot.annotate(f"{100 * (1.0 - value):.{digits}f}", (x, y), ha="center", va="center", fontsize=TINY_PT, color=INK)
+        fails = f"{100 * (1.0 - value):.{digits}f}"
+        plot.annotate(fails, (x, y), ha="center", va="center", fontsize=TINY_PT, color=INK)
     plot.add_patch(Circle((0, 0), 0.5e3 * process.wafer.diameter_m, fill=False, color=FAINT))
     plot.set_aspect("equal")
     dress(plot, "x (mm)", "y (mm)", "where they fail (% of each die)", grid="")
