@@ -107,9 +107,9 @@ def _no_step_limit(patch: pytest.MonkeyPatch) -> None:
     """The node as it was: whatever passes is applied. The gate's rule alone can't hold the slew limit."""
     shipped = AmplifierNode._apply
 
-    def apply(node: AmplifierNode, counts: tuple[int, int, int], t_us: int) -> None:
+    def apply(node: AmplifierNode, counts: tuple[int, int, int], t_us: int) -> tuple[int, int, int] | None:
         node._step_max = 32767
-        shipped(node, counts, t_us)
+        return shipped(node, counts, t_us)
 
     patch.setattr(AmplifierNode, "_apply", apply)
 
