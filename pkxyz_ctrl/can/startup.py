@@ -74,7 +74,7 @@ class Setting:
 
 @dataclass(frozen=True, slots=True)
 class Plan:
-    """``steps``: writes, then the read-back of each. ``lost``: protections that this node does not give, and what
+    """``steps``: writes, then the read-back of everything that has to hold. ``lost``: protections that this node does not give, and what
     stands in for each. ``refusal``: why it must not be started; empty if it may. ``is_proven``: a report on this very
     module shows that its combs go to 0 V without us.
     """
@@ -171,9 +171,11 @@ def plan(config: DriverConfig, count_step_max: int, found: Found) -> Plan:
             return Plan((), tuple(lost), refusal)
         lost += told
     writes = _writes(config, count_step_max, found, absent)
-    written = {(step.index, step.subindex) for step in writes}
+    # Also of what stood already: one answer that was damaged must not pass for a value that is there.
     back = tuple(
-        setting.ask() if setting.may_differ else setting.read_back() for setting in wanted if setting.key in written
+        setting.ask() if setting.may_differ else setting.read_back()
+        for setting in wanted
+        if setting.index not in absent
     )
     return Plan((*writes, *back), tuple(lost), "", bool({HEARTBEAT_LOST, DRIVE_TIMEOUT} & set(lines)))
 

@@ -10,6 +10,7 @@ from pathlib import Path
 import can
 import canopen
 import pytest
+from canopen.objectdictionary import ODVariable
 
 from pkxyz_ctrl.can.codec import crc8
 from pkxyz_ctrl.can.driver import NODE_REBOOTED, AmplifierDriver
@@ -17,6 +18,7 @@ from pkxyz_ctrl.can.driver_config import DriverConfig, ProvenModule
 from pkxyz_ctrl.can.frame import Frame
 from pkxyz_ctrl.can.sense_input import SENSE_COUNTER, SENSE_MISSING
 from pkxyz_ctrl.can.start_sequence import DriverState
+from pkxyz_ctrl.can.startup import settings
 
 EDS = str(Path(__file__).resolve().parents[2] / "configs" / "comb_amplifier.eds")
 FRAME_US = 100
@@ -261,6 +263,29 @@ def test_what_stands_is_not_written(protection):
     bench.start()
     assert (bench.driver.state, bench.driver.failure) == (DriverState.OPERATIONAL, "")
     assert written == [(0x1016, 1), (0x1017, 0)]
+
+
+@pytest.mark.parametrize(("index", "subindex"), [(0x2010, 0), (0x2011, 0), (0x2012, 0), (0x1016, 1), (0x6443, 1)])
+def test_one_damaged_answer_is_not_taken_for_a_value_that_stands(index, subindex):
+    """The node holds something else, and the first answer says the right thing: it is read once more."""
+    config = DriverConfig()
+    setting = next(s for s in settings(config) if s.key == (index, subindex))
+    bench = Bench(config)
+    entry = bench.node.object_dictionary[index]
+    (entry if isinstance(entry, ODVariable) else entry[subindex]).default = setting.value ^ 1
+    shipped, lies = bench.driver.receive, []
+
+    def receive(frame: Frame, t_us: int) -> tuple[Frame, ...]:
+        if frame.can_id == 0x58A and frame.data[1:4] == index.to_bytes(2, "little") + bytes((subindex,)) and not lies:
+            lies.append(frame)
+            frame = frame._replace(data=frame.data[:4] + setting.value.to_bytes(4, "little"))
+        return shipped(frame, t_us)
+
+    bench.driver.receive = receive
+    bench.start()
+    assert lies
+    assert bench.driver.state is DriverState.FAILED
+    assert "read-back" in bench.driver.failure
 
 
 def test_a_constant_mapping_that_is_another_is_refused():
