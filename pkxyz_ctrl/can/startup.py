@@ -74,9 +74,9 @@ class Setting:
 
 @dataclass(frozen=True, slots=True)
 class Plan:
-    """``steps``: writes, then the read-back of everything that has to hold. ``lost``: protections that this node does not give, and what
-    stands in for each. ``refusal``: why it must not be started; empty if it may. ``is_proven``: a report on this very
-    module shows that its combs go to 0 V without us.
+    """``steps``: writes, then the read-back of everything that has to hold. ``lost``: protections that this node does
+    not give, and what stands in for each. ``refusal``: why it must not be started; empty if it may. ``is_proven``: a
+    report on this very module shows that its combs go to 0 V without us.
     """
 
     steps: tuple[SdoStep, ...]
