@@ -181,6 +181,8 @@ class AmplifierDriver:
             self._on_emergency(data, t_us)
         elif received_id in self._ours:
             self._on_foreign(received_id, data)
+            if self.foreign and self.state in (DriverState.STARTING, DriverState.TRYING):
+                return self._go_on(self._start_up.disturbed(self.foreign), t_us)
         return _NOTHING
 
     def drive(self, counts: Counts, t_us: int) -> Frame:

@@ -220,6 +220,10 @@ class StartSequence:
             self._nmt(NmtCommand.PRE_OPERATIONAL),
         )
 
+    def disturbed(self, by: str) -> Messages:
+        """Somebody speaks in our name while the node is operational and we are silent: it goes back at once."""
+        return self._fail(by, self._nmt(NmtCommand.PRE_OPERATIONAL))
+
     # -- small things -----------------------------------------------------------------------------------------------
 
     @property
