@@ -180,9 +180,7 @@ class AmplifierDriver:
         elif received_id == self._emergency_id:
             self._on_emergency(data, t_us)
         elif received_id in self._ours:
-            self._on_foreign(received_id, data)
-            if self.foreign and self.state in (DriverState.STARTING, DriverState.TRYING):
-                return self._go_on(self._start_up.disturbed(self.foreign), t_us)
+            return self._on_foreign(received_id, data, t_us)
         return _NOTHING
 
     def drive(self, counts: Counts, t_us: int) -> Frame:
@@ -273,20 +271,22 @@ class AmplifierDriver:
         if not emergency.is_reset:
             self.node_events |= NODE_EMERGENCY
 
-    def _on_foreign(self, received_id: int, data: bytes) -> None:
+    def _on_foreign(self, received_id: int, data: bytes, t_us: int) -> Frames:
         """A frame that only we may send, and that we did not, since a controller does not receive its own.
 
-        What comes before the node is configured, a predecessor's last heartbeat perhaps, the configuration undoes.
+        What comes before the node is configured, a predecessor's last heartbeat perhaps, the configuration undoes; what
+        comes while the node is tried, and we are silent, ends the start.
         """
         if self.state not in _SPOKEN_FOR:
-            return
+            return _NOTHING
         if received_id == cob_id.NMT and data[1:] not in (b"\0", bytes((self.config.node_id,))):
-            return  # to another node
+            return _NOTHING  # to another node
         self.node_events |= FOREIGN_FRAME
         self.foreign = self.foreign or (
             f"0x{received_id:03X} [{data.hex(' ')}], {self._ours[received_id]} that this controller did not send: "
             "look for a second controller, a master or a tool on the bus, or receive_own_messages in its options"
         )
+        return self._go_on(self._start_up.disturbed(self.foreign), t_us) if self.state in _TRIAL else _NOTHING
 
     def _node_lost(self, t_us: int) -> None:
         silent_ms = (t_us - self._node_deadline_us + self._node_timeout_us) / 1000

@@ -36,10 +36,10 @@ class DriverState(Enum):
 class StartSequence:
     """The start-up of one node; ``state`` runs from RESETTING to OPERATIONAL or FAILED.
 
-    In IDENTIFYING the node says who it is, in CONFIGURING what it holds; what differs is written and read back. Once it
-    is operational, at 0 V, our heartbeat stays away: in TRYING a node has to leave that state by itself. One that has
-    done so, or of which a report says so, is known by identity and serial number and not tried again. ``lost`` tells
-    which protections it does without.
+    In IDENTIFYING the node says who it is, in CONFIGURING what it holds; what differs is written, and everything that
+    has to hold is read once more. Once it is operational, at 0 V, our heartbeat stays away: in TRYING a node has to
+    leave that state by itself. One that has done so, or of which a report says so, is known by identity and serial
+    number and not tried again. ``lost`` tells which protections it does without.
     """
 
     def __init__(self, config: DriverConfig, count_step_max: int) -> None:
@@ -172,10 +172,7 @@ class StartSequence:
             return self._fail(f"{self._name}: {planned.refusal}")
         is_known = None not in self._identity and self._identity == self._tried_identity
         self._is_tried = planned.is_proven or is_known
-        if planned.steps:
-            return self._ask(planned.steps, t_us)
-        self._dialogue = SdoDialogue((), 0, 0)
-        return self._advance((), t_us)
+        return self._ask(planned.steps, t_us)
 
     # -- start and trial --------------------------------------------------------------------------------------------
 
