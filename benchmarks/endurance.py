@@ -183,6 +183,7 @@ def _controlled(recorder: Witness, setup: Any, plant_pid: int) -> WallRig:
             print(go_real_time(), file=sys.stderr)
             tracemalloc.start()
             settle_memory()
+            rig.start()
             rig.run()
         except Ended:
             print("ended from outside: what was seen until then", file=sys.stderr)

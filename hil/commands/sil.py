@@ -10,7 +10,7 @@ import typer
 from hil.commands.run import Adapted, Apply, Learn, Refresh, ReplaceEarlier, learning_of
 from hil.lanes.lane import Lane
 from hil.screen.choices import InProcessLane, require_simulated
-from hil.screen.figures import error_lines, where_to_read
+from hil.screen.figures import error_lines, lacking_lines, where_to_read
 from hil.screen.first_run import say_if_compiling
 from hil.screen.progress import progress_bar
 from hil.screen.terminal import bad, faint, good, plain_table, say, screen
@@ -96,7 +96,8 @@ def _show(summary: "Summary", folder: Path) -> None:
     rate = f", {speed:.1f} times real time" if speed is not None else ""
     say(f"{summary.scenario}, {summary.lane} lane, seed {summary.seed}: {summary.rows.ticks} ticks{rate}")
     screen().print(table)
-    for line in error_lines(summary.rows, summary.loop.errors_are_of):
+    loop = summary.loop
+    for line in (*error_lines(summary.rows, loop.errors_are_of), *lacking_lines(loop.protections_lacking)):
         say(line)
     for fault in summary.loop.faults:
         say(bad("fault"), f": {fault}")

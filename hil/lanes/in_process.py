@@ -38,6 +38,8 @@ class LaneResult:
     """stage time over the machine's time"""
     learner: Learner | None = None
     """what was learnt, where the run learns"""
+    protections_lacking: tuple[str, ...] = ()
+    """that the amplifier does not give, and what replaces each"""
     adaptation: NDArray[np.void] | None = None
     """(1,) of ``core.adaptation.ADAPTATION_STATE`` in the end: what was learnt of the device"""
 
@@ -60,7 +62,7 @@ def run(
     blocks = Blocks(
         setup.trajectory, setup.bus.period_us, setup.ticks, on_block, on_progress, setup.excitation, learner
     )
-    law = setup.law
+    law, lost = setup.law, tuple[str, ...]()
     if lane == Lane.FAST:
         plant, memory = setup.new_plant(), new_memory(Mode.IDLE)
         run_block = runner_of(law)
@@ -72,12 +74,12 @@ def run(
         rig = LockstepRig(setup, frame_log)
         begin_s = time.perf_counter()  # designed, wired up and loaded: what is timed from here is the run
         missed, load = rig.run(blocks)
-        faults, memory = rig.controller.faults, rig.controller.memory
+        faults, memory, lost = rig.controller.faults, rig.controller.memory, rig.controller.driver.lost
     else:
         raise ValueError(f"the {lane} lane waits for a clock: hil.lanes.wall")
     factor = setup.ticks * setup.bus.period_s / (time.perf_counter() - begin_s)
     adaptation = memory["tick"]["adaptation"].copy()
-    return LaneResult(setup.ticks, missed, load, tuple(faults), factor, learner, adaptation)
+    return LaneResult(setup.ticks, missed, load, tuple(faults), factor, learner, lost, adaptation)
 
 
 def _run_fast(setup: Setup, run_block: RunBlock, memory: NDArray[np.void], plant: Plant, blocks: Blocks) -> list[str]:

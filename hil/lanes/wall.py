@@ -111,8 +111,9 @@ class WallRig:
         self.can_port = CanPort(self._bus, self.clock, can_config.sense_deadline_us // 2)
         self.port = _LoggedPort(self.can_port, self.clock, recorder, can_config.driver.node_id)
         self.controller = Controller(
-            law, setup.bus, wall_gate(setup.gate), self.port.send, self.can_port.discard_unsent
-        )
+            law, setup.bus, wall_gate(setup.gate), self.port.send, self.can_port.discard_unsent,
+            lambda: self.can_port.complaint,
+        )  # fmt: skip
         for name, *_ in TRUTH_FIELDS:
             self.controller.memory["row"][name] = np.nan  # nobody here knows it
         self._guard_us = setup.bus.period_us // _GUARDS_PER_PERIOD
@@ -136,9 +137,21 @@ class WallRig:
         """Frames that a bus among processes lost because a receiver stood still; None on other buses."""
         return self._bus.dropped if isinstance(self._bus, UnixBus) else None
 
+    def start(self, say: Callable[[str], object] = lambda words: None) -> None:
+        """Start the amplifier; ``say`` is told which protections are lacking. Raises ``StartUpError`` and ``Ended``."""
+        self._started = True
+        try:
+            start(self.clock, _Interruptible(self.port, self._ending), self.controller)
+        except StartUpError:
+            port = self.can_port
+            if port.sent or not port.refused:
+                raise
+            raise StartUpError(port.refusal) from None
+        for lacking in self.controller.driver.lost:
+            say(f"this amplifier lacks a protection: {lacking}")
+
     def run(self) -> None:
-        """Start the amplifier and run all ticks. Raises ``StartUpError``, ``AmplifierGoneError`` and ``Ended``."""
-        self._start()
+        """Run all ticks of an amplifier that is started. Raises ``AmplifierGoneError`` and ``Ended``."""
         row, take = self.controller.row, self._recorder.row
         live, memory = self.live, self.controller.memory
         streamed = StreamedReference(self.setup.trajectory, self.setup.bus.period_us, memory)
@@ -165,21 +178,10 @@ class WallRig:
             run(self.ticks, self.port, self.controller, lambda tick: rows, self.setup.ticks, record_and_learn)
 
     def operate(self, reference: Reference, after: Callable[[int], object]) -> None:
-        """Start the amplifier and run until somebody ends it: set-points are handed in, and ``after`` is called after
-        each tick. Raises ``StartUpError`` and ``Ended``.
+        """Run until somebody ends it: set-points are handed in, and ``after`` is called after each tick. Raises
+        ``Ended``.
         """
-        self._start()
         run(self.ticks, self.port, self.controller, reference, _NO_END, after)
-
-    def _start(self) -> None:
-        self._started = True
-        try:
-            start(self.clock, _Interruptible(self.port, self._ending), self.controller)
-        except StartUpError as error:
-            port = self.can_port
-            if not port.refused:
-                raise
-            raise StartUpError(f"{error}; {port.refusal}" if port.sent else port.refusal) from None
 
     def close(self) -> None:
         """0 V, pre-operational, and off the bus."""

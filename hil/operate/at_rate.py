@@ -117,6 +117,7 @@ def operate(setup: Setup, settings: Settings, name: str, files: dict[str, str], 
             place.write(name, "loop", _description(setup, settings, memory, files))
             say(go_real_time())
             settle_memory()
+            rig.start(say)
             rig.operate(session.stage.setpoints, OperatedLoop(session, memory, counted).after)
         except Ended as end:
             return end.signal_number

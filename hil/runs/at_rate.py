@@ -49,6 +49,7 @@ class _Watched:
     ended_by: int = 0
     elapsed_s: float = 0.0
     faults: tuple[str, ...] = ()
+    protections_lacking: tuple[str, ...] = ()
     lateness_us: list[int] = dataclasses.field(default_factory=list)
     missed_ticks: int = 0
     refused_frames: int = 0
@@ -103,6 +104,7 @@ def _run_into(
     loop = LoopFigures(
         missed_ticks=watched.missed_ticks,
         faults=watched.faults,
+        protections_lacking=watched.protections_lacking,
         realtime_factor=recording.ticks * period_s / watched.elapsed_s if watched.elapsed_s else None,
         errors_are_of="estimate",
         refused_frames=watched.refused_frames,
@@ -122,9 +124,11 @@ def _run(rig: WallRig, watched: _Watched, say: Callable[[str], object], ending: 
         say(go_real_time())
         settle_memory()
         begin_s = time.monotonic()
+        rig.start(say)
         rig.run()
     except AmplifierGoneError:
-        say(f"the amplifier has fallen silent, so the run ends: {_COME_BACK[rig.others is None]}")
+        hint = rig.can_port.complaint or f": {_COME_BACK[rig.others is None]}"
+        say(f"the amplifier has fallen silent, so the run ends{hint}")
     finally:
         try:
             rig.close()
@@ -132,6 +136,7 @@ def _run(rig: WallRig, watched: _Watched, say: Callable[[str], object], ending: 
             leave_real_time()
             watched.elapsed_s = time.monotonic() - begin_s
             watched.faults = tuple(rig.controller.faults)
+            watched.protections_lacking = rig.controller.driver.lost
             watched.lateness_us = rig.ticks.lateness_us
             watched.missed_ticks = rig.controller.missed_ticks
             watched.refused_frames = rig.can_port.refused

@@ -126,7 +126,8 @@ def run_in_memory(
 
 
 def _figures_of(result: lanes.LaneResult) -> LoopFigures:
-    return LoopFigures(result.missed_ticks, result.faults, result.bus_load, result.realtime_factor)
+    lost = result.protections_lacking
+    return LoopFigures(result.missed_ticks, result.faults, lost, result.bus_load, result.realtime_factor)
 
 
 def require_bus(scenario: Scenario, lane: Lane) -> None:

@@ -22,6 +22,8 @@ class LoopFigures:
     """skipped, without a sense frame, or with a drive frame that was late on the wire"""
     faults: tuple[str, ...] = ()
     """a sentence for each fault decision"""
+    protections_lacking: tuple[str, ...] = ()
+    """that this amplifier does not give, and what replaces each"""
     bus_load: float | None = None
     """0..1 over the ticks"""
     realtime_factor: float | None = None
@@ -95,7 +97,7 @@ class Summary:
             figures = learnt.pop("figures")
             periods = figures.pop("periods")
             plain |= figures | {"learning": learnt | {"periods": periods, "steps": list(learnt["steps"])}}
-        loop["faults"] = list(self.loop.faults)
+        loop |= {"faults": list(self.loop.faults), "protections_lacking": list(self.loop.protections_lacking)}
         return plain | rows | loop | {"checks": [verdict.as_json() for verdict in self.checks]}
 
 

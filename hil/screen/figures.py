@@ -22,6 +22,11 @@ def error_lines(rows: "RowFigures", errors_are_of: str) -> Iterator[str]:
     yield from (f"warning: {words}" for words in rows.warnings)
 
 
+def lacking_lines(protections: Iterable[str]) -> Iterator[str]:
+    """A line for each protection that the amplifier of a run does not give."""
+    yield from (f"the amplifier lacks a protection: {words}" for words in protections)
+
+
 def where_to_read(faults: Iterable[str]) -> str | None:
     """A line that leads from the fault codes, which stand in brackets in these texts, to their causes and remedies."""
     codes = dict.fromkeys(re.findall(r"\(([A-Z]+(?:_[A-Z0-9]+)*)\)", " ".join(faults)))

@@ -26,6 +26,8 @@ _REMEDIES = {
 }
 
 
+_ERROR_BUS_OFF = 0x40  # class of an error frame (linux/can/error.h); the next one, of a restart, has another
+_BUS_OFF = "check wiring, termination and bit rates, then restart it (ip link set ... type can restart)"
 _SAYS_NOTHING_OF_FD = ("virtual",)  # it carries them, and calls itself classic
 
 
@@ -93,9 +95,9 @@ class CanPort:
     """``runtime.Port`` on a python-can bus.
 
     ``refused`` counts frames that the bus did not take (queue full, bus-off): they are lost, and it is for the monitors
-    to say when that is too much. ``refusal`` is a sentence on the latest of them. ``last_us`` is the time of the frame
-    received last, by the stamp of its interface where that is a time of day, as python-can wants it, else when it was
-    read; it never runs backwards.
+    to say when that is too much. ``refusal`` is a sentence on the latest of them, and ``complaint`` what stands in the
+    way now. ``last_us`` is the time of the frame received last, by the stamp of its interface where that is a time of
+    day, as python-can wants it, else when it was read; it never runs backwards.
 
     ``receive`` looks again and again for ``spin_us`` before it sleeps: an answer that comes within that time, as a
     sense frame does, is not delayed by a wake-up, some 50 us. It reckons by ``clock``, and leaves python-can's own
@@ -112,6 +114,7 @@ class CanPort:
         self.refused = 0
         self.refusal = ""
         self.last_us = 0
+        self._refuses = self._is_bus_off = False
 
     def send(self, frame: Frame) -> bool:
         """Hand a frame to the bus; False if it was refused."""
@@ -120,8 +123,10 @@ class CanPort:
         except (can.CanError, OSError, ValueError) as error:
             self.refused += 1
             self.refusal = f"the interface refuses frames ({_reason(error)})"
+            self._refuses = True
             return False
         self.sent += 1
+        self._refuses = False
         return True
 
     def receive(self, deadline_us: int) -> Frame | None:
@@ -141,6 +146,8 @@ class CanPort:
             return None
         if message is None:
             return None
+        if message.is_error_frame:
+            self._is_bus_off = bool(message.arbitration_id & _ERROR_BUS_OFF)
         now_us = clock.now_us
         age_s = time.time() - message.timestamp
         stamp_us = now_us - round(age_s * 1e6) if 0 <= age_s < _STAMP_MAX_AGE_S else now_us
@@ -151,6 +158,13 @@ class CanPort:
         """A message that passes the filters; None also before the time is over, where one came that does not pass."""
         message, is_filtered = self._bus._recv_internal(timeout_s)
         return message if message is None or is_filtered or self._bus._matches_filters(message) else None
+
+    @property
+    def complaint(self) -> str:
+        """``; the interface ...`` where it takes no frames, or says that it is off the bus; else empty."""
+        if self._is_bus_off:
+            return f"; the interface is off the bus after too many errors (bus-off): {_BUS_OFF}"
+        return f"; {self.refusal}" if self._refuses else ""
 
     def unsent(self) -> int:
         """0: python-can doesn't tell what still waits."""

@@ -34,8 +34,9 @@ class Controller:
     """One stage under control.
 
     ``send`` takes every frame that may go out; ``discard_unsent`` drops those that still wait, so that no voltage of
-    before follows a fault decision. ``faults`` collects a sentence for each fault decision. ``memory`` is
-    the (1,) array of ``cycle.MEMORY`` that the cycle works on, ``row`` the bytes of its latest record.
+    before follows a fault decision; ``port_complaint`` says, as ``; ...``, what stands in the way of frames.
+    ``faults`` collects a sentence for each fault decision. ``memory`` is the (1,) array of ``cycle.MEMORY`` that the
+    cycle works on, ``row`` the bytes of its latest record.
     """
 
     def __init__(
@@ -45,6 +46,7 @@ class Controller:
         gate: GateConfig,
         send: Send,
         discard_unsent: Callable[[], object] = lambda: None,
+        port_complaint: Callable[[], str] = lambda: "",
     ) -> None:
         if bus.can is None:
             raise ValueError(f"bus {bus.name!r} has no [can]: nothing to control over")
@@ -58,6 +60,7 @@ class Controller:
         self.memory = cycling.new_memory(Mode.BOOT)
         self._send = send
         self._discard_unsent = discard_unsent
+        self._port_complaint = port_complaint
         row_at = dict(cycling.MEMORY.fields or {})["row"][1]
         self.row = self.memory.view(np.uint8).data[row_at : row_at + ROW.itemsize]
         self.mode = int(Mode.BOOT)
@@ -97,7 +100,7 @@ class Controller:
         if self._blocked:
             raise StartUpError(self.faults[-1])
         if driver.state is DriverState.FAILED:
-            raise StartUpError(f"{driver.failure}{self._others.complaint}")
+            raise StartUpError(f"{driver.failure}{self._complaints}")
         if driver.state is DriverState.CONFIGURING and self.mode == Mode.BOOT:
             self._apply(Event.NODE_FOUND)
         if driver.state is not DriverState.OPERATIONAL:
@@ -214,7 +217,7 @@ class Controller:
             self.send(frame, t_us)
         if driver.state is DriverState.FAILED and self._restarting:
             self._restarting = False
-            self.faults.append(f"start-up after a clear: {driver.failure}")
+            self.faults.append(f"start-up after a clear: {driver.failure}{self._complaints}")
             self._event = int(Event.NODE_LOST)
         elif driver.state is DriverState.CONFIGURING or (
             driver.state is DriverState.OPERATIONAL and self.mode == Mode.BOOT  # found and configured within one tick
@@ -238,7 +241,11 @@ class Controller:
             reason = explain(int(row["trips"]))
             emergencies = "".join(f"\n{e.told_at(self._begun_us)}." for e in self.driver.emergencies)
             detail = "".join(f" [{words}]" for words in (self.driver.failure, self.driver.foreign) if words)
-            self.faults.append(f"at {row['t_us'] * 1e-6:.4f} s: {reason}{detail}{emergencies}{self._others.complaint}")
+            self.faults.append(f"at {row['t_us'] * 1e-6:.4f} s: {reason}{detail}{emergencies}{self._complaints}")
+
+    @property
+    def _complaints(self) -> str:
+        return f"{self._others.complaint}{self._port_complaint()}"
 
 
 def _require_rows(reference: NDArray[np.void]) -> None:

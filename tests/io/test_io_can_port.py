@@ -257,6 +257,27 @@ def test_a_frame_that_is_refused_is_told_with_what_to_do(error, words):
         assert "\n" not in port.refusal
 
 
+def test_what_stands_in_the_way_is_told_while_it_does():
+    """An interface that is down and up again; a chip that is off the bus, as its error frames say, and restarted."""
+    with can.Bus(interface="virtual", channel="way") as bus, can.Bus(interface="virtual", channel="way") as other:
+        clock = WallClock()
+        port = CanPort(bus, clock)
+        usual = bus.send
+        assert port.complaint == ""
+        bus.send = Refusing(can.CanOperationError("Network is down", errno.ENETDOWN)).send
+        assert not port.send(Frame(0x80, b""))
+        assert port.complaint.startswith("; the interface refuses frames (Network is down")
+        assert port.complaint.endswith("; it is down: ip link set ... up)")
+        bus.send = usual
+        assert port.send(Frame(0x80, b""))
+        assert (port.complaint, port.refused) == ("", 1)
+        for kind, is_off in ((0x04, False), (0x40, True), (0x100, False), (0x44, True)):
+            other.send(can.Message(arbitration_id=kind, data=bytes(8), is_error_frame=True, is_extended_id=False))
+            assert port.receive(clock.now_us + 100_000).is_error
+            assert port.complaint.startswith("; the interface is off the bus") == is_off
+            assert port.complaint == "" or is_off
+
+
 def test_what_cannot_carry_fd_frames_is_refused_as_such(tmp_path):
     with pytest.raises(ConfigError, match=r"carries no FD frames.*fd = false"):
         open_bus(config(channel=f"{tmp_path}/bus", options={"fd": False}), "mine")

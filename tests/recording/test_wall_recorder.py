@@ -186,6 +186,7 @@ def test_after_warm_up_nothing_grows(tmp_path, folder):
             recorder = Watched(folder, metadata(), "bus")
             with Ending() as ending:
                 rig = WallRig(setup, recorder, ending)
+                rig.start()
                 tracemalloc.start()
                 try:
                     rig.run()
