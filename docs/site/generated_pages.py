@@ -43,11 +43,15 @@ MODELS: dict[str, type[BaseModel]] = {
 API: dict[str, tuple[str, ...]] = {
     "Runs and studies: the package `hil`": tuple(f"{home}.{name}" for name, home in hil._HOME.items()),
     "One device": ("pkxyz_ctrl.stage.Stage", "pkxyz_ctrl.stage.StageDomainError"),
+    "A stage in operation": (
+        "pkxyz_ctrl.client.plain.connect", "pkxyz_ctrl.client.plain.Stage", "pkxyz_ctrl.client.stage.connect_async",
+        "pkxyz_ctrl.client.reply",
+    ),
     "Trajectories": ("pkxyz_ctrl.trajectory.Trajectory", "pkxyz_ctrl.trajectory.check.check_against"),
     "Configuration files": ("pkxyz_ctrl.config.files.load", "pkxyz_ctrl.config.files.parse"),
     "A law of one's own": ("pkxyz_ctrl.design.laws.chosen_law.with_law",),
     "A recording": ("hil.recording.recording.Recording",),
-}
+}  # fmt: skip
 """What a program may rely on, by task."""
 
 _UNITS = {

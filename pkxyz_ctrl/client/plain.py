@@ -1,18 +1,30 @@
 """A stage in operation, for programs without asyncio: ``AsyncStage``, each call waiting for its end."""
 
 import asyncio
+import functools
 import threading
-from collections.abc import Coroutine, Iterator, Mapping, Sequence
+from collections.abc import Callable, Coroutine, Iterator
 from types import TracebackType
-from typing import Any, Self, TypeVar
+from typing import Any, Concatenate, ParamSpec, Self, TypeVar
 
 from pkxyz_ctrl.client import place
 from pkxyz_ctrl.client.protocol import Block
-from pkxyz_ctrl.client.reply import Command, Status
-from pkxyz_ctrl.client.stage import AsyncStage, Axis, connect_async
-from pkxyz_ctrl.client.trigger import Trigger
+from pkxyz_ctrl.client.reply import Status
+from pkxyz_ctrl.client.stage import AsyncStage, connect_async
 
+P = ParamSpec("P")
 T = TypeVar("T")
+
+
+def _waited(verb: Callable[Concatenate[AsyncStage, P], Coroutine[Any, Any, T]]) -> Callable[Concatenate["Stage", P], T]:
+    """A method of ``Stage`` from one of ``AsyncStage``: the same arguments and words, and its end is waited for."""
+
+    @functools.wraps(verb)
+    def waiting(stage: "Stage", /, *args: P.args, **kwargs: P.kwargs) -> T:
+        return stage._now(verb(stage._stage, *args, **kwargs))
+
+    waiting.__module__, waiting.__qualname__ = __name__, f"Stage.{verb.__name__}"
+    return waiting
 
 
 class Stage:
@@ -47,137 +59,27 @@ class Stage:
         finally:
             self._end()
 
-    def home(self) -> Command:
-        """Average the sense offsets at rest, at 0 V."""
-        return self._now(self._stage.home())
-
-    def enable(self) -> Command:
-        """Close the loop; the stage then holds its rest pose."""
-        return self._now(self._stage.enable())
-
-    def disable(self) -> Command:
-        """Open the loop: 0 V."""
-        return self._now(self._stage.disable())
-
-    def move_to(
-        self,
-        x: float | None = None,
-        y: float | None = None,
-        z: float | None = None,
-        *,
-        velocity_m_per_s: float | None = None,
-        acceleration_m_per_s2: float | None = None,
-        jerk_m_per_s3: float | None = None,
-        wait: bool = True,
-    ) -> Command:
-        """Go to a point, in m; axes left out keep their target. A move in flight takes the new target up.
-
-        ``wait``: until the stage is in position, else until the move has begun. Raises ``RefusedError`` for what the
-        combs can't hold, before anything moves.
-        """
-        return self._now(
-            self._stage.move_to(
-                x, y, z, velocity_m_per_s=velocity_m_per_s, acceleration_m_per_s2=acceleration_m_per_s2,
-                jerk_m_per_s3=jerk_m_per_s3, wait=wait,
-            )
-        )  # fmt: skip
-
-    def move_by(
-        self,
-        x: float | None = None,
-        y: float | None = None,
-        z: float | None = None,
-        *,
-        velocity_m_per_s: float | None = None,
-        acceleration_m_per_s2: float | None = None,
-        jerk_m_per_s3: float | None = None,
-        wait: bool = True,
-    ) -> Command:
-        """Go by a way, in m, from the present target."""
-        return self._now(
-            self._stage.move_by(
-                x, y, z, velocity_m_per_s=velocity_m_per_s, acceleration_m_per_s2=acceleration_m_per_s2,
-                jerk_m_per_s3=jerk_m_per_s3, wait=wait,
-            )
-        )  # fmt: skip
-
-    def jog(self, axis: Axis, direction: float, seconds: float, *, velocity_m_per_s: float) -> Command:
-        """Go along an axis for a time, as long as this program says so again and again."""
-        return self._now(self._stage.jog(axis, direction, seconds, velocity_m_per_s=velocity_m_per_s))
-
-    def follow(
-        self,
-        scenario: str | None = None,
-        *,
-        segments: Sequence[Mapping[str, Any]] | None = None,
-        table_csv: str | None = None,
-        velocity_m_per_s: float = 0.5e-3,
-        acceleration_m_per_s2: float = 0.5,
-        jerk_m_per_s3: float = 300.0,
-        wait: bool = True,
-    ) -> Command:
-        """Follow the path of a shipped scenario, of segments as in a scenario file, or of a table (the text of a CSV
-        file, whose limits are the three below). The stage goes to its first point before.
-        """
-        return self._now(
-            self._stage.follow(
-                scenario, segments=segments, table_csv=table_csv, velocity_m_per_s=velocity_m_per_s,
-                acceleration_m_per_s2=acceleration_m_per_s2, jerk_m_per_s3=jerk_m_per_s3, wait=wait,
-            )
-        )  # fmt: skip
-
-    def pause(self) -> Command:
-        """Stop on the path, without leaving it."""
-        return self._now(self._stage.pause())
-
-    def resume(self) -> Command:
-        """Go on along the path."""
-        return self._now(self._stage.resume())
-
-    def abort(self) -> Command:
-        """End what runs: stop on the path, then hold."""
-        return self._now(self._stage.abort())
-
-    def stop(self) -> Command:
-        """Stop by the shortest way and hold. Needs no control."""
-        return self._now(self._stage.stop())
-
-    def release(self) -> Command:
-        """0 V at once, whatever runs; a fault that has to be cleared. Needs no control."""
-        return self._now(self._stage.release())
-
-    def park(self) -> Command:
-        """Go to the rest pose, then 0 V."""
-        return self._now(self._stage.park())
-
-    def clear(self) -> Command:
-        """Forget the fault and start the amplifier again."""
-        return self._now(self._stage.clear())
-
-    def auto_zero(self) -> Command:
-        """Park, home, and go back."""
-        return self._now(self._stage.auto_zero())
-
-    def settle_window(self, window_m: float, dwell_s: float) -> Command:
-        """In position is: each axis within ``window_m`` of its target for ``dwell_s``."""
-        return self._now(self._stage.settle_window(window_m, dwell_s))
-
-    def limits(self, *, velocity_m_per_s: float, acceleration_m_per_s2: float, jerk_m_per_s3: float) -> Command:
-        """Of moves that name none, for each axis."""
-        return self._now(
-            self._stage.limits(
-                velocity_m_per_s=velocity_m_per_s, acceleration_m_per_s2=acceleration_m_per_s2,
-                jerk_m_per_s3=jerk_m_per_s3,
-            )
-        )  # fmt: skip
-
-    def take_control(self) -> Command:
-        """Be the one who may move the stage. Raises ``RefusedError`` while another is."""
-        return self._now(self._stage.take_control())
-
-    def give_control(self) -> Command:
-        """Let another have it."""
-        return self._now(self._stage.give_control())
+    home = _waited(AsyncStage.home)
+    enable = _waited(AsyncStage.enable)
+    disable = _waited(AsyncStage.disable)
+    move_to = _waited(AsyncStage.move_to)
+    move_by = _waited(AsyncStage.move_by)
+    jog = _waited(AsyncStage.jog)
+    follow = _waited(AsyncStage.follow)
+    pause = _waited(AsyncStage.pause)
+    resume = _waited(AsyncStage.resume)
+    abort = _waited(AsyncStage.abort)
+    stop = _waited(AsyncStage.stop)
+    release = _waited(AsyncStage.release)
+    park = _waited(AsyncStage.park)
+    clear = _waited(AsyncStage.clear)
+    auto_zero = _waited(AsyncStage.auto_zero)
+    settle_window = _waited(AsyncStage.settle_window)
+    limits = _waited(AsyncStage.limits)
+    take_control = _waited(AsyncStage.take_control)
+    give_control = _waited(AsyncStage.give_control)
+    wait_in_position = _waited(AsyncStage.wait_in_position)
+    capture = _waited(AsyncStage.capture)
 
     @property
     def status(self) -> Status:
@@ -189,10 +91,6 @@ class Stage:
         """What the loop says of itself: stage, controller, bus, period_us, limits, middle_m, ..."""
         return self._stage.description
 
-    def wait_in_position(self, timeout_s: float = 10.0) -> Status:
-        """Until the stage is in position. Raises ``StageError`` after ``timeout_s``."""
-        return self._now(self._stage.wait_in_position(timeout_s))
-
     def telemetry(self, *fields: str) -> Iterator[Block]:
         """Blocks of rows as they come, every tick of them: fields such as "reference_m", "estimate_m", "voltage_v"."""
         blocks = self._stage.telemetry(*fields)
@@ -201,18 +99,6 @@ class Stage:
                 yield self._now(_next(blocks))
         finally:
             self._now(_closed(blocks))
-
-    def capture(
-        self, *fields: str, seconds: float, trigger: Trigger | None = None, before_s: float = 0.0,
-        timeout_s: float = 60.0,
-    ) -> Block:  # fmt: skip
-        """Rows of so many seconds, without a gap; with a trigger, from ``before_s`` before it.
-
-        Raises ``StageError`` where rows were lost or the trigger did not come in ``timeout_s``.
-        """
-        return self._now(
-            self._stage.capture(*fields, seconds=seconds, trigger=trigger, before_s=before_s, timeout_s=timeout_s)
-        )
 
     def _now(self, doing: Coroutine[Any, Any, T]) -> T:
         future = asyncio.run_coroutine_threadsafe(doing, self._loop)

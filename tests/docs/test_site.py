@@ -1,5 +1,7 @@
 """The documentation's site: it builds without a warning, offline, and no page loads or names another host."""
 
+import html
+import inspect
 import re
 from html.parser import HTMLParser
 from pathlib import Path
@@ -13,6 +15,7 @@ from mkdocs.config import load_config
 
 from hil.conformance.run import CHECKS
 from pkxyz_ctrl.can.emergency import _EXACT
+from pkxyz_ctrl.client.plain import Stage
 from pkxyz_ctrl.loop.row import ROW, columns
 from pkxyz_ctrl.safety.trips import Trip
 
@@ -93,6 +96,16 @@ def test_every_column_is_on_the_page_with_its_meaning(site: Path) -> None:
     text = (site / "lookup" / "recording.html").read_text(encoding="utf-8")
     for field in meanings:
         assert all(f"<code>{column}</code>" in text for column in columns(field))
+
+
+def test_the_verbs_of_a_stage_in_operation_are_on_the_page_with_arguments_and_words(site: Path) -> None:
+    text = (site / "lookup" / "api.html").read_text(encoding="utf-8")
+    for verb, function in inspect.getmembers(Stage, inspect.isfunction):
+        if not verb.startswith("_"):
+            _, _, section = text.partition(f'id="pkxyz_ctrl.client.plain.Stage.{verb}"')
+            words = html.unescape(re.sub(r"<[^>]+>", "", section[:9000])).split()
+            wanted = [*inspect.signature(function).parameters][1:] + (inspect.getdoc(function) or "").split()[:4]
+            assert all(any(word.strip("`") in said for said in words) for word in wanted), verb
 
 
 @pytest.mark.parametrize("name", sorted(reference_tables.BUILT))
