@@ -10,14 +10,15 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import partial
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any, NamedTuple, Self
+from typing import TYPE_CHECKING, Annotated, Any, NamedTuple
 
-from pydantic import BaseModel, Field, field_validator, model_validator
+from pydantic import BaseModel, Field, field_validator
 
 from hil.faults.fault import Fault
 from hil.runs.correction import belongs, stored_for
 from hil.runs.metrics import METRICS
 from pkxyz_ctrl.config import files as config
+from pkxyz_ctrl.config.bound import Bound
 from pkxyz_ctrl.config.bus import BusConfig
 from pkxyz_ctrl.config.controller import ControllerConfig
 from pkxyz_ctrl.config.files import ConfigError, FrozenModel
@@ -41,21 +42,6 @@ LEARNT_FROM = "learnt_from.json"
 
 
 _PARTS = ("stage", "plant", "controller", "bus")
-
-
-class Bound(FrozenModel):
-    """Where a metric has to lie, ends included. Two-sided bounds also catch an improvement that nobody can explain."""
-
-    min: float | None = None
-    max: float | None = None
-
-    @model_validator(mode="after")
-    def _bounds_something(self) -> Self:
-        if self.min is None and self.max is None:
-            raise ValueError("give max, min or both")
-        if self.min is not None and self.max is not None and self.min > self.max:
-            raise ValueError(f"min {self.min:g} is above max {self.max:g}, so no value could pass")
-        return self
 
 
 class ScenarioConfig(FrozenModel):

@@ -14,6 +14,7 @@ from typing import Annotated, Literal, Self
 
 from pydantic import Field, model_validator
 
+from pkxyz_ctrl.config.bound import Bound
 from pkxyz_ctrl.config.files import FrozenModel, Name
 
 Positive = Annotated[float, Field(gt=0)]
@@ -106,21 +107,6 @@ class MadeOfConfig(FrozenModel):
         total = self.mass_layer_1 + self.mass_handle + self.mass_layer_2
         if abs(total - 1.0) > 1e-9:
             raise ValueError(f"mass_layer_1 + mass_handle + mass_layer_2 must be 1, not {total:g}")
-        return self
-
-
-class Bound(FrozenModel):
-    """Where a figure has to lie, ends included."""
-
-    min: float | None = None
-    max: float | None = None
-
-    @model_validator(mode="after")
-    def _bounds_something(self) -> Self:
-        if self.min is None and self.max is None:
-            raise ValueError("give max, min or both")
-        if self.min is not None and self.max is not None and self.min > self.max:
-            raise ValueError(f"min {self.min:g} is above max {self.max:g}, so no device could pass")
         return self
 
 

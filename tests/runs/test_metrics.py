@@ -9,7 +9,7 @@ from hypothesis import strategies as st
 from synthetic_rows import START_TICKS, default_scenario, tracking_rows
 
 from hil.runs.metrics import METRICS, Metrics, evaluate
-from hil.runs.scenario import Bound
+from pkxyz_ctrl.config.bound import Bound
 from pkxyz_ctrl.safety.modes import Mode
 
 PERIOD_US = 200

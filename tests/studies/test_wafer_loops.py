@@ -13,8 +13,8 @@ from hil.runs.scenario import load_scenario
 from hil.studies.margins.loop import Loop
 from hil.studies.wafer.closed_loop import PART_DEVICES, ClosedLoops, Truth
 from hil.studies.wafer.study import WaferStudy
+from pkxyz_ctrl.config.bound import Bound
 from pkxyz_ctrl.config.files import ConfigError
-from pkxyz_ctrl.fabrication.process import Bound
 from pkxyz_ctrl.fabrication.statics import pose, pose_of_strokes
 from pkxyz_ctrl.fabrication.wafer import dies_per_wafer
 from pkxyz_ctrl.stage import Stage

@@ -11,9 +11,10 @@ from hil.studies.wafer.causes import PLACE, causes
 from hil.studies.wafer.shares import share_of
 from hil.studies.wafer.study import PART_WAFERS, WaferStudy, parts_for, run_study
 from hil.studies.wafer.table import Table
+from pkxyz_ctrl.config.bound import Bound
 from pkxyz_ctrl.config.calibration import Calibration
 from pkxyz_ctrl.config.files import ConfigError
-from pkxyz_ctrl.fabrication.process import Bound, Spread
+from pkxyz_ctrl.fabrication.process import Spread
 from pkxyz_ctrl.fabrication.wafer import dies_per_wafer
 
 PART = PART_WAFERS * dies_per_wafer(SHIPPED)
