@@ -26,6 +26,9 @@ from pkxyz_ctrl.loop.runtime import Reference, run, start
 from pkxyz_ctrl.safety.gate import GateConfig
 from pkxyz_ctrl.safety.modes import Mode
 
+COMPANY_S = 30.0
+"""For which an empty bus is given time."""
+_LOOK_S = 0.02
 _GUARDS_PER_PERIOD = 8
 _SILENT_US = 500_000  # after a fault, for so long without its heartbeat, the amplifier is gone
 _NO_END = 1 << 60  # ticks
@@ -136,6 +139,17 @@ class WallRig:
     def dropped_frames(self) -> int | None:
         """Frames that a bus among processes lost because a receiver stood still; None on other buses."""
         return self._bus.dropped if isinstance(self._bus, UnixBus) else None
+
+    def wait_for_others(self, say: Callable[[str], object], company_s: float = COMPANY_S) -> None:
+        """Until somebody else is on the bus, where that is known: a plant that was started in the same moment takes
+        some seconds until it is there. Raises ``Ended``.
+        """
+        end_s = time.monotonic() + company_s
+        if self.others == 0:
+            say(f"nobody else is on the bus yet: waiting {company_s:g} s for an amplifier, such as `pkxyz plant`")
+        while self.others == 0 and time.monotonic() < end_s:
+            self._ending.check()
+            time.sleep(_LOOK_S)
 
     def start(self, say: Callable[[str], object] = lambda words: None) -> None:
         """Start the amplifier; ``say`` is told which protections are lacking. Raises ``StartUpError`` and ``Ended``."""

@@ -4,7 +4,6 @@ Commands and telemetry cross in shared memory; whatever becomes of those at its 
 """
 
 import os
-import time
 from collections.abc import Callable
 
 import numpy as np
@@ -31,7 +30,6 @@ from pkxyz_ctrl.trajectory.check import DriveLimits
 KEPT_S = 60.0
 """Of telemetry that stays in the memory."""
 _COMMANDS_A_TICK = 4
-_COMPANY_S, _LOOK_S = 30.0, 0.02
 
 
 class _Counted:
@@ -113,7 +111,7 @@ def operate(setup: Setup, settings: Settings, name: str, files: dict[str, str], 
         memory = StageMemory.made(name, round(KEPT_S / setup.bus.period_s))
         try:
             session = _session_of(setup, settings, rig, memory)
-            _wait_for_others(rig, say, ending)
+            rig.wait_for_others(say)
             place.write(name, "loop", _description(setup, settings, memory, files))
             say(go_real_time())
             settle_memory()
@@ -158,15 +156,6 @@ def rehearse(reach: Reach, settings: Settings) -> None:
         step()
         for row in range(setpoints.row + 1, setpoints.row + 100):
             setpoints.advance(row)
-
-
-def _wait_for_others(rig: WallRig, say: Callable[[str], object], ending: Ending) -> None:
-    end_s = time.monotonic() + _COMPANY_S
-    if rig.others == 0:
-        say(f"nobody else is on the bus yet: waiting {_COMPANY_S:g} s for the amplifier")
-    while rig.others == 0 and time.monotonic() < end_s:
-        ending.check()
-        time.sleep(_LOOK_S)
 
 
 def _description(setup: Setup, settings: Settings, memory: StageMemory, files: dict[str, str]) -> dict[str, object]:

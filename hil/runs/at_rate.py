@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 
 from hil.lanes.ending import Ended, Ending
 from hil.lanes.lane import Lane
-from hil.lanes.wall import AmplifierGoneError, WallRig, require_real_bus
+from hil.lanes.wall import COMPANY_S, AmplifierGoneError, WallRig, require_real_bus
 from hil.recording.recording import Recording
 from hil.recording.wall_recorder import WallRecorder, Watch
 from hil.runs.metrics import Metrics, RowFigures
@@ -23,7 +23,6 @@ from pkxyz_ctrl.io.clocks import percentile_us
 from pkxyz_ctrl.io.realtime import go_real_time, leave_real_time, settle_memory
 from pkxyz_ctrl.learning import Learner
 
-COMPANY_S, _LOOK_S = 30.0, 0.05
 _COME_BACK = {
     False: "start `pkxyz plant` again, then this",
     True: "check its power and the cable, then start this again",
@@ -91,7 +90,7 @@ def _run_into(
         channel = can_config.channel
         recorder = WallRecorder(folder.recording, folder.frames, begun.metadata, channel, watch)
         try:
-            _run(WallRig(setup, recorder, ending), watched, say, ending, company_s)
+            _run(WallRig(setup, recorder, ending), watched, say, company_s)
         except Ended as end:
             watched.ended_by = end.signal_number
         finally:
@@ -117,10 +116,10 @@ def _run_into(
     return RanAtRate(summary, watched.ended_by, late)
 
 
-def _run(rig: WallRig, watched: _Watched, say: Callable[[str], object], ending: Ending, company_s: float) -> None:
+def _run(rig: WallRig, watched: _Watched, say: Callable[[str], object], company_s: float) -> None:
     begin_s = time.monotonic()
     try:
-        _wait_for_others(rig, say, ending, company_s)
+        rig.wait_for_others(say, company_s)
         say(go_real_time())
         settle_memory()
         begin_s = time.monotonic()
@@ -144,16 +143,6 @@ def _run(rig: WallRig, watched: _Watched, say: Callable[[str], object], ending: 
             watched.blocked_frames = rig.controller.gate.blocked_frames
             watched.adaptation = rig.controller.memory["tick"]["adaptation"].copy()
             watched.learner = rig.live.learner if rig.live is not None else None
-
-
-def _wait_for_others(rig: WallRig, say: Callable[[str], object], ending: Ending, company_s: float) -> None:
-    """A plant that was started in the same moment takes some seconds until it is there."""
-    end_s = time.monotonic() + company_s
-    if rig.others == 0:
-        say(f"nobody else is on the bus yet: waiting {company_s:g} s for `pkxyz plant` in another process")
-    while rig.others == 0 and time.monotonic() < end_s:
-        ending.check()
-        time.sleep(_LOOK_S)
 
 
 def _figures(recording: Recording, metrics: Metrics) -> RowFigures:
