@@ -1,6 +1,7 @@
 """``pkxyz serve``: amplifier and plant, loop and server, each a process of its own, started and ended together."""
 
 import asyncio
+import contextlib
 import os
 import secrets
 import signal
@@ -8,7 +9,7 @@ import socket
 import subprocess
 import sys
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Generator
 from dataclasses import dataclass
 
 import tomlkit
@@ -76,6 +77,7 @@ class _Children:
 
 def serve(served: Served, tell: Callable[[str], object]) -> int:
     """Serve until SIGINT or SIGTERM; ``tell`` is told where. Returns an exit code. Raises ``ConfigError``."""
+    signal.signal(signal.SIGTERM, signal.default_int_handler)  # while it starts, too, nothing is left behind
     children = _Children()
     is_new = place.read(served.name, "loop") is None
     if place.read(served.name, "server") is not None:
@@ -98,34 +100,45 @@ def serve(served: Served, tell: Callable[[str], object]) -> int:
             ws_max_queue=8, ws_ping_interval=10, ws_ping_timeout=10, limit_concurrency=128,
             timeout_graceful_shutdown=1, lifespan="on",
         )  # fmt: skip
-        server = uvicorn.Server(config)
-        return _run(server, bound, children, is_new)
+        server = _Server(config)
+        return _run(server, bound, children)
+    except KeyboardInterrupt:
+        return 0
     finally:
         place.forget(served.name, "server")
         children.end()
         if not is_new:
             _end_loop(served.name)
+        place.forget(served.name, "plant")
         bound.close()
 
 
-def _run(server: uvicorn.Server, bound: socket.socket, children: _Children, is_new: bool) -> int:
+class _Server(uvicorn.Server):
+    """Signals end it through ``should_exit`` alone: uvicorn's own would be raised anew inside its task."""
+
+    @contextlib.contextmanager
+    def capture_signals(self) -> Generator[None, None, None]:
+        """Nothing is captured: ``_run`` does."""
+        yield
+
+
+def _run(server: uvicorn.Server, bound: socket.socket, children: _Children) -> int:
     async def main() -> str | None:
+        def end() -> None:
+            server.should_exit = True
+
+        for number in (signal.SIGINT, signal.SIGTERM):
+            asyncio.get_running_loop().add_signal_handler(number, end)
         serving = asyncio.create_task(server.serve([bound]))
         ended = None
-        while not serving.done():
-            ended = children.ended
-            if ended is not None:
-                server.should_exit = True
-                await serving
-                break
+        while not serving.done() and ended is None:
             await asyncio.sleep(0.1)
+            ended = children.ended
+        server.should_exit = True
+        await serving
         return ended
 
-    signal.signal(signal.SIGTERM, signal.default_int_handler)  # uvicorn raises anew what ended it, and we tidy up
-    try:
-        ended = asyncio.run(main())
-    except KeyboardInterrupt:
-        return 0
+    ended = asyncio.run(main())
     if ended is not None:
         print(f"pkxyz: the {ended} has ended by itself; the combs are at 0 V", file=sys.stderr)
         return 1
@@ -165,7 +178,6 @@ def _end_loop(name: str) -> None:
         end_s = time.monotonic() + _ENDS_S
         while place.read(name, kind) is not None and time.monotonic() < end_s:
             time.sleep(0.02)
-    place.forget(name, "plant")
 
 
 def _bound(host: str, port: int) -> socket.socket:

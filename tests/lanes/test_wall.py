@@ -7,7 +7,6 @@ where no tick was missed, times are those of the frames.
 import dataclasses
 import json
 import os
-import re
 import signal
 import subprocess
 import sys
@@ -18,6 +17,7 @@ from pathlib import Path
 import can
 import numpy as np
 import pytest
+from patience import patient_bus, patient_law
 
 from hil.bus.unix_bus import UnixBus
 from hil.commands import run as run_cli
@@ -29,7 +29,7 @@ from hil.lanes.wall_plant import TRUTH
 from hil.recording.recording import Recording
 from hil.recording.wall_recorder import WallRecorder
 from hil.runs.scenario import load_scenario
-from pkxyz_ctrl.config.files import CONFIG_DIR, ConfigError
+from pkxyz_ctrl.config.files import ConfigError
 from pkxyz_ctrl.safety.modes import NODE_EXPECTED, Mode
 
 ROOT = Path(__file__).parents[2]
@@ -67,19 +67,9 @@ jerk_max_m_per_s3 = 1.0
 def bench(tmp_path_factory):
     """A folder with a scenario, a controller that forgives missed ticks, and a patient and an impatient bus."""
     folder = tmp_path_factory.mktemp("wall")
-    law = (CONFIG_DIR / "controllers" / "lqg.toml").read_text(encoding="utf-8")
-    for name in ("stale", "sequence", "innovation", "saturation", "overrun", "slew"):
-        law, found = re.subn(rf"^{name}_count = \d+", f"{name}_count = -1", law, flags=re.MULTILINE)
-        assert found == 1
-    (folder / "patient.toml").write_text(law, encoding="utf-8")
-    bus = (CONFIG_DIR / "buses" / "unix_1k.toml").read_text(encoding="utf-8")
-    bus, found = re.subn(r'channel = "pkxyz"', f'channel = "{folder}/bus"', bus)
-    assert found == 1
-    bus += "node_heartbeat_timeout_ms = 900\nboot_timeout_us = 20_000_000\n"
-    bus += "start_timeout_us = 5_000_000\nsdo_timeout_us = 5_000_000\n"  # a machine that stands still is no silence
-    (folder / "quick.toml").write_text(bus, encoding="utf-8")
-    patient = "controller_heartbeat_timeout_ms = 900\ndrive_timeout_ms = 900\n"
-    (folder / "slow.toml").write_text(bus + patient, encoding="utf-8")
+    patient_law(folder)
+    patient_bus(folder / "quick.toml", is_node_patient=False)
+    patient_bus(folder / "slow.toml")
     for name in ("quick", "slow"):
         (folder / f"on_{name}.toml").write_text(SCENARIO.format(bus=f"{name}.toml"), encoding="utf-8")
     return folder

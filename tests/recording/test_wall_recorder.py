@@ -12,6 +12,7 @@ from pathlib import Path
 import can
 import numpy as np
 import pytest
+from patience import PUNCTUALITY, patient_bus
 
 from hil.bus.frame_log import FrameLog
 from hil.lanes.ending import Ending
@@ -24,7 +25,7 @@ from hil.runs.scenario import load_scenario, resolve
 from hil.studies import latency
 from hil.studies.latency import measure, read_cyclictest
 from pkxyz_ctrl.can.frame import Frame
-from pkxyz_ctrl.config.files import CONFIG_DIR, ConfigError
+from pkxyz_ctrl.config.files import ConfigError
 from pkxyz_ctrl.loop.row import ROW
 from pkxyz_ctrl.safety.modes import Mode
 
@@ -170,11 +171,7 @@ def test_after_warm_up_nothing_grows(tmp_path, folder):
     """Controller, port, bus, clock and recorder, for 3000 ticks under tracemalloc: a reference kept per tick would be
     8 bytes of each, 20 kB.
     """
-    text = (CONFIG_DIR / "buses" / "unix_1k.toml").read_text(encoding="utf-8")
-    text = text.replace('channel = "pkxyz"', f'channel = "{tmp_path}/bus"')
-    bus = tmp_path / "bus.toml"
-    patient = "controller_heartbeat_timeout_ms = 900\nnode_heartbeat_timeout_ms = 900\nsdo_timeout_us = 5_000_000\n"
-    bus.write_text(text + patient, encoding="utf-8")
+    bus = patient_bus(tmp_path / "bus.toml")
     scenario = load_scenario("raster", bus=str(bus))
     scenario.config.__dict__["duration_s"] = 3.0
     setup = scenario.setup()
@@ -202,16 +199,13 @@ def test_after_warm_up_nothing_grows(tmp_path, folder):
     assert Recording.open(folder.recording).ticks == 3000
 
 
-_OF_PUNCTUALITY = ("overrun", "sequence", "innovation", "residual", "unexplained_force")
-
-
 def test_latency_counts_every_tick_and_the_controller_has_really_controlled(monkeypatch):
     """Monitors that a stalled machine sets off are off: how punctual it is, is measured here and not tested."""
     real = latency._setup
 
     def patient(period_us, seconds):
         setup = real(period_us, seconds)
-        counts = {f"{name}_count": -1 for name in _OF_PUNCTUALITY}
+        counts = {f"{name}_count": -1 for name in PUNCTUALITY}
         monitors = setup.controller.monitors.model_copy(update=counts)
         return dataclasses.replace(setup, controller=setup.controller.model_copy(update={"monitors": monitors}))
 

@@ -11,7 +11,6 @@ import faulthandler
 import json
 import multiprocessing
 import os
-import re
 import signal
 import socket
 import struct
@@ -27,6 +26,7 @@ import canopen  # noqa: F401
 import numpy as np
 import pyarrow.parquet  # noqa: F401
 import pytest
+from patience import patient_law, replaced
 
 import hil.commands.check_amplifier
 import hil.commands.run  # noqa: F401  a command is loaded when it is called, which in the guest takes a while
@@ -83,10 +83,9 @@ jerk_max_m_per_s3 = 0.05
 def bench(request):
     """A folder with the scenario, the shipped bus at a slow rate and the shipped law, patient with lateness."""
     folder = Path(tempfile.mkdtemp(prefix=request.param))
-    law = (CONFIG_DIR / "controllers" / "lqg.toml").read_text(encoding="utf-8")
-    for name in ("stale", "sequence", "innovation", "saturation", "overrun"):
-        law = replaced(rf"^{name}_count = \d+", f"{name}_count = -1", law)
-    (folder / "patient.toml").write_text(replaced(r"^slew_max_v_per_s = \S+", "slew_max_v_per_s = 15.0e3", law))
+    law = patient_law(folder)
+    slow = replaced(r"^slew_max_v_per_s = \S+", "slew_max_v_per_s = 15.0e3", law.read_text(encoding="utf-8"))
+    law.write_text(slow, encoding="utf-8")
     bus = (CONFIG_DIR / "buses" / f"{request.param}.toml").read_text(encoding="utf-8")
     for key, value in (("period", PERIOD_US), ("sense_deadline", 8000), ("heartbeat_deadline", 9900)):
         bus = replaced(rf"^{key}_us = \d+", f"{key}_us = {value}", bus)
@@ -100,12 +99,6 @@ def bench(request):
 
 def is_fd(bench):
     return "_fd" in bench.name
-
-
-def replaced(pattern, by, text):
-    text, found = re.subn(pattern, by, text, flags=re.MULTILINE)
-    assert found == 1, pattern
-    return text
 
 
 def without_real_time():
