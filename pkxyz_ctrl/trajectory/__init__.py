@@ -62,8 +62,10 @@ class TimedSegment:
     """where the position jumps, on purpose: the first instants at the new places"""
     highest_hz: float = 0.0
     """of a periodic motion; 0 for others"""
+    source: str | None = None
+    """the file that it was read from, if there is one"""
     source_sha256: str | None = None
-    """digest of the file that it was read from, if there is one"""
+    """its digest"""
     period_s: float | None = None
     """after which the scan repeats itself, if it does"""
 
@@ -106,6 +108,7 @@ class Trajectory:
                     _window(start_us, plan.still_s),
                     tuple(start_us + math.ceil(t * 1e6 - 1e-3) for t in plan.jumps_s),
                     plan.highest_hz,
+                    plan.source,
                     plan.source_sha256,
                     plan.period_s,
                 )

@@ -1,7 +1,7 @@
 """Can the device follow this reference? Asked before anything moves."""
 
 import math
-from typing import NamedTuple
+from typing import Final, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -15,6 +15,25 @@ _STEP_MAX_US = 100
 _SAMPLES_A_PERIOD = 40  # of a periodic motion: between two samples an extreme hides 0.3 % of the amplitude
 _ROUNDING_M = 1e-12  # far below anything measurable; a reference that goes to a limit exactly is allowed
 _ROUNDING_N = 1e-12
+_NEAREST_M = 1e-12
+
+_MOTION = "velocity_max_m_per_s, acceleration_max_m_per_s2 or jerk_max_m_per_s3"
+KEYS: Final[dict[str, tuple[str, str]]] = {
+    "hold": ("", ""),
+    "move": ("to_m", _MOTION),
+    "raster": ("centre_m, line_length_m, line_pitch_m or layer_pitch_m", f"line_rate_hz, {_MOTION}"),
+    "circle": ("radius_m", "radius_m or frequency_hz"),
+    "lissajous": ("amplitude_m", "amplitude_m or frequency_hz"),
+    "rosette": ("radius_m", "radius_m, petal_hz or rotation_hz"),
+    "sine": ("amplitude_m", "amplitude_m or frequency_hz"),
+    "spiral": ("radius_m", "radius_m, speed_m_per_s or frequency_hz"),
+    "steps": ("by_m or count", "by_m or count"),
+    "staircase": ("step_m or steps", _MOTION),
+    "sweep": ("amplitude_m", "amplitude_m, from_hz or to_hz"),
+    "csv": ("the file", _MOTION),
+    "waypoints": ("points_m", f"points_m, {_MOTION}"),
+}
+"""Keys of each kind of segment that mend what could not even be held there, and what is too fast."""
 
 
 class DriveLimits(NamedTuple):
@@ -27,18 +46,34 @@ class DriveLimits(NamedTuple):
 
 
 def check_against(stage: Stage, trajectory: Trajectory, drive: DriveLimits | None = None) -> None:
-    """Raise ``TrajectoryError`` at the first sampled instant that the stage can't follow, naming the limit.
+    """Raise ``TrajectoryError`` at the first segment that the stage can't follow, naming what is worst in it.
 
     Links close, strokes are in range, and the comb forces that hold, brake and accelerate the platform,
     B^-T (grad V + C v + m a), are pulls within the voltage limit. With ``drive`` they are also within the controller's,
     and voltages change by no more than its slew limit from any instant to a period later; announced jumps are left out
-    of that. Looked at every 100 us or closer, 40 times in a period of the highest frequency, and at the very end.
+    of that. Looked at where each segment comes to rest, every 100 us or closer, 40 times in a period of the highest
+    frequency, and at the very end.
     """
-    for segment in trajectory.segments:
+    for n, segment in enumerate(trajectory.segments):
+        place, motion = KEYS[segment.kind]
+        target = np.concatenate([trajectory.sample(segment.t_end_us - 1, 1, 1)[0, 0:3], np.zeros(6)])
+        if (found := _worst_of(stage, target[None], _limit_v(stage, drive))) is not None:
+            raise _refusal(trajectory, n, f"at its target {_um(target[0:3])} {found.why}", place)
         step_us = _step_us(segment, drive)
-        first, last = segment.t_start_us // step_us, -(-segment.t_end_us // step_us)
-        for begin in range(first, last + 1, _CHUNK):
-            _check_samples(stage, trajectory, drive, begin, min(_CHUNK, last + 1 - begin), step_us)
+        first, last = segment.t_start_us // step_us, (segment.t_end_us - 1) // step_us
+        if n == len(trajectory.segments) - 1:
+            last += 1
+        chunks = (
+            _worst_sampled(stage, trajectory, drive, begin, min(_CHUNK, last + 1 - begin), step_us)
+            for begin in range(first, last + 1, _CHUNK)
+        )
+        if beyond := [found for found in chunks if found is not None]:
+            worst = max(beyond, key=lambda found: (found.kind, found.excess))
+            still = np.concatenate([worst.position_m, np.zeros(6)])
+            stands = _worst_of(stage, still[None], _limit_v(stage, drive)) is None
+            raise _refusal(
+                trajectory, n, f"on its way, at {_um(worst.position_m)}, {worst.why}", motion if stands else place
+            )
 
 
 def _step_us(segment: TimedSegment, drive: DriveLimits | None) -> int:
@@ -49,28 +84,22 @@ def _step_us(segment: TimedSegment, drive: DriveLimits | None) -> int:
     return max(n for n in range(1, closest + 1) if drive.period_us % n == 0)
 
 
-def _check_samples(
+def _limit_v(stage: Stage, drive: DriveLimits | None) -> float:
+    return min(stage.voltage_max_v, drive.voltage_max_v) if drive else stage.voltage_max_v
+
+
+def _worst_sampled(
     stage: Stage, trajectory: Trajectory, drive: DriveLimits | None, first: int, count: int, step_us: int
-) -> None:
+) -> "_Beyond | None":
+    """What is worst at so many instants from ``first`` on, and in the periods that end there."""
     lag = drive.period_us // step_us if drive else 0
     rows = trajectory.sample(first - lag, count + lag, step_us)
-    t_us = (first - lag + np.arange(len(rows))) * step_us
     new = np.append(True, (rows[1:] != rows[:-1]).any(axis=1))  # holds cost nothing
-    which = np.cumsum(new) - 1
-    distinct, distinct_us = rows[new], t_us[new]
-    outside = _first_outside(stage, distinct[:, 0:3])
-    inside = distinct if outside is None else distinct[: outside[0]]
-    force = comb_forces(stage, inside)
-    limit_v = min(stage.voltage_max_v, drive.voltage_max_v) if drive else stage.voltage_max_v
-    refusals = [
-        _first_beyond(stage, inside, distinct_us, force, limit_v),
-        None if outside is None else (int(distinct_us[outside[0]]), distinct[outside[0], 0:3], outside[1]),
-        None if drive is None else _first_too_fast(stage, trajectory, drive, rows, t_us, force, which, lag),
-    ]
-    found = [refusal for refusal in refusals if refusal is not None]
-    if found:
-        t_first_us, position_m, why = min(found, key=lambda refusal: refusal[0])
-        raise _refusal(trajectory, t_first_us, position_m, why)
+    found = _worst_of(stage, rows[new], _limit_v(stage, drive))
+    if found is not None or drive is None:
+        return found
+    t_us = (first - lag + np.arange(len(rows))) * step_us
+    return _too_fast(stage, trajectory, drive, rows, t_us, comb_forces(stage, rows[new])[np.cumsum(new) - 1], lag)
 
 
 def comb_forces(stage: Stage, rows: Array) -> Array:
@@ -87,17 +116,53 @@ def comb_forces(stage: Stage, rows: Array) -> Array:
 
 def within_limits(stage: Stage, rows: Array, drive: DriveLimits) -> bool:
     """Whether rows (n, 9), a period of the drive apart, keep strokes, pulls, voltages and slew within the limits."""
-    if _first_outside(stage, rows[:, 0:3]) is not None:
+    if _worst_of(stage, rows, _limit_v(stage, drive)) is not None:
         return False
     force = comb_forces(stage, rows)
-    limit_v = min(stage.voltage_max_v, drive.voltage_max_v)
-    if _first_beyond(stage, rows, np.zeros(len(rows), np.int64), force, limit_v) is not None:
-        return False
     change_v = np.abs(np.diff(np.sqrt(np.maximum(force, 0.0) / stage.force_gain_n_per_v2), axis=0))
     return bool((change_v <= drive.slew_max_v_per_s * drive.period_us * 1e-6).all())
 
 
-_Refusal = tuple[int, Array, str]
+_SLEW, _FORCE, _STROKE, _LINKS = range(4)  # what is named first is last
+
+
+class _Beyond(NamedTuple):
+    """What passes a limit, and where. ``excess`` is comparable within a kind."""
+
+    kind: int
+    excess: float
+    position_m: Array
+    why: str
+
+
+def _worst_of(stage: Stage, rows: Array, limit_v: float) -> _Beyond | None:
+    """What is worst in rows (n, 9) by themselves: links, then strokes, then comb forces."""
+    position = rows[:, 0:3]
+    if (outside := _first_outside(stage, position)) is not None:
+        return _Beyond(_LINKS, 0.0, position[outside[0]], outside[1])
+    limits, strokes = stage.config.limits, stage.inverse_kinematics(position)
+    over = np.maximum(limits.stroke_min_m - strokes, strokes - limits.stroke_max_m)
+    n, comb = _place_of_most(over)
+    if over[n, comb] > _ROUNDING_M:
+        low, high = limits.stroke_min_m * 1e6, limits.stroke_max_m * 1e6
+        why = f"stroke {comb + 1} would be {strokes[n, comb] * 1e6:.4g} um, outside {low:g} to {high:g} um"
+        return _Beyond(_STROKE, float(over[n, comb]), position[n], why)
+    force = comb_forces(stage, rows)
+    over = np.maximum(-force - _ROUNDING_N, force - stage.force_gain_n_per_v2 * limit_v**2)
+    n, comb = _place_of_most(over)
+    if not over[n, comb] > 0.0:
+        return None
+    pull_n = force[n, comb]
+    why = f"comb {comb + 1} would have to push with {-pull_n * 1e6:.4g} uN, and combs only pull"
+    if pull_n > 0.0:
+        voltage_v = float(np.sqrt(pull_n / stage.force_gain_n_per_v2[comb]))
+        why = f"comb {comb + 1} would need {voltage_v:.1f} V, beyond the limit of {limit_v:g} V"
+    return _Beyond(_FORCE, float(over[n, comb]), position[n], why)
+
+
+def _place_of_most(values: Array) -> tuple[int, int]:
+    n, comb = np.unravel_index(int(np.argmax(values)), values.shape)
+    return int(n), int(comb)
 
 
 def _first_outside(stage: Stage, position_m: Array) -> tuple[int, str] | None:
@@ -113,67 +178,41 @@ def _first_outside(stage: Stage, position_m: Array) -> tuple[int, str] | None:
     return None
 
 
-def _first_beyond(
-    stage: Stage, rows: Array, t_us: NDArray[np.integer], force: Array, limit_v: float
-) -> _Refusal | None:
-    """The first instant at which a stroke or a comb force passes a limit."""
-    limits = stage.config.limits
-    strokes = stage.inverse_kinematics(rows[:, 0:3])
-    force_max_n = stage.force_gain_n_per_v2 * limit_v**2
-    low, high = limits.stroke_min_m - _ROUNDING_M, limits.stroke_max_m + _ROUNDING_M
-    broken = (strokes < low) | (strokes > high) | (force < -_ROUNDING_N) | (force > force_max_n)
-    if not broken.any():
-        return None
-    n, comb = (int(i) for i in np.argwhere(broken)[0])
-    stroke_um, pull_n = strokes[n, comb] * 1e6, force[n, comb]
-    if not low <= strokes[n, comb] <= high:
-        why = (
-            f"stroke {comb + 1} would be {stroke_um:.4g} um, outside {limits.stroke_min_m * 1e6:g} to "
-            f"{limits.stroke_max_m * 1e6:g} um"
-        )
-    elif pull_n < 0:
-        why = f"comb {comb + 1} would have to push with {-pull_n * 1e6:.4g} uN, and combs only pull"
-    else:
-        voltage_v = float(np.sqrt(pull_n / stage.force_gain_n_per_v2[comb]))
-        why = f"comb {comb + 1} would need {voltage_v:.1f} V, beyond the limit of {limit_v:g} V"
-    return int(t_us[n]), rows[n, 0:3], why
-
-
-def _first_too_fast(
+def _too_fast(
     stage: Stage,
     trajectory: Trajectory,
     drive: DriveLimits,
     rows: Array,
     t_us: NDArray[np.integer],
     force: Array,
-    which: NDArray[np.integer],
     lag: int,
-) -> _Refusal | None:
-    """The first instant by which a voltage has changed more in a period than the slew limit allows."""
-    known = which < len(force)
-    voltage = np.sqrt(np.maximum(force[which[known]], 0.0) / stage.force_gain_n_per_v2)
+) -> _Beyond | None:
+    """The largest change of a voltage in a period, if it is beyond the slew limit."""
+    voltage = np.sqrt(np.maximum(force, 0.0) / stage.force_gain_n_per_v2)
     change = np.abs(voltage[lag:] - voltage[:-lag])
     share_v = drive.slew_max_v_per_s * drive.period_us * 1e-6
-    now_us, before_us = t_us[known][lag:], t_us[known][:-lag]
     jumps_us = np.array([t for segment in trajectory.segments for t in segment.jumps_us], np.int64)
-    passed = np.searchsorted(jumps_us, now_us, side="right") > np.searchsorted(jumps_us, before_us, side="right")
-    change[passed] = 0.0
-    broken = np.argwhere(change > share_v)
-    if not len(broken):
+    now, before = (np.searchsorted(jumps_us, t, side="right") for t in (t_us[lag:], t_us[:-lag]))
+    change[now > before] = 0.0
+    n, comb = _place_of_most(change)
+    if not change[n, comb] > share_v:
         return None
-    n, comb = (int(i) for i in broken[0])
     why = (
         f"the voltage of comb {comb + 1} would have to change by {change[n, comb]:.4g} V within a period of "
         f"{drive.period_us} us, beyond the slew limit of {share_v:.4g} V ({drive.slew_max_v_per_s:g} V/s)"
     )
-    return int(now_us[n]), rows[known][lag:][n, 0:3], why
+    return _Beyond(_SLEW, float(change[n, comb]), rows[lag:][n, 0:3], why)
 
 
-def _refusal(trajectory: Trajectory, t_us: int, position_m: Array, why: str) -> TrajectoryError:
-    inside = [n for n, s in enumerate(trajectory.segments) if s.t_start_us <= t_us]
-    n = inside[-1] if inside else 0
-    where = ", ".join(f"{v * 1e6:.4g}" for v in position_m)
-    return TrajectoryError(
-        f"reference.{n} ({trajectory.segments[n].kind}): {t_us * 1e-6:.4f} s after its start the reference reaches "
-        f"({where}) um, where {why}"
-    )
+def _refusal(trajectory: Trajectory, n: int, why: str, keys: str) -> TrajectoryError:
+    segment = trajectory.segments[n]
+    ends = (segment.t_start_us - 1, segment.t_end_us - 1)
+    begin, end = (trajectory.sample(max(t_us, 0), 1, 1)[0, 0:3] for t_us in ends)
+    way = f"at {_um(begin)}" if np.abs(end - begin).max() < _NEAREST_M else f"from {_um(begin)} to {_um(end)}"
+    file = f" {segment.source}" if segment.source is not None else ""
+    advice = f"; change {keys}" if keys else ""
+    return TrajectoryError(f"reference.{n} ({segment.kind}{file} {way}): {why}{advice}")
+
+
+def _um(position_m: Array) -> str:
+    return f"({', '.join(f'{round(v * 1e6, 5) + 0.0:.4g}' for v in position_m)}) um"

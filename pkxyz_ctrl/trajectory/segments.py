@@ -53,8 +53,10 @@ class Plan(NamedTuple):
     """when it jumps: instants at which its position is discontinuous on purpose"""
     highest_hz: float = 0.0
     """the highest frequency of a periodic motion: a check has to look as closely as that"""
+    source: str | None = None
+    """the file that it was read from"""
     source_sha256: str | None = None
-    """digest of the file that it was read from"""
+    """its digest"""
     period_s: float | None = None
     """after which the scan repeats itself, if it does"""
 

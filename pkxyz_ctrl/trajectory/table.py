@@ -63,7 +63,7 @@ class Table(FrozenModel):
         begin = sum(part.total_s for part in lead_in)
         return Plan(
             (*lead_in, spline, *lead_out), position_m[-1], scan_s=(begin, begin + spline.total_s),
-            source_sha256=hashlib.sha256(content).hexdigest(),
+            source=self.file, source_sha256=hashlib.sha256(content).hexdigest(),
         )  # fmt: skip
 
 

@@ -18,9 +18,10 @@ from pkxyz_ctrl.trajectory import Hold, Move, Steps, Trajectory, TrajectoryError
 from pkxyz_ctrl.trajectory.check import DriveLimits, check_against
 from sim.config import PlantConfig
 
-LAWS = tuple(n for n in names("controllers") if n != "robust_20k")
-LED = tuple(n for n in LAWS if load("controllers", n, ControllerConfig).law != "mpc")
-"""Those whose answer to set-points is that of the model; mpc plans its own."""
+LAWS = names("controllers")
+BUS = {"robust_20k": "local_20k"}
+LED = tuple(n for n in LAWS if load("controllers", n, ControllerConfig).law != "mpc" and n not in BUS)
+"""Those whose answer to set-points is that of the model on fd_5k; mpc plans its own."""
 GENTLE = {"velocity_max_m_per_s": 0.5e-3, "acceleration_max_m_per_s2": 0.05, "jerk_max_m_per_s3": 10.0}
 MIDDLE_M, LOW_M = 19.2495e-6, 4e-6
 DWELL_S = 0.025
@@ -56,8 +57,8 @@ def largest_um(height_m, axis):
 
 @cache
 def designed(law):
-    setup = load_scenario("raster", controller=law).setup()
-    assert setup.law["period_us"][0] == DRIVE.period_us
+    setup = load_scenario("raster", controller=law, bus=BUS.get(law)).setup()
+    assert setup.law["period_us"][0] == (50 if law in BUS else DRIVE.period_us)
     return setup
 
 

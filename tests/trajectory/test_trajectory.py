@@ -196,7 +196,7 @@ def test_move_and_hold_by_hand():
         Trajectory([])
 
 
-def test_the_default_scan_can_be_followed_and_worse_ones_say_when_and_why_not():
+def test_the_default_scan_can_be_followed_and_worse_ones_say_where_and_why_not():
     class Reference(FrozenModel):
         reference: tuple[Segment, ...]
 
@@ -209,24 +209,17 @@ def test_the_default_scan_can_be_followed_and_worse_ones_say_when_and_why_not():
     weak = Stage(
         stage.config.model_copy(update={"limits": stage.config.limits.model_copy(update={"voltage_max_v": 150.0})})
     )
+    needed = float(stage.holding_voltages(np.array([0.0, 0.0, 30e-6])).max())
     cases = [
-        (stage, [(0.0, 0.0, -1e-6)], "stroke 1 would be -.* outside 0 to 25 um"),
-        (stage, [(0.0, 0.0, 2e-6), (0.0, 0.0, 0.0)], "combs only pull"),
-        (stage, [(0.0, 0.0, 400e-6)], "stroke 1 would be 25"),
-        (weak, [(0.0, 0.0, 30e-6)], r"comb [123] would need 150\.\d V, beyond the limit of 150 V"),
+        (stage, [(0.0, 0.0, -1e-6)], "at its target .* stroke 1 would be -.* outside 0 to 25 um"),
+        (stage, [(0.0, 0.0, 2e-6), (0.0, 0.0, 0.0)], r"reference\.1 .* on its way, .* combs only pull"),
+        (stage, [(0.0, 0.0, 400e-6)], "at its target .* reach of the out-of-plane links"),
+        (weak, [(0.0, 0.0, 30e-6)], rf"comb [123] would need {needed:.1f} V, beyond the limit of 150 V"),
     ]
     for device, targets, message in cases:
         limits = [bounds, harsh][: len(targets)]
         trajectory = Trajectory(
             [Move(kind="move", to_m=to, **given) for to, given in zip(targets, limits, strict=True)]
         )
-        with pytest.raises(TrajectoryError, match=message) as refused:
+        with pytest.raises(TrajectoryError, match=message):
             check_against(device, trajectory)
-        named_us = round(float(str(refused.value).split(": ")[1].split(" s after")[0]) * 1e6)
-        assert 0 < named_us <= trajectory.duration_us
-        before = trajectory.sample(0, named_us // 100, 100)[:, :3]
-        assert np.all(
-            (device.inverse_kinematics(before) >= -1e-12) & (device.inverse_kinematics(before) <= 25e-6 + 1e-12)
-        )
-        voltages = np.sqrt(np.maximum(device.holding_forces(before), 0) / device.force_gain_n_per_v2)
-        assert voltages.max() < device.voltage_max_v + 0.1

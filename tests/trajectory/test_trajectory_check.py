@@ -1,4 +1,7 @@
-"""The check before a run: forces by hand, every limit at its edge, the first instant named."""
+"""The check before a run: forces by hand, every limit at its edge; a refusal names segment, place, limit and key."""
+
+import re
+from typing import get_args
 
 import numpy as np
 import pytest
@@ -6,8 +9,8 @@ import pytest
 from hil.runs.scenario import load_scenario
 from pkxyz_ctrl.config.files import names
 from pkxyz_ctrl.stage import Stage
-from pkxyz_ctrl.trajectory import Circle, Hold, Move, Sine, Steps, Trajectory, TrajectoryError
-from pkxyz_ctrl.trajectory.check import DriveLimits, check_against, comb_forces
+from pkxyz_ctrl.trajectory import AnySegment, Circle, Hold, Move, Sine, Steps, Table, Trajectory, TrajectoryError
+from pkxyz_ctrl.trajectory.check import KEYS, DriveLimits, check_against, comb_forces
 
 STAGE = Stage.load("reconstructed")
 MIDDLE = Move(
@@ -47,10 +50,13 @@ def test_the_slew_limit_holds_from_any_instant_to_a_period_later(period_us):
     check_against(STAGE, trajectory, drive(fastest * 1.001, period_us=period_us))
     with pytest.raises(TrajectoryError, match=r"comb \d would have to change .* V within a period of") as refused:
         check_against(STAGE, trajectory, drive(fastest * 0.99, period_us=period_us))
-    named_us = round(float(str(refused.value).split(": ")[1].split(" s after")[0]) * 1e6)
-    change = np.abs(voltage[lag:] - voltage[:-lag]).max(axis=1) / (period_us * 1e-6)
-    first_us = (np.argmax(change > fastest * 0.99) + lag) * 10
-    assert named_us == pytest.approx(first_us, abs=150), "to a sample and four digits of the time"
+    change = np.abs(voltage[lag:] - voltage[:-lag])
+    worst = np.unravel_index(np.argmax(change), change.shape)
+    words = str(refused.value)
+    assert words.startswith("reference.1 (circle at (0, 0, 19.25) um): on its way, at (")
+    assert words.endswith("; change radius_m or frequency_hz")
+    named_v = float(words.split("would have to change by ")[1].split(" V")[0])
+    assert named_v == pytest.approx(change[worst], rel=2e-3), "to the distance of samples"
 
 
 def test_the_controllers_voltage_limit_counts_and_so_does_inertia():
@@ -74,7 +80,7 @@ def test_announced_jumps_are_left_out_of_the_slew_limit_but_not_of_the_others():
 
     check_against(STAGE, jumping(5.0), drive())
     check_against(STAGE, jumping(5.0, 0.0001), drive())
-    with pytest.raises(TrajectoryError, match=r"reference\.1 \(steps\): .*stroke \d would be"):
+    with pytest.raises(TrajectoryError, match=r"reference\.1 \(steps at .*stroke \d would be .*; change by_m or count"):
         check_against(STAGE, jumping(20.0), drive())
 
 
@@ -84,3 +90,67 @@ def test_every_shipped_scenario_loads_and_its_reference_can_be_followed(name):
     assert scenario.config.name == name
     end_s = scenario.trajectory.duration_us * 1e-6
     assert end_s + scenario.controller.homing_s + 0.05 < scenario.config.duration_s < end_s + 0.3
+
+
+def move(to_m, velocity=0.5e-3, acceleration=0.05, jerk=10.0):
+    return Move(
+        kind="move", to_m=to_m, velocity_max_m_per_s=velocity, acceleration_max_m_per_s2=acceleration,
+        jerk_max_m_per_s3=jerk,
+    )  # fmt: skip
+
+
+def refused(*segments):
+    with pytest.raises(TrajectoryError) as caught:
+        check_against(STAGE, Trajectory(segments), drive())
+    return str(caught.value)
+
+
+@pytest.mark.parametrize(
+    ("target_um", "why"),
+    [
+        ((0.0, 0.0, 49.0), r"stroke \d would be 3\d\.\d* um, outside 0 to 25 um"),
+        ((0.0, 0.0, -1.0), r"stroke \d would be -0\.\d* um, outside 0 to 25 um"),
+        ((17.0, 0.0, 19.0), r"stroke 2 would be -2\.319 um, outside 0 to 25 um"),
+        ((0.0, 0.0, 900.0), "reach"),
+    ],
+)
+def test_a_target_that_cannot_be_held_is_named_with_what_it_would_take_there(target_um, why):
+    """The worst value is the target's, not that of the instant at which the limit is passed."""
+    words = refused(move(tuple(v * 1e-6 for v in target_um)))
+    where = f"({', '.join(f'{v:g}' for v in target_um)}) um"
+    assert words.startswith(f"reference.0 (move from (0, 0, 0) um to {where}): at its target {where} ")
+    assert re.search(why, words)
+    assert words.endswith("; change to_m")
+
+
+def test_a_move_that_is_too_fast_between_two_good_ends_names_its_limits():
+    words = refused(MIDDLE, Hold(kind="hold", duration_s=0.01), move((0.0, 0.0, 1e-6), 0.2, 400.0, 1e7))
+    assert words.startswith("reference.2 (move from (0, 0, 19.25) um to (0, 0, 1) um): on its way, at (0, 0, ")
+    assert words.endswith("; change velocity_max_m_per_s, acceleration_max_m_per_s2 or jerk_max_m_per_s3")
+
+
+def test_what_is_too_fast_to_be_pulled_names_the_force():
+    words = refused(
+        move((0.0, 0.0, 1e-6)), Sine(kind="sine", axis="z", amplitude_m=0.4e-6, frequency_hz=1500.0, cycles=9)
+    )
+    assert re.match(
+        r"reference\.1 \(sine at \(0, 0, 1\) um\): on its way, at \(0, 0, [\d.]+\) um, comb \d would have", words
+    )
+    assert re.search(r"to push with [\d.]+ uN, and combs only pull; change amplitude_m or frequency_hz$", words)
+
+
+def test_a_table_is_named_by_its_file(tmp_path):
+    file = tmp_path / "mine.csv"
+    file.write_text("t_ms, z_um\n0, 0\n50, 10\n100, 30\n150, 48\n200, 20\n", encoding="utf-8")
+    fast = {"velocity_max_m_per_s": 1.0, "acceleration_max_m_per_s2": 1e3, "jerk_max_m_per_s3": 1e6}
+    words = refused(Table(kind="csv", file=str(file), **fast))
+    assert words.startswith(f"reference.0 (csv {file} from (0, 0, 0) um to (0, 0, 20) um): on its way, at (0, 0, ")
+    assert re.search(r"stroke \d would be 3\d\.\d* um, outside 0 to 25 um; change the file$", words)
+
+
+def test_every_kind_of_segment_has_keys_and_they_exist():
+    kinds = {model.model_fields["kind"].annotation.__args__[0]: model for model in get_args(AnySegment)}
+    assert set(kinds) == set(KEYS)
+    for kind, keys in KEYS.items():
+        named = {key for words in keys for key in re.findall(r"\w+_\w+|count|steps", words)}
+        assert named <= set(kinds[kind].model_fields), kind
