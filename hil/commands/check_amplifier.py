@@ -32,7 +32,10 @@ def check_amplifier(
     as_json: Annotated[bool, typer.Option("--json", help="Print JSON, and nothing else.")] = False,
 ) -> None:
     """Conformance run for a CANopen amplifier; exit code 1 if it is unsafe here, or a voltmeter has to tell, else 0."""
+    from datetime import UTC, datetime
+
     from hil.conformance import report
+    from hil.conformance.objects import identity_of
     from hil.conformance.run import run_all
     from pkxyz_ctrl.config.bus import BusConfig
 
@@ -42,7 +45,7 @@ def check_amplifier(
         folder_to_write(out)
     with _talker(config, path, allow_voltage) as talker:
         lines = run_all(talker, (lambda line: None) if as_json else _show)
-        result = report.as_json(talker, path.name, lines)
+        result = report.as_json(talker, path.name, lines, identity_of(talker), datetime.now(UTC))
     if out is not None:
         _save(out, "conformance.json", json.dumps(result, indent=1) + "\n")
         _save(out, "conformance.md", report.as_markdown(result))

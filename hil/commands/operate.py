@@ -5,6 +5,7 @@ from typing import Annotated, Literal
 
 import typer
 
+from hil.commands.run import Report
 from pkxyz_ctrl.config.files import ConfigError
 
 Name = Annotated[str, typer.Option(help="What the stage is called, where there are several.")]
@@ -21,8 +22,10 @@ def operate(
     controller: Controller = "youla",
     name: Name = "stage",
     on_silence: Silence = "hold",
+    report: Report = None,
 ) -> None:
     """Run the loop of a stage that `pkxyz serve` operates, until Ctrl-C or SIGTERM; at its end the combs are at 0 V."""
+    from hil.conformance.proven import with_report
     from hil.lanes.setup import bare_setup
     from hil.operate.at_rate import operate as run_loop
     from hil.operate.settings import Settings
@@ -32,10 +35,11 @@ def operate(
     from pkxyz_ctrl.loop.controller import StartUpError
 
     settings = Settings(on_silence=_silence(on_silence))
-    setup = bare_setup(
-        stage, "nominal", load("controllers", controller, ControllerConfig), load("buses", bus, BusConfig), 1,
-        autostart=False,
-    )  # fmt: skip
+    config = load("buses", bus, BusConfig)
+    if report is not None:
+        config = with_report(config, report)
+    law = load("controllers", controller, ControllerConfig)
+    setup = bare_setup(stage, "nominal", law, config, 1, autostart=False)
     try:
         run_loop(setup, settings, name, {"stage": stage, "controller": controller, "bus": bus}, _say)
     except StartUpError as error:

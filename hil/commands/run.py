@@ -1,5 +1,6 @@
 """``pkxyz run`` and ``pkxyz plant``: controller and plant at the machine's pace, each in a process of its own."""
 
+import dataclasses
 import json
 import sys
 from pathlib import Path
@@ -37,6 +38,12 @@ Refresh = Annotated[
 Adapted = Annotated[
     str | None, typer.Option(metavar="FILE", help="Begin with what a run has learnt of the device (its adapted.json).")
 ]
+Report = Annotated[
+    Path | None,
+    typer.Option(
+        help="conformance.json of `pkxyz check-amplifier` on this very module: what passed is not tried anew."
+    ),
+]
 _MEETING_BUSES = ("unix_2k", "unix_1k")  # on one channel: a plant on one of them serves a controller on the other, too
 
 
@@ -55,6 +62,7 @@ def run(
     wait_s: Annotated[
         float, typer.Option("--wait", min=0, max=3600, help="Seconds until somebody else has to be on the bus.")
     ] = 30.0,
+    report: Report = None,
     as_json: Json = False,
 ) -> None:
     """Control an amplifier at rate; exit code 0 if the checks hold, 1 if not, 2 for bad input or a full disk, 128 +
@@ -62,6 +70,7 @@ def run(
 
     Ctrl-C, SIGTERM and errors leave the combs at 0 V. Errors of position are those of the estimate.
     """
+    from hil.conformance.proven import with_report
     from hil.lanes.ending import Ended
     from hil.lanes.lane import Lane
     from hil.lanes.wall import require_real_bus
@@ -84,6 +93,8 @@ def run(
         raise typer.Exit(128 + end.signal_number) from None
     loaded = _lasting(loaded, duration_s)
     require_real_bus(loaded.bus)
+    if report is not None:
+        loaded = dataclasses.replace(loaded, bus=with_report(loaded.bus, report))
     live = LiveStatus(round(loaded.config.duration_s / loaded.bus.period_s), loaded.bus.period_s)
     path = out if out is not None else next_free(Path("runs"), loaded.config.name, Lane.WALL)
     folder = RunFolder(path, replace=replace_earlier)
@@ -188,8 +199,6 @@ def require_seconds(duration_s: float | None) -> None:
 
 
 def _lasting(loaded: Any, duration_s: float | None) -> Any:
-    import dataclasses
-
     if duration_s is None:
         return loaded
     return dataclasses.replace(loaded, config=loaded.config.model_copy(update={"duration_s": duration_s}))

@@ -6,6 +6,7 @@ from typing import Annotated
 
 import typer
 
+from hil.commands.run import Report
 from hil.screen.first_run import say_if_compiling
 
 
@@ -24,12 +25,14 @@ def serve(
         "127.0.0.1"
     ),
     port: Annotated[int, typer.Option(help="0: any that is free.", min=0, max=65535)] = 8765,
+    report: Report = None,
     as_json: Annotated[bool, typer.Option("--json", help="Print where it is as JSON.")] = False,
 ) -> None:
     """Operate a stage: a loop at rate, and beside it a page and clients, until Ctrl-C. At the end the combs are at 0 V.
 
     What it prints is the address of the page; what stands behind # in it lets people in, so keep it to yourself.
     """
+    from hil.conformance.proven import with_report
     from hil.server.serving import Served, bus_of_its_own, serve
     from pkxyz_ctrl.config.bus import BusConfig
     from pkxyz_ctrl.config.files import load
@@ -37,6 +40,8 @@ def serve(
     bus = bus or bus_of_its_own(name, _SIMULATED_BUS)
     config = load("buses", bus, BusConfig)
     is_simulated = config.can is not None and config.can.interface == "pkxyz-unix"
+    if report is not None:
+        with_report(config, report)  # said here, before anything is started
     say_if_compiling(quiet=as_json)
     if host not in ("127.0.0.1", "localhost", "::1"):
         print(f"everybody who can reach {host} and has the address below can move the stage", file=sys.stderr)
@@ -44,7 +49,7 @@ def serve(
     def tell(url: str) -> None:
         print(json.dumps({"url": url}) if as_json else f"the stage is at {url}", flush=True)
 
-    served = Served(name, stage, controller, plant, bus, on_silence, host, port, is_simulated)
+    served = Served(name, stage, controller, plant, bus, on_silence, host, port, is_simulated, report)
     raise typer.Exit(serve(served, tell))
 
 

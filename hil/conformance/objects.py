@@ -85,6 +85,12 @@ def _defaults(talker: Talker) -> str:
     return f"{compared} values as the EDS says"
 
 
+def identity_of(talker: Talker) -> tuple[int | None, ...]:
+    """Vendor, product, revision and serial number (0x1018:1 to 4); None for what the node does not tell."""
+    results = (talker.read(0x1018, part) for part in (1, 2, 3, 4))
+    return tuple(result.unsigned if result.ok else None for result in results)
+
+
 def _read_only(talker: Talker) -> str:
     tried, deviations = 0, []
     for variable, data in list(_read_values(talker)):

@@ -8,15 +8,21 @@ from hil.conformance.talker import SETTLE_US, ZERO, Talker
 from hil.conformance.verdict import OUR_CONTRACT, SAFETY, Check
 from pkxyz_ctrl.can.cob_id import NmtCommand
 from pkxyz_ctrl.can.codec import Counts
+from pkxyz_ctrl.can.driver_config import OUR_TIMEOUT_MAX_MS
+from pkxyz_ctrl.can.sdo import NO_SUCH_OBJECT
+from pkxyz_ctrl.can.startup import DRIVE_TIMEOUT, HEARTBEAT_LOST, LEAVING
 
 _HEARTBEAT_TOLERANCE_MS = 5
 _SCALE_VOLTS = (0.0, 1.0, 5.0)
 _OTHER: Counts = (TEST_COUNTS[1], TEST_COUNTS[2], TEST_COUNTS[0])
+_STEP_MAX = TEST_COUNTS[0]
+_RISE: tuple[Counts, ...] = ((164, 164, 164), (164, 328, 328))  # to the test counts, by no larger steps
+_TIMEOUT_MS = 200  # long enough for the reads before it
 
 
-def _energised(talker: Talker, configure: Callable[[], object] = lambda: None) -> None:
+def _energised(talker: Talker, configure: Callable[[], object] = lambda: None, rise: tuple[Counts, ...] = ()) -> None:
     """Operational with the test counts at the outputs; only with permission. ``configure`` is called before that: a
-    node may hold what is safe fixed while operational.
+    node may hold what is safe fixed while operational. ``rise``: by way of these counts.
     """
     if not talker.allow_voltage:
         raise NotTestedError("takes counts other than 0: only with --allow-voltage")
@@ -24,6 +30,8 @@ def _energised(talker: Talker, configure: Callable[[], object] = lambda: None) -
     talker.nmt(NmtCommand.PRE_OPERATIONAL)
     configure()
     talker.nmt(NmtCommand.START)
+    for counts in rise:
+        talker.cycles(1, counts)
     talker.cycles(10, TEST_COUNTS)
     talker.cycle()
     if (outputs := talker.outputs()) != TEST_COUNTS:
@@ -66,9 +74,16 @@ def _error_objects(talker: Talker) -> str:
     return "modes 0 and 1 and value 0 are kept"
 
 
+def _has_only_its_drive_timeout(talker: Talker) -> bool:
+    """No 0x1016, but a protected node: 0x2012 may stand in for it."""
+    return talker.driver.protection and talker.read(0x1016, 1).abort in NO_SUCH_OBJECT
+
+
 def _heartbeat_lost(talker: Talker) -> str:
     """EMCY 0x8130 in time, and out of operational, as 0x1029:01 = 0 says."""
     talker.operational()
+    if _has_only_its_drive_timeout(talker):
+        raise DeviationError(f"no 0x1016: it does not notice; the line {DRIVE_TIMEOUT!r} has to stand in for it")
     limit_ms = talker.driver.controller_heartbeat_timeout_ms
     talker.run(2000 * limit_ms)
     mark = talker.mark()
@@ -93,6 +108,8 @@ def _heartbeat_lost(talker: Talker) -> str:
 
 def _heartbeat_outputs(talker: Talker) -> str:
     _energised(talker)
+    if _has_only_its_drive_timeout(talker):
+        raise NotTestedError("no 0x1016")
     talker.beating = False
     talker.run(1000 * (talker.driver.controller_heartbeat_timeout_ms + _HEARTBEAT_TOLERANCE_MS))
     if (outputs := talker.outputs()) != ZERO:
@@ -145,6 +162,56 @@ def _drive_missing(talker: Talker) -> str:
     if before != TEST_COUNTS or 0x8250 not in codes:
         raise DeviationError(told)
     if after != ZERO:
+        _measure_if([told])
+    return told
+
+
+def _step_limit(talker: Talker) -> str:
+    """One step as large as 0x2011 says, and one that is a count larger."""
+    if not talker.driver.protection:
+        raise NotTestedError("the bus configuration asks for no limit of the node's own")
+    _energised(talker, lambda: talker.write(0x2011, 0, _STEP_MAX, 2), _RISE)
+    beyond = (TEST_COUNTS[0] + _STEP_MAX + 1, *TEST_COUNTS[1:])
+    mark = talker.mark()
+    talker.send(talker.drive_id, talker.next_drive(beyond))
+    talker.run(1000)
+    talker.cycle()
+    talker.run(SETTLE_US)
+    outputs, codes = talker.outputs(), talker.emergencies(mark)
+    told = f"comb 1 asked for {_STEP_MAX + 1} counts more, 0x2011 = {_STEP_MAX}: 0x6411 {outputs}, EMCY " + (
+        ", ".join(f"0x{code:04X}" for code in codes) or "none"
+    )
+    if outputs == beyond or 0xFF14 not in codes:
+        raise DeviationError(told, is_unsafe=outputs == beyond)
+    if outputs != ZERO:
+        _measure_if([told])
+    return told
+
+
+def _drive_timeout(talker: Talker) -> str:
+    """Nothing of ours comes any more, no SYNC either, and our heartbeat may be away for longer than that."""
+    if not talker.driver.protection:
+        raise NotTestedError("the bus configuration asks for no time-out of the drive PDO")
+
+    def configure() -> None:
+        talker.write(0x2012, 0, _TIMEOUT_MS, 2)
+        talker.write(0x1016, 1, talker.driver.controller_node_id << 16 | OUR_TIMEOUT_MAX_MS, 4)
+
+    _energised(talker, configure)
+    talker.cycles(2, TEST_COUNTS)
+    mark = talker.mark()
+    applied_us = talker.sync()
+    talker.beating = False
+    talker.run(1000 * _TIMEOUT_MS + SETTLE_US)
+    told_us = [t_us for t_us, data in talker.since(mark, talker.emergency_id) if data[:2] == b"\x50\x82"]
+    outputs = talker.outputs()
+    if not told_us:
+        raise DeviationError(f"no EMCY 0x8250 within {_TIMEOUT_MS} ms, 0x6411 reads {outputs}")
+    after_ms = (told_us[0] - applied_us) / 1000
+    told = f"0x2012 = {_TIMEOUT_MS} ms: EMCY 0x8250 {after_ms:.2f} ms after the last SYNC, 0x6411 reads {outputs}"
+    if not _TIMEOUT_MS - 1 <= after_ms <= _TIMEOUT_MS + _HEARTBEAT_TOLERANCE_MS:
+        raise DeviationError(told)
+    if outputs != ZERO:
         _measure_if([told])
     return told
 
@@ -214,8 +281,8 @@ CHECKS = (
     Check(
         _A, "heartbeat consumer", "when ours stops: EMCY 0x8130 in time, pre-operational", OUR_CONTRACT, _heartbeat_lost
     ),
-    Check(_B, "heartbeat lost", "outputs at their error value, 0", SAFETY, _zeroed_first(_heartbeat_outputs)),
-    Check(_B, "leaving operational", "outputs at their error value, 0", SAFETY, _zeroed_first(_leaving)),
+    Check(_B, HEARTBEAT_LOST, "outputs at their error value, 0", SAFETY, _zeroed_first(_heartbeat_outputs)),
+    Check(_B, LEAVING, "outputs at their error value, 0", SAFETY, _zeroed_first(_leaving)),
     Check(_B, "error value", "mode 1 takes 0x6444, mode 0 keeps what is there", _MODES, _zeroed_first(_error_value)),
     Check(
         _B,
@@ -223,6 +290,16 @@ CHECKS = (
         "after 0x2010 SYNCs without: outputs 0, EMCY 0x8250",
         OUR_CONTRACT,
         _zeroed_first(_drive_missing),
+    ),
+    Check(
+        _B,
+        DRIVE_TIMEOUT,
+        "0x2012 ms without any frame of ours: outputs 0, EMCY 0x8250",
+        OUR_CONTRACT,
+        _zeroed_first(_drive_timeout),
+    ),
+    Check(
+        _B, "own step limit", "a step beyond 0x2011: outputs 0, EMCY 0xFF14", OUR_CONTRACT, _zeroed_first(_step_limit)
     ),
     Check(_B, "applied at SYNC", "a drive PDO takes effect at the next SYNC", _PDO, _zeroed_first(_at_sync)),
     Check(_B, "drive by SDO", "with protection, counts other than 0 are refused", OUR_CONTRACT, _zeroed_first(_by_sdo)),

@@ -1,19 +1,30 @@
 """The report that a person can file: Markdown, and the same as JSON."""
 
+import hashlib
+import json
 from collections import Counter
+from collections.abc import Sequence
+from datetime import datetime
 from itertools import groupby
 from typing import Any
 
 from hil.conformance.talker import Talker
 from hil.conformance.verdict import Line, Verdict
 
+IDENTITY = ("vendor_id", "product_code", "revision", "serial")
+"""Of 0x1018, sub-indices 1 to 4."""
 
-def as_json(talker: Talker, eds: str, lines: list[Line]) -> dict[str, Any]:
+
+def as_json(
+    talker: Talker, eds: str, lines: list[Line], identity: Sequence[int | None], made: datetime
+) -> dict[str, Any]:
     """Everything, as plain data. ``ok``: nothing unsafe was seen, and nothing is left that only a voltmeter can tell;
-    ``complete``: no line was left out.
+    ``complete``: no line was left out; ``digest``: of all the rest.
     """
     counts = Counter(line.verdict for line in lines)
-    return {
+    report = {
+        "made": made.isoformat(timespec="seconds"),
+        "module": dict(zip(IDENTITY, identity, strict=True)),
         "bus": talker.bus.name,
         "interface": talker.can.interface,
         "channel": talker.can.channel,
@@ -41,6 +52,13 @@ def as_json(talker: Talker, eds: str, lines: list[Line]) -> dict[str, Any]:
             for line in lines
         ],
     }
+    return report | {"digest": digest_of(report)}
+
+
+def digest_of(report: dict[str, Any]) -> str:
+    """``sha256:...`` of everything else in a report. Against accidents: whoever changes it can make it anew."""
+    rest = {key: value for key, value in report.items() if key != "digest"}
+    return f"sha256:{hashlib.sha256(json.dumps(rest, sort_keys=True).encode()).hexdigest()}"
 
 
 def conclusion(report: dict[str, Any]) -> str:
@@ -75,6 +93,7 @@ def as_markdown(report: dict[str, Any]) -> str:
     text = [
         "# Conformance of an amplifier",
         "",
+        f"- {report['made']}, {', '.join(f'{name} {_number(value)}' for name, value in report['module'].items())}",
         f"- bus {report['bus']}: {report['interface']} {report['channel']}, node {report['node_id']}",
         f"- EDS: {report['eds']}",
         f"- counts other than 0: {'allowed' if report['allow_voltage'] else 'not allowed (--allow-voltage)'}",
@@ -89,6 +108,10 @@ def as_markdown(report: dict[str, Any]) -> str:
 
 
 _COLUMNS = ("name", "verdict", "expected", "basis", "got")
+
+
+def _number(value: int | None) -> str:
+    return "unknown" if value is None else f"0x{value:X}"
 
 
 def _cell(text: str) -> str:

@@ -11,6 +11,7 @@ import sys
 import time
 from collections.abc import Callable, Generator
 from dataclasses import dataclass
+from pathlib import Path
 
 import tomlkit
 import uvicorn
@@ -42,6 +43,8 @@ class Served:
     port: int
     is_simulated: bool
     """whether amplifier and plant are to be started, too"""
+    report: Path | None = None
+    """on the amplifier"""
 
 
 class _Children:
@@ -154,7 +157,7 @@ def _start(children: _Children, served: Served) -> None:
         place.write(served.name, "plant", {"pid": pid})
     children.start(
         "loop", "operate", *common, "--controller", served.controller, "--name", served.name, "--on-silence",
-        served.on_silence,
+        served.on_silence, *(("--report", str(served.report)) if served.report is not None else ()),
     )  # fmt: skip
 
 

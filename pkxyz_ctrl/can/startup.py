@@ -24,7 +24,7 @@ _NO_SAFE_STATE = "an amplifier that cannot be told to go to 0 V by itself must n
 _NO_STEP_LIMIT = "an amplifier that does not limit its own steps makes two in one where a frame is lost"
 _NO_HEARTBEAT = "the amplifier must produce and consume heartbeats"
 _READ_BACK = "the amplifier did not keep what was written; power it off and on, then compare it with its EDS"
-_REPORT = "measure them by `pkxyz check-amplifier --allow-voltage`, and give the passed lines in [can.driver.proven]"
+_REPORT = "try it by `pkxyz check-amplifier --allow-voltage --out DIR`, and give its report to `pkxyz run --report`"
 
 _STOPPED = 2  # 0x1029: also a state in which the outputs take their error value
 

@@ -191,7 +191,7 @@ def test_wrong_identity():
         (
             0x6444,
             "no 0x6444 (error value of comb 1: 0 V), and no report",
-            "give the passed lines in [can.driver.proven]",
+            "give its report to `pkxyz run --report`",
         ),
         (0x1016, "no 0x1016 (consumer of our heartbeat), and nothing else takes the combs to 0 V", "must not be used"),
         (0x1401, "no 0x1401", "in the PDOs and channels of the bus config"),

@@ -1,5 +1,7 @@
 """The conformance run: our own node passes every line, and each defect shows on exactly the line that is about it."""
 
+from datetime import UTC, datetime
+
 import can
 import pytest
 from conformance_defects import (
@@ -18,6 +20,7 @@ from hil.bus.wire import Wire
 from hil.conformance import report
 from hil.conformance.deviation import DeviationError
 from hil.conformance.eds import read_eds
+from hil.conformance.objects import identity_of
 from hil.conformance.run import CHECKS, run_all
 from hil.conformance.simulated import EDS, simulated_talker
 from hil.conformance.talker import Talker
@@ -29,6 +32,7 @@ from pkxyz_ctrl.config.bus import BusConfig
 from pkxyz_ctrl.config.files import ConfigError, load
 from pkxyz_ctrl.io.can_port import to_frame, to_message
 
+MADE = datetime(2026, 11, 22, 13, tzinfo=UTC)
 BUS = load("buses", "fd_5k", BusConfig)
 SAMPLE_CYCLES = 80
 
@@ -71,6 +75,8 @@ def test_a_plain_cia_401_module_passes_what_applies_to_it() -> None:
         "drive PDO: wrong alive counter",
         "drive PDO: late",
         "outputs, with voltage: drive PDO missing",
+        "outputs, with voltage: drive time-out",
+        "outputs, with voltage: own step limit",
         "outputs, with voltage: drive by SDO",
     }
 
@@ -88,7 +94,7 @@ def test_a_defect_shows_on_its_line_and_no_other(defect: type[AmplifierNode]) ->
 KINDS = {
     Verdict.UNSAFE: {
         "drive PDO: wrong CRC", "drive PDO: wrong alive counter", "drive PDO: late",
-        "drive PDO: negative count", "outputs: heartbeat consumer",
+        "drive PDO: negative count", "outputs: heartbeat consumer", "outputs, with voltage: own step limit",
     },
     Verdict.MEASURE: {
         "outputs: after reset", "outputs, with voltage: heartbeat lost", "outputs, with voltage: leaving operational",
@@ -98,7 +104,7 @@ KINDS = {
         "identity: identity", "object dictionary: configuration", "frames: formats", "sense PDO: latency",
         "sense PDO: alive counter", "sense PDO: CRC", "SYNC: SYNC counter", "drive PDO: too long",
         "outputs, with voltage: drive by SDO", "outputs, with voltage: scaling",
-        "outputs, with voltage: drive PDO missing",
+        "outputs, with voltage: drive PDO missing", "outputs, with voltage: drive time-out",
     },
 }  # fmt: skip
 
@@ -318,7 +324,7 @@ def test_two_runs_say_the_same() -> None:
 def test_the_report_holds_every_line() -> None:
     talker = talk_to(AmplifierNode, allow_voltage=False)
     lines = run_all(talker)
-    data = report.as_json(talker, "comb_amplifier.eds", lines)
+    data = report.as_json(talker, "comb_amplifier.eds", lines, identity_of(talker), MADE)
     text = report.as_markdown(data)
     assert data["ok"]
     assert not data["complete"]

@@ -330,6 +330,21 @@ class TakesNegative(_OtherDrive):
         return DRIVE.encode((abs(a), abs(b), abs(c)), counter) if right else data
 
 
+class NeverOverdue(AmplifierNode):
+    """outputs, with voltage: drive time-out"""
+
+    def _drive_overdue(self, now_us: int) -> None:
+        pass
+
+
+class AnyStep(AmplifierNode):
+    """outputs, with voltage: own step limit"""
+
+    def _configure(self, index: int) -> None:
+        super()._configure(index)
+        self._step_max = 32767
+
+
 class NeverTellsTheEnd(AmplifierNode):
     """EMCY: register and end"""
 
@@ -413,8 +428,9 @@ class AppliesAtOnce(_OtherDrive):
     def on_frame(self, frame: Frame, t_us: int) -> None:
         super().on_frame(frame, t_us)
         if frame.can_id == 0x30A and (pending := self._drive.pending) is not None:
-            self.outputs = pending
-            self._plant.exchange(t_us, pending, sample=False)
+            outputs, self._drive.pending = self._apply(pending, t_us), pending
+            if outputs is not None:
+                self._plant.exchange(t_us, outputs, sample=False)
 
 
 class Saturates(AmplifierNode):
@@ -446,6 +462,26 @@ class SelfStarting(AmplifierNode):
     def _boot(self, now_us: int) -> None:
         super()._boot(now_us)
         self._enter(NmtState.OPERATIONAL)
+
+
+class WithoutConsumer(_OtherObjects):
+    """No defect, but no 0x1016: what it has is its own time without an applied drive PDO (0x2012)."""
+
+    def check_download(self, index: int, subindex: int, length: int | None) -> None:
+        self._look(index)
+        super().check_download(index, subindex, length)
+
+    def read(self, index: int, subindex: int) -> bytes:
+        self._look(index)
+        return super().read(index, subindex)
+
+    def write(self, index: int, subindex: int, data: bytes) -> None:
+        self._look(index)
+        super().write(index, subindex, data)
+
+    def _look(self, index: int) -> None:
+        if index == 0x1016:
+            raise SdoAbortError(Abort.NO_OBJECT)
 
 
 class EverySenseLate(AmplifierNode):
