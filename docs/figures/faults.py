@@ -1,4 +1,4 @@
-"""Draws the matrix of faults, and fills in the tables of docs/lookup/faults.md. The matrix takes a minute or two.
+"""Draws the matrix of faults, and keeps what came of each for docs/lookup/faults.md. The matrix takes a minute or two.
 
     python docs/figures/faults.py [SOAK.JSON]
 
@@ -11,6 +11,7 @@ import re
 import shutil
 import sys
 from pathlib import Path
+from typing import Any
 
 from hil.commands.studies.faults import run_matrix
 from hil.pictures.faults import draw
@@ -20,20 +21,37 @@ from pkxyz_ctrl.config.files import names
 
 HERE = Path(__file__).parent
 PAGE = HERE.parent / "lookup" / "faults.md"
+FOUND = HERE / "faults.json"
+"""Of the law of the page; the site's table is made of it."""
+LAW = "lqg"
 
 
-def matrix(outcomes: list[Outcome]) -> str:
-    """What came of each fault under the default law."""
+def plain(outcomes: list[Outcome]) -> list[dict[str, Any]]:
+    """What came of each fault under the law of the page, to be kept."""
+    return [
+        {
+            "fault": outcome.case,
+            "ticks": outcome.ticks,
+            "latched": list(outcome.reason),
+            "zero_ms": outcome.zero_ms,
+            "excursion_um": outcome.excursion_um,
+            "remark": "; ".join(outcome.problems) or case.note,
+        }
+        for outcome, case in zip(outcomes, CASES, strict=True)
+    ]
+
+
+def matrix(found: list[dict[str, Any]]) -> str:
+    """The table of what was kept."""
     rows = [
         "| fault | ticks | latched | 0 V after, ms | off by, um | |",
         "| --- | --- | --- | --- | --- | --- |",
     ]
-    for outcome, case in zip(outcomes, CASES, strict=True):
-        ticks = "-" if outcome.ticks is None else str(outcome.ticks)
-        zero = "-" if outcome.zero_ms is None else f"{outcome.zero_ms:.1f}"
+    for f in found:
+        ticks = "-" if f["ticks"] is None else str(f["ticks"])
+        zero = "-" if f["zero_ms"] is None else f"{f['zero_ms']:.1f}"
         rows.append(
-            f"| {outcome.case} | {ticks} | {', '.join(outcome.reason)} | {zero} "
-            f"| {outcome.excursion_um:.2f} | {'; '.join(outcome.problems) or case.note} |"
+            f"| {f['fault']} | {ticks} | {', '.join(f['latched'])} | {zero} | {f['excursion_um']:.2f} | {f['remark']} |"
         )
     return "\n".join(rows)
 
@@ -62,11 +80,12 @@ def main() -> None:
     found, refused = run_matrix(laws, list(CASES), 0, quiet=False)
     print("not run:", refused)
     draw(found, CASES, HERE / "faults.png")
-    page = filled_in(PAGE.read_text(encoding="utf-8"), "matrix", matrix([o for o in found if o.law == "lqg"]))
+    kept = plain([o for o in found if o.law == LAW])
+    FOUND.write_text(json.dumps(kept, indent=1) + "\n", encoding="utf-8")
     if len(sys.argv) > 1:
-        page = filled_in(page, "soak", soaked(Path(sys.argv[1])))
+        page = filled_in(PAGE.read_text(encoding="utf-8"), "soak", soaked(Path(sys.argv[1])))
         shutil.copy(Path(sys.argv[1]).with_name("soak.png"), HERE / "soak.png")
-    PAGE.write_text(page, encoding="utf-8")
+        PAGE.write_text(page, encoding="utf-8")
     for outcome in found:
         if not outcome.ok:
             print(outcome.law, outcome.case, "; ".join(outcome.problems))

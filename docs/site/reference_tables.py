@@ -10,11 +10,14 @@ from functools import partial
 from pathlib import Path
 
 import canopen
+import config_tables
 import fault_codes
+import limit_table
+import mode_tables
 
 from hil.conformance.run import CHECKS
 from hil.faults.catalogue import KINDS, PARTS
-from pkxyz_ctrl.can.wire_doc import object_table
+from pkxyz_ctrl.can.wire_doc import object_table, pdo_table
 from pkxyz_ctrl.mechanics.published import entries
 from pkxyz_ctrl.mechanics.reproduction import reproduction_table
 from pkxyz_ctrl.safety.modes import EVENT_MEANING, TRANSITIONS, Event, Mode
@@ -87,6 +90,17 @@ def objects() -> str:
     return object_table(canopen.import_od(str(EDS), 10))
 
 
+def pdos() -> str:
+    """The bytes of both process PDOs."""
+    return pdo_table(canopen.import_od(str(EDS), 10))
+
+
+def matrix() -> str:
+    """What came of each fault under one law, as ``docs/figures/faults.py`` last found it."""
+    drawing = runpy.run_path(str(ROOT / "docs" / "figures" / "faults.py"))
+    return str(drawing["matrix"](json.loads(drawing["FOUND"].read_text(encoding="utf-8"))))
+
+
 def rooms() -> str:
     """The rooms of the house and which room may use which; the table is that of the test that holds it."""
     house = runpy.run_path(str(ROOT / "tests" / "house" / "rooms.py"))
@@ -94,7 +108,7 @@ def rooms() -> str:
 
 
 def measured(name: str) -> str:
-    """A table of benchmarks/results.json: the parts of a tick, which explain the figures on the page."""
+    """A table of benchmarks/results.json."""
     drawing = runpy.run_path(str(ROOT / "docs" / "figures" / "performance.py"))
     blocks = drawing["generated"](json.loads(drawing["RESULTS"].read_text(encoding="utf-8")))
     return str(blocks[name])
@@ -102,9 +116,7 @@ def measured(name: str) -> str:
 
 BUILT = {
     "rooms": rooms,
-    "share": partial(measured, "share"),
-    "parts": partial(measured, "parts"),
-    "floor": partial(measured, "floor"),
+    **{name: partial(measured, name) for name in ("quality", "beside", "speed", "share", "parts", "floor")},
     "trips": fault_codes.trips_table,
     "emergencies": fault_codes.emergencies_table,
     "transitions": transitions,
@@ -112,7 +124,15 @@ BUILT = {
     "kinds": kinds,
     "conformance": conformance,
     "paper": paper,
+    "pdos": pdos,
     "objects": objects,
+    "mode_diagram": mode_tables.diagram,
+    "modes": mode_tables.modes,
+    "gate": mode_tables.gate,
+    "limits": limit_table.limits,
+    "effects": config_tables.effects,
+    "segments": config_tables.segments,
+    "matrix": matrix,
 }
 
 

@@ -35,7 +35,8 @@ Name = Annotated[str, Field(min_length=1, max_length=100), AfterValidator(_one_f
 
 
 class StiffnessMismatch(Model):
-    """Relative error of each chain's flexures against the drawing."""
+    """Relative error of each chain's flexures against the drawing: K1_i, K2_i (1 + e_i); K3 by the mean
+    over the chains."""
 
     on: bool = False
     leaf: RelativePerChain = (0.0, 0.0, 0.0)
@@ -44,12 +45,15 @@ class StiffnessMismatch(Model):
 
 
 class MassError(Model):
+    """Relative error of the moving mass: m (1 + e)."""
+
     on: bool = False
     relative: Relative = 0.0
 
 
 class Damping(Model):
-    """Modal damping. Without a ``quality_factor`` the stage file's holds; off means no damping at all."""
+    """Modal damping at the rest pose, D = Phi diag(w / Q) Phi^T. Without a ``quality_factor`` the stage file's holds;
+    off means no damping at all."""
 
     on: bool = True
     quality_factor: Positive | None = None
@@ -69,7 +73,7 @@ class Gravity(Model):
 class Parasitic(Model):
     """One more mode, moved by the comb forces and seen by the sense combs through the same shape (that is:
     passively), and by the table through its own. ``compliance_share``: its static compliance as a share of the
-    stage's in-plane 1/K_xx."""
+    stage's in-plane 1/K_xx. r'' + (w/Q) r' + w^2 r = w^2 share / K_xx sum u_i F_i; strokes + u_i r, table + t r."""
 
     on: bool = False
     frequency_hz: Positive = 2600.0
@@ -80,7 +84,8 @@ class Parasitic(Model):
 
 
 class Drift(Model):
-    """Slow force on the table: an exponential that settles at ``force_n``, and a random walk on each axis."""
+    """Slow force on the table: an exponential that settles at ``force_n``, F (1 - exp(-t / tau)), and a
+    random walk on each axis."""
 
     on: bool = False
     force_n: PerChain = (0.0, 0.0, 0.0)
@@ -108,21 +113,22 @@ class Stops(Model):
 
 
 class CombMismatch(Model):
-    """Relative error of each drive comb's force gain."""
+    """Relative error of each drive comb's force gain: k_i (1 + e_i) in F_i = k_i (V_i - V_c,i)^2."""
 
     on: bool = False
     relative: RelativePerChain = (0.0, 0.0, 0.0)
 
 
 class Fringe(Model):
-    """Change of the drive combs' force gain with overlap, relative, over 25 um of stroke."""
+    """Change of the drive combs' force gain with overlap, relative, over 25 um of stroke: k_i (1 + phi q_i)."""
 
     on: bool = False
     relative_per_25um: Annotated[float, Field(gt=-0.5, lt=0.5)] = 0.0
 
 
 class Levitation(Model):
-    """Out-of-plane force of a comb as a share of its in-plane force; the ground plane below lifts the fingers."""
+    """Out-of-plane force of a comb as a share of its in-plane force; the ground plane below lifts the fingers:
+    F_z += ratio sum F_i."""
 
     on: bool = False
     ratio: Finite = 0.0
@@ -137,7 +143,8 @@ class PullIn(Model):
 
 
 class Charging(Model):
-    """Dielectric charging: an opposing voltage that creeps towards ``fraction`` of the comb voltage."""
+    """Dielectric charging: an opposing voltage that creeps towards ``fraction`` of the comb voltage:
+    V_c' = (fraction V - V_c) / tau, once a call of ``advance``."""
 
     on: bool = False
     fraction: Annotated[float, Field(ge=-0.5, le=0.5)] = 0.0
@@ -145,11 +152,15 @@ class Charging(Model):
 
 
 class AmplifierBandwidth(Model):
+    """First-order lag of each output: V' = 2 pi corner_hz (target - V)."""
+
     on: bool = True
     corner_hz: Positive = 30e3
 
 
 class Slew(Model):
+    """Bound on the rate of each output, |V'|."""
+
     on: bool = True
     limit_v_per_s: Positive = 20e6
 
@@ -163,11 +174,15 @@ class CurrentLimit(Model):
 
 
 class AmplifierGain(Model):
+    """Relative error of each output: target = counts scale (1 + e_i) + offset_i."""
+
     on: bool = False
     relative: RelativePerChain = (0.0, 0.0, 0.0)
 
 
 class AmplifierOffset(Model):
+    """Offset of each output."""
+
     on: bool = False
     offset_v: PerChain = (0.0, 0.0, 0.0)
 
@@ -208,7 +223,8 @@ class SenseDelay(Model):
 
 
 class SenseGain(Model):
-    """Relative error of each sense comb's gradient and, as curvature, its change over 25 um."""
+    """Relative error of each sense comb's gradient and, as curvature, its change over 25 um: g (1 + e_i),
+    q (1 + c q / 2)."""
 
     on: bool = False
     relative: RelativePerChain = (0.0, 0.0, 0.0)
@@ -216,6 +232,8 @@ class SenseGain(Model):
 
 
 class SenseOffset(Model):
+    """Constant offset of each sense channel."""
+
     on: bool = False
     offset_f: PerChain = (0.0, 0.0, 0.0)
 

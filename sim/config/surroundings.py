@@ -70,6 +70,8 @@ class Harmonic(Model):
 
 
 class Mains(Model):
+    """Lines of the mains: shaking of the base, ripple of the amplifier, hum of the sense chain."""
+
     on: bool = False
     frequency_hz: Annotated[float, Field(ge=10.0, le=100.0)] = 50.0
     harmonics: Annotated[tuple[Harmonic, ...], Field(max_length=8)] = ()

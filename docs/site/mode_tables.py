@@ -1,17 +1,7 @@
-"""Writes the generated parts of safety.md: the mode diagram and the tables, each from the data that the code runs.
-
-    python docs/tables/modes.py
-
-Each part stands between ``<!-- generated: NAME -->`` and ``<!-- end -->``; what is around them is written by hand.
-"""
-
-import re
-from pathlib import Path
+"""The tables of modes and gate, and the diagram of the modes, from the data that the code runs."""
 
 from pkxyz_ctrl.safety.gate import PERMITTED, FrameKind
 from pkxyz_ctrl.safety.modes import MODE_FACTS, TRANSITIONS, Mode
-
-PAGE = Path(__file__).parents[1] / "understand" / "safety.md"
 
 Rows = list[list[str]]
 
@@ -37,6 +27,7 @@ def diagram() -> str:
 
 
 def modes() -> str:
+    """Every mode, and what holds in it."""
     header = ["mode", "meaning", "voltage may go out", "loop closed", "node expected"]
     return _table(
         header,
@@ -49,18 +40,6 @@ def modes() -> str:
 
 
 def gate() -> str:
+    """Which frames the transmit gate lets out in which mode."""
     rows = [[mode.name, *(_yes(kind in kinds) for kind in FrameKind)] for mode, kinds in PERMITTED.items()]
     return _table(["mode", *(str(kind.name) for kind in FrameKind)], rows)
-
-
-PARTS = {"diagram": diagram, "modes": modes, "gate": gate}
-
-
-def filled_in(page: str) -> str:
-    """``page`` with every generated part as it has to be now. Raises KeyError for a part that nobody generates."""
-    pattern = r"(<!-- generated: (\w+) -->\n).*?(<!-- end -->)"
-    return re.sub(pattern, lambda match: f"{match[1]}{PARTS[match[2]]()}\n{match[3]}", page, flags=re.DOTALL)
-
-
-if __name__ == "__main__":
-    PAGE.write_text(filled_in(PAGE.read_text(encoding="utf-8")), encoding="utf-8")
