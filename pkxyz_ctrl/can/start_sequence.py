@@ -37,15 +37,9 @@ class StartSequence:
     """The start-up of one node; ``state`` runs from RESETTING to OPERATIONAL or FAILED.
 
     In IDENTIFYING the node says who it is, in CONFIGURING what it holds; what differs is written, and everything that
-<<<<<<< HEAD
     has to hold is read once more. Once it is operational, at 0 V, our heartbeat stays away: in TRYING a node has to
     leave that state by itself. One that has done so, or of which a report says so, is known by identity and serial
     number and not tried again. ``lost`` tells which protections it does without.
-=======
-    has to hold is read a second time, written or not. Once it is operational, at 0 V, our heartbeat stays away: in
-    TRYING a node has to leave that state by itself. One that has done so, or of which a report says so, is known by
-    identity and serial number and not tried again. ``lost`` tells which protections it does without.
->>>>>>> b34f3bb (Safety, wire, laws and tests on two thirds of the words: tables of modes, gate, limits and PDOs are made when the site is built, and the start-up is told as it is: everything is read twice)
     """
 
     def __init__(self, config: DriverConfig, count_step_max: int) -> None:

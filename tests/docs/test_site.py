@@ -14,6 +14,7 @@ from mkdocs.commands.build import build
 from mkdocs.config import load_config
 
 from hil.conformance.run import CHECKS
+from hil.studies.faults.matrix import CASES
 from pkxyz_ctrl.can.emergency import _EXACT
 from pkxyz_ctrl.client.plain import Stage
 from pkxyz_ctrl.loop.row import ROW, columns
@@ -122,6 +123,11 @@ def test_every_table_of_the_code_stands_on_a_page_of_the_site(site: Path, name: 
 def test_every_check_of_an_amplifier_is_in_its_table() -> None:
     text = reference_tables.conformance()
     assert all(f"| {check.name} | {check.expected} | {check.basis} |" in text for check in CHECKS)
+
+
+def test_the_kept_matrix_is_of_today_s_faults() -> None:
+    told = [line.split(" | ")[0].strip("| ") for line in reference_tables.matrix().splitlines()[2:]]
+    assert told == [case.text for case in CASES]
 
 
 def test_a_mark_that_nobody_serves_is_an_error() -> None:
