@@ -125,7 +125,6 @@ SESSION = np.dtype(
         ("activity", "<i4"),
         ("in_position", "<i4"),
         ("homed", "<i4"),
-        ("driven", "<i4"),  # 1 while the loop is closed
         ("running_id", "<u8"),  # of the command that moves the stage, 0 for none
         ("target_m", "<f8", (3,)),  # where the motion ends
         ("progress", "<f8"),  # 0..1 of a path

@@ -110,7 +110,7 @@ class Session:
             stage.setpoints.advance(int(controller.memory["reference_tick"][0]))
         for command in commands:
             self._begin(command)
-        self._tell(row)
+        self._tell()
 
     # -- commands ------------------------------------------------------------------------------------------------------
 
@@ -294,18 +294,18 @@ class Session:
     def _is_on_path(self) -> bool:
         return self.stage.setpoints.follows(self.stage.path)
 
-    def _tell(self, row: np.void) -> None:
+    def _tell(self) -> None:
         state, stage = self.state, self.stage
         setpoints, path = stage.setpoints, stage.path
         state["activity"] = int(self._activity())
         state["in_position"] = stage.is_in_position and stage.is_driven
-        state["homed"], state["driven"] = stage.is_homed, stage.is_driven
+        state["homed"] = stage.is_homed
         state["running_id"] = self._job.id if self._job is not None else 0
         state["target_m"] = setpoints.target_m
         on_path = self._is_on_path
         state["path_row"] = setpoints.path_row if on_path else 0.0
         state["progress"] = setpoints.path_row / max(1, path.rows) if on_path and path is not None else 0.0
-        state["missed"] += int(row["overrun"]) + int(row["sense_status"] & 1)
+        state["missed"] = stage.controller.missed_ticks
 
     def _activity(self) -> Activity:
         stage, setpoints = self.stage, self.stage.setpoints

@@ -6,7 +6,7 @@ from typing import Any
 import numpy as np
 
 from hil.operate.commands import ACTIVITY_WORDS, Activity
-from pkxyz_ctrl.safety.modes import MODE_FACTS, Mode
+from pkxyz_ctrl.safety.modes import LOOP_CLOSED, MODE_FACTS, Mode
 
 
 def status_of(tick: np.void, description: dict[str, Any], bus_load: float) -> dict[str, Any]:
@@ -19,7 +19,7 @@ def status_of(tick: np.void, description: dict[str, Any], bus_load: float) -> di
         "t_s": int(row["t_us"]) * 1e-6, "tick": int(row["tick"]),
         "mode": mode.name, "mode_words": MODE_FACTS[mode].meaning,
         "activity": activity.name.lower(), "words": ACTIVITY_WORDS[activity],
-        "homed": bool(session["homed"]), "driven": bool(session["driven"]),
+        "homed": bool(session["homed"]), "driven": bool(LOOP_CLOSED[mode]),
         "in_position": bool(session["in_position"]), "running_id": int(session["running_id"]),
         "setpoint_m": _finite(row["reference_m"]), "position_m": _finite(row["estimate_m"]),
         "error_m": _finite(row["estimate_m"] - row["reference_m"]), "target_m": _finite(session["target_m"]),

@@ -135,8 +135,7 @@ def measure(period_us: int, seconds: float, cyclictest: str | None = None) -> La
     setup = _setup(period_us, seconds)
     amplifier = _Amplifier(_played(setup))
     controller = Controller(setup.law, setup.bus, wall_gate(setup.gate), amplifier.send)
-    controller.mode = int(Mode.IDLE)  # as after the start-up, which a played amplifier cannot answer
-    controller.memory["mode"] = Mode.IDLE
+    controller.memory["mode"] = Mode.IDLE  # as after the start-up, which a played amplifier cannot answer
     reference = reference_rows(setup.trajectory.sample(0, setup.ticks + PREVIEW_ROWS, period_us))
     cycling.cycle(setup.law, cycling.new_memory(), reference)
     beside = _start_cyclictest(cyclictest, period_us, seconds)

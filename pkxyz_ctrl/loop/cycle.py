@@ -176,18 +176,13 @@ def respond(law_array: Records, memory_array: Records) -> None:
 def cycle_on(
     law_array: Records, memory_array: Records, reference: Records,
     event: int, sense_status: int, node_events: int, overrun: int, count_1: int, count_2: int, count_3: int,
-) -> tuple[int, int, int, int]:  # fmt: skip
-    """``cycle`` with its ``INPUT`` handed in, trips excepted. Returns the mode and the drive counts.
-
-    A call from Python for all that passes between the two: each number costs less than a look into the memory.
-    """
-    seen, row = memory_array[0]["input"], memory_array[0]["row"]
+) -> None:  # fmt: skip
+    """``cycle`` with its ``INPUT`` handed in, trips excepted: each number costs less than its way into the memory."""
+    seen = memory_array[0]["input"]
     seen["event"], seen["sense_status"] = event, sense_status
     seen["node_events"], seen["overrun"] = node_events, overrun
     seen["sense_count"][0], seen["sense_count"][1], seen["sense_count"][2] = count_1, count_2, count_3
     cycle(law_array, memory_array, reference)
-    drive = row["drive_count"]
-    return memory_array[0]["mode"], drive[0], drive[1], drive[2]
 
 
 @njit(cache=True, error_model="numpy")

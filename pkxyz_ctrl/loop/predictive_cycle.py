@@ -70,14 +70,12 @@ class PredictiveCycle:
     def on(
         self, law: Records, memory: Records, reference: Records, event: int, sense_status: int, node_events: int,
         overrun: int, count_1: int, count_2: int, count_3: int,
-    ) -> tuple[int, int, int, int]:  # fmt: skip
-        """One period with its input handed in, as ``cycle.cycle_on``: mode and drive counts."""
+    ) -> None:  # fmt: skip
+        """One period with its input handed in, as ``cycle.cycle_on``."""
         seen = memory["input"][0]
         seen["event"], seen["sense_status"], seen["node_events"] = event, sense_status, node_events
         seen["overrun"], seen["sense_count"] = overrun, (count_1, count_2, count_3)
         self(law, memory, reference)
-        a, b, c = memory["row"]["drive_count"][0].tolist()
-        return int(memory["mode"][0]), a, b, c
 
     def _solve(self, law: Records, memory: Records) -> None:
         if self._is_cold:

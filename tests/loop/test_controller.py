@@ -7,7 +7,7 @@ from itertools import pairwise
 
 import numpy as np
 import pytest
-from loop_rig import rows_of
+from loop_rig import rows_of, setup
 
 from hil.faults.fault import parse
 from hil.lanes.blocks import Blocks
@@ -15,6 +15,7 @@ from hil.lanes.lockstep import LockstepRig
 from hil.studies.faults.outcome import setup_for
 from pkxyz_ctrl.can.frame import Frame
 from pkxyz_ctrl.can.start_sequence import DriverState
+from pkxyz_ctrl.loop.controller import Controller
 from pkxyz_ctrl.safety.modes import Mode
 
 
@@ -75,6 +76,18 @@ class Watched:
 
     def of(self, can_id):
         return [frame.data for _, frame in self.frames if frame.can_id == can_id]
+
+
+def test_the_mode_and_the_counts_stand_in_the_memory_of_the_cycle_and_nowhere_else():
+    sent = []
+    controller = Controller(setup().law, setup().bus, setup().gate, sent.append)
+    controller.memory["mode"] = Mode.IDLE
+    controller.memory["tick"]["count"][0, 0] = (1, 2, 3)
+    assert controller.mode == Mode.IDLE
+    controller.finish(1000, 0)
+    assert controller.faults[-1].endswith("blocked in IDLE: DRIVE is not permitted now")
+    assert "[01 00 02 00 03 00" in controller.faults[-1]
+    assert [frame.data[:6] for frame in sent] == [bytes(6)]
 
 
 def test_a_clear_while_it_is_starting_clears_nothing_that_comes_later():

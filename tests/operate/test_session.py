@@ -7,6 +7,7 @@ from operated_rig import MIDDLE_M, Feeder, OperatedRig, Script
 from hil.operate.commands import Activity, State, Verb
 from hil.operate.settings import Settings
 from pkxyz_ctrl.safety.modes import Mode
+from pkxyz_ctrl.safety.monitors import SenseStatus
 from pkxyz_ctrl.trajectory import Raster, Trajectory
 from pkxyz_ctrl.trajectory.segments import Limits
 
@@ -353,7 +354,10 @@ def test_released_by_hand_is_0_v_at_once_and_latched_until_cleared():
         refused = rig.give(Verb.ENABLE)
         yield from rig.until_final(refused)
         assert rig.state_of(refused) is State.REFUSED
+        yield from rig.wait_s(0.05)
+        assert rig.rows[-1]["sense_status"] & SenseStatus.MISSING
         assert (yield from rig.do(Verb.CLEAR)) is State.DONE
+        assert rig.session.state["missed"] == rig.controller.missed_ticks < 50  # a released node owes no sample
         assert rig.session.state["homed"] == 0
         yield from rig.switched_on()
 

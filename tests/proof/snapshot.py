@@ -40,7 +40,6 @@ UNREAD = {
     ("Controller", "faults"),
     ("Controller", "missed_ticks"),
     ("Controller", "_reference"),
-    ("Controller", "_drive_counts"),  # written by compute, read by finish; in between no state is taken
     ("TransmitGate", "blocked_frames"),
     ("AmplifierDriver", "emergencies"),
     ("AmplifierDriver", "lost"),

@@ -430,7 +430,7 @@ class World:
         self.skipped = 0
         if MAY_ENERGISE[controller.mode] and not MAY_ENERGISE[was] and self.quiet < SETTLED:
             raise ViolationError(f"the loop is closed after {self.quiet} quiet ticks, {SETTLED} are asked for")
-        is_quiet = fresh and not any(controller._drive_counts)
+        is_quiet = fresh and not any(controller._count)
         self.quiet = min(self.quiet + 1, SETTLED) if is_quiet else 0
         self.phase = "finish"
 
