@@ -1,7 +1,8 @@
 """What the combs can hold and follow, asked between two ticks, before anything moves.
 
 Combs only pull, and only up to their voltage: the positions that can be held are a body that begins in a point at rest.
-The same forces as in ``trajectory.check``, compiled: a motion of a hundred rows takes some 50 us.
+Forces and limits are those of ``trajectory.check``, which looks for the worst of a whole reference and says how to mend
+its file; here the first objection ends the question, so that a motion of a hundred rows takes some 50 us.
 """
 
 import math
@@ -10,10 +11,10 @@ import numpy as np
 from numba import njit
 from numpy.typing import NDArray
 
-from pkxyz_ctrl.core import elasticity, kinematics
-from pkxyz_ctrl.core.linear3 import inverse3
+from pkxyz_ctrl.core import kinematics
 from pkxyz_ctrl.stage import Stage
 from pkxyz_ctrl.trajectory.check import DriveLimits
+from pkxyz_ctrl.trajectory.comb_forces import INERTIA, ROUNDING_M, ROUNDING_N, forces_of, inertia_of
 
 Array = NDArray[np.float64]
 Records = NDArray[np.void]
@@ -25,13 +26,11 @@ _LIMITS = np.dtype(
         ("force_max_n", "f8", (3,)),
         ("gain_n_per_v2", "f8", (3,)),
         ("slew_v", "f8"),  # most that a voltage may change in a period
-        ("damping_n_s_per_m", "f8", (3, 3)),
-        ("mass_kg", "f8"),
+        ("inertia", INERTIA),
     ],
     align=True,
 )
 _FINE, _DOMAIN, _STROKE, _PUSH, _VOLTAGE, _SLEW = range(6)
-_ROUNDING_M, _ROUNDING_N = 1e-12, 1e-9
 _HALVINGS = 28
 _SPAN_STROKES, _PROBES = 2.5, 101
 _AXES = "xyz"
@@ -50,9 +49,7 @@ class Reach:
         numbers["gain_n_per_v2"] = stage.force_gain_n_per_v2
         numbers["force_max_n"] = stage.force_gain_n_per_v2 * self._limit_v**2
         numbers["slew_v"] = drive.slew_max_v_per_s * drive.period_us * 1e-6
-        eigenvalue, mode = np.linalg.eigh(stage.stiffness(np.zeros(3)))
-        damping = math.sqrt(stage.mass_kg) / stage.quality_factor * (mode * np.sqrt(eigenvalue)) @ mode.T
-        numbers["damping_n_s_per_m"], numbers["mass_kg"] = damping, stage.mass_kg
+        numbers["inertia"] = inertia_of(stage)[0]
         self._span_m = _SPAN_STROKES * limits.stroke_max_m
 
     def holds(self, position_m: Array) -> bool:
@@ -158,26 +155,16 @@ def _objection(
 ) -> tuple[int, int, float]:
     """The limit that a row (9,) of a reference passes, the comb, and the value; ``force`` (3,): what the combs give."""
     bounds = limits[0]
-    position, demand = row[0:3], np.empty(3)
+    position = row[0:3]
     if kinematics.in_domain(geometry[0], position) != 0:
         return _DOMAIN, 0, 0.0
     kinematics.strokes(geometry[0], position, force)
     for i in range(3):
-        if force[i] < bounds["stroke_min_m"] - _ROUNDING_M or force[i] > bounds["stroke_max_m"] + _ROUNDING_M:
+        if force[i] < bounds["stroke_min_m"] - ROUNDING_M or force[i] > bounds["stroke_max_m"] + ROUNDING_M:
             return _STROKE, i, force[i]
-    elasticity.energy_gradient(geometry[0], elastic[0], position, demand)
-    damping = bounds["damping_n_s_per_m"]
+    forces_of(geometry[0], elastic[0], bounds["inertia"], row, force)
     for i in range(3):
-        demand[i] += bounds["mass_kg"] * row[6 + i]
-        for k in range(3):
-            demand[i] += damping[i, k] * row[3 + k]
-    pulls, inverse = np.empty((3, 3)), np.empty((3, 3))
-    kinematics.pulls(geometry[0], position, pulls)
-    inverse3(pulls, inverse)
-    for i in range(3):
-        force[i] = inverse[0, i] * demand[0] + inverse[1, i] * demand[1] + inverse[2, i] * demand[2]
-    for i in range(3):
-        if force[i] < -_ROUNDING_N:
+        if force[i] < -ROUNDING_N:
             return _PUSH, i, force[i]
         if force[i] > bounds["force_max_n"][i]:
             return _VOLTAGE, i, force[i]

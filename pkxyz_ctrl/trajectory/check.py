@@ -8,13 +8,12 @@ from numpy.typing import NDArray
 
 from pkxyz_ctrl.stage import Stage, StageDomainError
 from pkxyz_ctrl.trajectory import TimedSegment, Trajectory, TrajectoryError
+from pkxyz_ctrl.trajectory.comb_forces import ROUNDING_M, ROUNDING_N, comb_forces
 from pkxyz_ctrl.trajectory.motion import Array
 
 _CHUNK = 4096
 _STEP_MAX_US = 100
 _SAMPLES_A_PERIOD = 40  # of a periodic motion: between two samples an extreme hides 0.3 % of the amplitude
-_ROUNDING_M = 1e-12  # far below anything measurable; a reference that goes to a limit exactly is allowed
-_ROUNDING_N = 1e-12
 _NEAREST_M = 1e-12
 
 _MOTION = "velocity_max_m_per_s, acceleration_max_m_per_s2 or jerk_max_m_per_s3"
@@ -102,18 +101,6 @@ def _worst_sampled(
     return _too_fast(stage, trajectory, drive, rows, t_us, comb_forces(stage, rows[new])[np.cumsum(new) - 1], lag)
 
 
-def comb_forces(stage: Stage, rows: Array) -> Array:
-    """Comb forces (n, 3) in N that let the platform follow rows (n, 9) of a trajectory; negative where that is a push.
-
-    Damping is that of the stage file, modal about rest: C = sqrt(m) K(0)^(1/2) / Q.
-    """
-    eigenvalue, mode = np.linalg.eigh(stage.stiffness(np.zeros(3)))
-    damping = math.sqrt(stage.mass_kg) / stage.quality_factor * (mode * np.sqrt(eigenvalue)) @ mode.T
-    position, velocity, acceleration = rows[:, 0:3], rows[:, 3:6], rows[:, 6:9]
-    demand = stage.energy_gradient(position) + velocity @ damping + stage.mass_kg * acceleration
-    return np.linalg.solve(np.swapaxes(stage.pulls(position), -1, -2), demand[..., None])[..., 0]
-
-
 def within_limits(stage: Stage, rows: Array, drive: DriveLimits) -> bool:
     """Whether rows (n, 9), a period of the drive apart, keep strokes, pulls, voltages and slew within the limits."""
     if _worst_of(stage, rows, _limit_v(stage, drive)) is not None:
@@ -143,12 +130,12 @@ def _worst_of(stage: Stage, rows: Array, limit_v: float) -> _Beyond | None:
     limits, strokes = stage.config.limits, stage.inverse_kinematics(position)
     over = np.maximum(limits.stroke_min_m - strokes, strokes - limits.stroke_max_m)
     n, comb = _place_of_most(over)
-    if over[n, comb] > _ROUNDING_M:
+    if over[n, comb] > ROUNDING_M:
         low, high = limits.stroke_min_m * 1e6, limits.stroke_max_m * 1e6
         why = f"stroke {comb + 1} would be {strokes[n, comb] * 1e6:.4g} um, outside {low:g} to {high:g} um"
         return _Beyond(_STROKE, float(over[n, comb]), position[n], why)
     force = comb_forces(stage, rows)
-    over = np.maximum(-force - _ROUNDING_N, force - stage.force_gain_n_per_v2 * limit_v**2)
+    over = np.maximum(-force - ROUNDING_N, force - stage.force_gain_n_per_v2 * limit_v**2)
     n, comb = _place_of_most(over)
     if not over[n, comb] > 0.0:
         return None

@@ -29,7 +29,8 @@ from pkxyz_ctrl.design.identification.modal_fit import FitError, ModalFit
 from pkxyz_ctrl.design.law import design_law
 from pkxyz_ctrl.stage import Stage, StageDomainError
 from pkxyz_ctrl.trajectory import Hold, Move, Trajectory, TrajectoryError
-from pkxyz_ctrl.trajectory.check import check_against, comb_forces
+from pkxyz_ctrl.trajectory.check import check_against
+from pkxyz_ctrl.trajectory.comb_forces import comb_forces
 from sim.config import Device, PlantConfig
 
 DRAWN = load("stages", "reconstructed", StageConfig)

@@ -53,7 +53,7 @@ HOUSE: Mapping[str, Room] = MappingProxyType({
         ("pkxyz_ctrl.config", "pkxyz_ctrl.elements"), ("math", "itertools", "pydantic", "numpy", *VALUES)
     ),
     "pkxyz_ctrl.mechanics": Room(("pkxyz_ctrl.config", "pkxyz_ctrl.core", "pkxyz_ctrl.elements", "pkxyz_ctrl")),
-    "pkxyz_ctrl.trajectory": Room(("pkxyz_ctrl.config", "pkxyz_ctrl")),
+    "pkxyz_ctrl.trajectory": Room(("pkxyz_ctrl.config", "pkxyz_ctrl.core", "pkxyz_ctrl")),
     "pkxyz_ctrl.learning": Room(("pkxyz_ctrl.safety", "pkxyz_ctrl.config", "pkxyz_ctrl.trajectory")),
     "pkxyz_ctrl.design.model": Room(("pkxyz_ctrl.config", "pkxyz_ctrl")),
     "pkxyz_ctrl.design.margins": Room(("pkxyz_ctrl.config", "pkxyz_ctrl.design.model")),

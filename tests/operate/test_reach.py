@@ -8,7 +8,8 @@ from loop_rig import stage
 
 from hil.operate.reach import Reach
 from pkxyz_ctrl.stage import StageDomainError
-from pkxyz_ctrl.trajectory.check import DriveLimits, comb_forces, within_limits
+from pkxyz_ctrl.trajectory.check import DriveLimits, within_limits
+from pkxyz_ctrl.trajectory.comb_forces import comb_forces
 
 DRIVE = DriveLimits(200.0, 100e3, 200)
 REACH = Reach(stage(), DRIVE)

@@ -10,7 +10,8 @@ from hil.runs.scenario import load_scenario
 from pkxyz_ctrl.config.files import names
 from pkxyz_ctrl.stage import Stage
 from pkxyz_ctrl.trajectory import AnySegment, Circle, Hold, Move, Sine, Steps, Table, Trajectory, TrajectoryError
-from pkxyz_ctrl.trajectory.check import KEYS, DriveLimits, check_against, comb_forces
+from pkxyz_ctrl.trajectory.check import KEYS, DriveLimits, check_against
+from pkxyz_ctrl.trajectory.comb_forces import comb_forces
 
 STAGE = Stage.load("reconstructed")
 MIDDLE = Move(
