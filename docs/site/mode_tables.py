@@ -1,6 +1,6 @@
 """The tables of modes and gate, and the diagram of the modes, from the data that the code runs."""
 
-from pkxyz_ctrl.safety.gate import PERMITTED, FrameKind
+from pkxyz_ctrl.safety.gate_rules import PERMITTED, FrameKind
 from pkxyz_ctrl.safety.modes import MODE_FACTS, TRANSITIONS, Mode
 
 Rows = list[list[str]]

@@ -1,41 +1,69 @@
 """Which SDO requests may go to the amplifier: reads, and writes of a short list of objects with harmless values.
 
 The gate's own reading of CiA 301 (7.2.4) and CiA 401, on purpose not shared with the driver that makes the requests.
+A request is its eight bytes as an integer, the first one lowest: command, index (two bytes), sub-index, value (four).
 """
 
-import struct
-from collections.abc import Callable
 from dataclasses import dataclass
-from typing import Final, NamedTuple
+from enum import IntEnum
+from typing import Final
 
-_REQUEST: Final = struct.Struct("<BHBI")
-_DOWNLOAD_SIZE: Final = {0x2F: 1, 0x2B: 2, 0x27: 3, 0x23: 4}  # expedited with size said; nothing else is let through
+import numpy as np
+from numba import njit
+from numpy.typing import NDArray
+
 _UPLOAD: Final = 0x40
-_UPLOAD_SEGMENT: Final = (0x60, 0x70)
+_UPLOAD_SEGMENT, _UPLOAD_SEGMENT_TOGGLED = 0x60, 0x70
 _ABORT: Final = 0x80
 _COB_ID_OFF: Final = 1 << 31
 _COB_ID_MASK: Final = 0x3FFFFFFF  # without "off" (bit 31) and "no remote frame" (bit 30)
+_PDO_STEP: Final = 0x100
+_FIRST_TPDO_ID, _LAST_TPDO_ID = 0x180, 0x480
+
+WRITES = np.dtype(
+    [
+        ("drive_index", "i4"),  # communication parameter of the drive PDO
+        ("drive_id", "i4"),
+        ("drive_channel", "i4", (3,)),  # sub-indices of 0x6411
+        ("node_id", "i4"),
+        ("controller_node_id", "i4"),
+        ("timeout_max_ms", "i4"),
+        ("count_slew_max", "i4"),
+    ],
+    align=True,
+)
+"""What the values are compared with."""
 
 
-class WriteContext(NamedTuple):
-    """What the values are compared with. ``object_index``, ``subindex``: what is being written; ``drive_index``: the
-    communication parameter of the drive PDO, ``drive_id`` its identifier, ``drive_channels`` the sub-indices of 0x6411.
-    """
+class Value(IntEnum):
+    """What an object may hold. The first two compare with ``low`` and ``high`` of the rule."""
 
-    node_id: int
-    controller_node_id: int
-    heartbeat_timeout_max_ms: int
-    count_slew_max: int
-    drive_index: int
-    drive_id: int
-    drive_channels: tuple[int, int, int]
-    object_index: int = 0
-    subindex: int = 0
+    BETWEEN = 0
+    EITHER = 1
+    OUR_HEARTBEAT = 2
+    IN_TIME = 3
+    STEP = 4
+    DRIVE_OR_OFF = 5
+    EVERY_SYNC = 6
+    DRIVE_FIELD = 7
+    OWN_OR_OFF = 8
+    OF_A_COMB = 9  # and ``low``, in one of the three channels
+
+
+class WriteReason(IntEnum):
+    """Why a write is not permitted."""
+
+    NONE = 0
+    COMMAND = 1
+    BEHIND = 2
+    UNLISTED = 3
+    SIZE = 4
+    VALUE = 5
 
 
 @dataclass(frozen=True, slots=True)
 class WriteRule:
-    """Objects first..last, sub-indices sub_first..sub_last: exactly ``size`` bytes, a value that ``accepts`` takes."""
+    """Objects first..last, sub-indices sub_first..sub_last: exactly ``size`` bytes, a ``value`` of this kind."""
 
     first: int
     last: int
@@ -44,116 +72,163 @@ class WriteRule:
     size: int
     what: str
     permitted: str
-    accepts: Callable[[int, WriteContext], bool]
-
-    def covers(self, index: int, subindex: int) -> bool:
-        return self.first <= index <= self.last and self.sub_first <= subindex <= self.sub_last
-
-
-def _anything(value: int, context: WriteContext) -> bool:
-    return True
+    value: Value
+    low: int = 0
+    high: int = 0xFFFFFFFF
 
 
-def _is(*values: int) -> Callable[[int, WriteContext], bool]:
-    return lambda value, context: value in values
-
-
-def _not_zero(value: int, context: WriteContext) -> bool:
-    return value > 0
-
-
-def _our_heartbeat(value: int, context: WriteContext) -> bool:
-    timeout_ms = value & 0xFFFF
-    return value >> 16 == context.controller_node_id and 1 <= timeout_ms <= context.heartbeat_timeout_max_ms
-
-
-def _in_time(value: int, context: WriteContext) -> bool:
-    return 1 <= value <= context.heartbeat_timeout_max_ms
-
-
-def _step(value: int, context: WriteContext) -> bool:
-    return 1 <= value <= context.count_slew_max
-
-
-def _drive_or_off(value: int, context: WriteContext) -> bool:
-    if context.object_index == context.drive_index and value & _COB_ID_MASK == context.drive_id:
-        return True
-    return bool(value & _COB_ID_OFF)
-
-
-def _of_a_comb(only: int) -> Callable[[int, WriteContext], bool]:
-    return lambda value, context: value == only and context.subindex in context.drive_channels
-
-
-def _every_sync(value: int, context: WriteContext) -> bool:
-    return context.object_index == context.drive_index and value == 1
-
-
-def _drive_field(value: int, context: WriteContext) -> bool:
-    """All that a PDO may write: three counts, alive counter, CRC. Never 0x6444, 0x2010 or 0x1016."""
-    counts = (0x6411_0010 | channel << 8 for channel in context.drive_channels)
-    return value in (0, *counts, 0x2000_0108, 0x2000_0208)
-
-
-def _own_or_off(value: int, context: WriteContext) -> bool:
-    own = [base + context.node_id for base in (0x180, 0x280, 0x380, 0x480)]
-    return bool(value & _COB_ID_OFF) or value & _COB_ID_MASK in own
-
-
+_ANY, _EITHER, _COMB, _HEARTBEAT = Value.BETWEEN, Value.EITHER, Value.OF_A_COMB, Value.OUR_HEARTBEAT
 WRITE_RULES: Final = (
-    WriteRule(0x1005, 0x1005, 0, 0, 4, "identifier of SYNC", "0x080, the node not its producer", _is(0x80)),
-    WriteRule(0x1016, 0x1016, 1, 1, 4, "consumer of our heartbeat", "our node id, 1 ms to the limit", _our_heartbeat),
-    WriteRule(0x1017, 0x1017, 0, 0, 2, "the node's heartbeat", "1 ms or more, never off", _not_zero),
-    WriteRule(0x1019, 0x1019, 0, 0, 1, "overflow of the SYNC counter", "240", _is(240)),
-    WriteRule(0x1029, 0x1029, 1, 1, 1, "behaviour on communication error", "0 or 2, never 'carry on'", _is(0, 2)),
-    WriteRule(0x1400, 0x15FF, 1, 1, 4, "identifier of a receive PDO", "drive PDO: its own; or off", _drive_or_off),
-    WriteRule(0x1400, 0x15FF, 2, 2, 1, "receive PDO: transmission type", "drive PDO: 1, every SYNC", _every_sync),
-    WriteRule(0x1600, 0x17FF, 0, 0, 1, "receive mapping: number of entries", "0 to 5", _is(*range(6))),
-    WriteRule(0x1600, 0x17FF, 1, 64, 4, "receive mapping: entry", "0x6411 of a comb, 0x2000, none", _drive_field),
-    WriteRule(0x1800, 0x19FF, 1, 1, 4, "identifier of a transmit PDO", "the node's own four; or off", _own_or_off),
-    WriteRule(0x1800, 0x19FF, 2, 2, 1, "transmit PDO: transmission type", "any", _anything),
-    WriteRule(0x1800, 0x19FF, 3, 3, 2, "transmit PDO: inhibit time", "any", _anything),
-    WriteRule(0x1800, 0x19FF, 5, 5, 2, "transmit PDO: event timer", "any", _anything),
-    WriteRule(0x1A00, 0x1BFF, 0, 0, 1, "transmit mapping: number of entries", "any", _anything),
-    WriteRule(0x1A00, 0x1BFF, 1, 64, 4, "transmit mapping: entry", "any", _anything),
-    WriteRule(0x2010, 0x2010, 0, 0, 1, "SYNCs without a drive PDO until 0 V", "1 or more, never off", _not_zero),
-    WriteRule(0x2011, 0x2011, 0, 0, 2, "largest step of a drive count", "1 to our own slew limit", _step),
-    WriteRule(0x2012, 0x2012, 0, 0, 2, "time without an applied drive PDO", "1 ms to the limit", _in_time),
-    WriteRule(0x6443, 0x6443, 1, 254, 1, "error mode of a comb", "1, use the error value", _of_a_comb(1)),
-    WriteRule(0x6444, 0x6444, 1, 254, 4, "error value of a comb", "0, that is 0 V", _of_a_comb(0)),
+    WriteRule(0x1005, 0x1005, 0, 0, 4, "identifier of SYNC", "0x080, the node not its producer", _EITHER, 0x80, 0x80),
+    WriteRule(
+        0x1016, 0x1016, 1, 1, 4, "consumer of our heartbeat", "our node id, 1 ms to the limit", Value.OUR_HEARTBEAT
+    ),
+    WriteRule(0x1017, 0x1017, 0, 0, 2, "the node's heartbeat", "1 ms or more, never off", Value.BETWEEN, 1),
+    WriteRule(0x1019, 0x1019, 0, 0, 1, "overflow of the SYNC counter", "240", _EITHER, 240, 240),
+    WriteRule(0x1029, 0x1029, 1, 1, 1, "behaviour on communication error", "0 or 2, never 'carry on'", _EITHER, 0, 2),
+    WriteRule(0x1400, 0x15FF, 1, 1, 4, "identifier of a receive PDO", "drive PDO: its own; or off", Value.DRIVE_OR_OFF),
+    WriteRule(0x1400, 0x15FF, 2, 2, 1, "receive PDO: transmission type", "drive PDO: 1, every SYNC", Value.EVERY_SYNC),
+    WriteRule(0x1600, 0x17FF, 0, 0, 1, "receive mapping: number of entries", "0 to 5", Value.BETWEEN, 0, 5),
+    WriteRule(0x1600, 0x17FF, 1, 64, 4, "receive mapping: entry", "0x6411 of a comb, 0x2000, none", Value.DRIVE_FIELD),
+    WriteRule(0x1800, 0x19FF, 1, 1, 4, "identifier of a transmit PDO", "the node's own four; or off", Value.OWN_OR_OFF),
+    WriteRule(0x1800, 0x19FF, 2, 2, 1, "transmit PDO: transmission type", "any", _ANY),
+    WriteRule(0x1800, 0x19FF, 3, 3, 2, "transmit PDO: inhibit time", "any", _ANY),
+    WriteRule(0x1800, 0x19FF, 5, 5, 2, "transmit PDO: event timer", "any", _ANY),
+    WriteRule(0x1A00, 0x1BFF, 0, 0, 1, "transmit mapping: number of entries", "any", _ANY),
+    WriteRule(0x1A00, 0x1BFF, 1, 64, 4, "transmit mapping: entry", "any", _ANY),
+    WriteRule(0x2010, 0x2010, 0, 0, 1, "SYNCs without a drive PDO until 0 V", "1 or more, never off", Value.BETWEEN, 1),
+    WriteRule(0x2011, 0x2011, 0, 0, 2, "largest step of a drive count", "1 to our own slew limit", Value.STEP),
+    WriteRule(0x2012, 0x2012, 0, 0, 2, "time without an applied drive PDO", "1 ms to the limit", Value.IN_TIME),
+    WriteRule(0x6443, 0x6443, 1, 254, 1, "error mode of a comb", "1, use the error value", _COMB, 1),
+    WriteRule(0x6444, 0x6444, 1, 254, 4, "error value of a comb", "0, that is 0 V", _COMB, 0),
 )
 
 
-def _fields(data: bytes) -> tuple[int, int, int, int]:
-    command, index, subindex, value = _REQUEST.unpack(data)
-    return command, index, subindex, value
+def _table() -> NDArray[np.void]:
+    numbers = [(r.first, r.last, r.sub_first, r.sub_last, r.size, r.value, r.low, r.high) for r in WRITE_RULES]
+    fields = [("first", "u2"), ("last", "u2"), ("sub_first", "u1"), ("sub_last", "u1"), ("size", "u1"), ("value", "u1")]
+    table = np.array(numbers, np.dtype([*fields, ("low", "u4"), ("high", "u4")], align=True))
+    table.setflags(write=False)
+    return table
 
 
-def is_read(data: bytes) -> bool:
+_RULES: Final = _table()
+_BETWEEN, _OUR_HEARTBEAT, _IN_TIME, _STEP, _DRIVE_OR_OFF, _EVERY_SYNC, _DRIVE_FIELD, _OWN_OR_OFF = (
+    int(Value[name])
+    for name in (
+        "BETWEEN", "OUR_HEARTBEAT", "IN_TIME", "STEP", "DRIVE_OR_OFF", "EVERY_SYNC", "DRIVE_FIELD", "OWN_OR_OFF",
+    )
+)  # fmt: skip
+_EITHER_OF: Final = int(Value.EITHER)
+_COMMAND, _BEHIND, _UNLISTED, _SIZE, _VALUE = (
+    int(WriteReason[name]) for name in ("COMMAND", "BEHIND", "UNLISTED", "SIZE", "VALUE")
+)
+
+
+@njit(cache=True, error_model="numpy")
+def is_read(word: int) -> bool:
     """Whether eight bytes are an upload request, the request of a further segment, or an abort; padding must be 0."""
-    command, index, subindex, rest = _fields(data)
+    command = word & 0xFF
     if command == _UPLOAD:
-        return rest == 0
-    if command in _UPLOAD_SEGMENT:
-        return index == 0 and subindex == 0 and rest == 0
+        return word >> 32 & 0xFFFFFFFF == 0
+    if command in (_UPLOAD_SEGMENT, _UPLOAD_SEGMENT_TOGGLED):
+        return word >> 8 == 0
     return command == _ABORT
 
 
-def write_refusal(data: bytes, limits: WriteContext) -> str | None:
-    """Why the eight bytes are not a permitted write; None if they are."""
-    command, index, subindex, value = _fields(data)
-    size = _DOWNLOAD_SIZE.get(command)
-    if size is None:
-        return f"SDO command 0x{command:02X} is neither a read nor an expedited write with its size"
-    name = f"0x{index:04X}:{subindex:02X}"
-    if value >> 8 * size:
-        return f"SDO write of {name}: the bytes behind its {size} are not empty"
-    context = limits._replace(object_index=index, subindex=subindex)
-    for rule in WRITE_RULES:
-        if rule.covers(index, subindex):
-            if size != rule.size:
-                return f"SDO write of {name} ({rule.what}): {size} bytes instead of {rule.size}"
-            if not rule.accepts(value, context):
-                return f"SDO write of {name} ({rule.what}): 0x{value:X} is not permitted; permitted: {rule.permitted}"
-            return None
-    return f"SDO write of {name}: not in the list of objects that may be written"
+@njit(cache=True, error_model="numpy")
+def size_of(word: int) -> int:
+    """Bytes of an expedited download that says its size; 0 for any other request: nothing else is let through."""
+    command = word & 0xFF
+    return 4 - (command >> 2 & 3) if command & 0xF3 == 0x23 else 0
+
+
+@njit(cache=True, error_model="numpy")
+def rule_of(word: int) -> int:
+    """Place in ``WRITE_RULES`` of the rule for the object that a request names; -1: there is none."""
+    index, subindex = word >> 8 & 0xFFFF, word >> 24 & 0xFF
+    for place in range(len(_RULES)):
+        rule = _RULES[place]
+        if rule["first"] <= index <= rule["last"] and rule["sub_first"] <= subindex <= rule["sub_last"]:
+            return place
+    return -1
+
+
+@njit(cache=True, error_model="numpy")
+def write_refusal(limits: np.void, word: int) -> int:
+    """Why the eight bytes are not a permitted write, a ``WriteReason``; 0 if they are. ``limits`` of ``WRITES``."""
+    size, value = size_of(word), word >> 32 & 0xFFFFFFFF
+    if size == 0:
+        return _COMMAND
+    if value >> 8 * size != 0:
+        return _BEHIND
+    place = rule_of(word)
+    if place < 0:
+        return _UNLISTED
+    rule = _RULES[place]
+    if size != rule["size"]:
+        return _SIZE
+    return 0 if _accepts(limits, rule, word >> 8 & 0xFFFF, word >> 24 & 0xFF, value) else _VALUE
+
+
+@njit(cache=True, error_model="numpy")
+def _accepts(limits: np.void, rule: np.void, index: int, subindex: int, value: int) -> bool:
+    kind = rule["value"]
+    if kind == _BETWEEN:
+        return rule["low"] <= value <= rule["high"]
+    if kind == _EITHER_OF:
+        return value == rule["low"] or value == rule["high"]
+    if kind == _OUR_HEARTBEAT:
+        is_ours = value >> 16 == limits["controller_node_id"]
+        return is_ours and 1 <= value & 0xFFFF <= limits["timeout_max_ms"]
+    if kind == _IN_TIME:
+        return 1 <= value <= limits["timeout_max_ms"]
+    if kind == _STEP:
+        return 1 <= value <= limits["count_slew_max"]
+    is_drive = index == limits["drive_index"]
+    if kind == _DRIVE_OR_OFF:
+        return value & _COB_ID_OFF != 0 or (is_drive and value & _COB_ID_MASK == limits["drive_id"])
+    if kind == _EVERY_SYNC:
+        return is_drive and value == 1
+    if kind == _OWN_OR_OFF:
+        return value & _COB_ID_OFF != 0 or _is_own(value & _COB_ID_MASK, limits["node_id"])
+    if kind == _DRIVE_FIELD:
+        return _is_drive_field(limits, value)
+    return value == rule["low"] and _is_channel(limits, subindex)
+
+
+@njit(cache=True, error_model="numpy")
+def _is_own(cob_id: int, node_id: int) -> bool:
+    """Of the node's four TPDOs."""
+    base = cob_id - node_id
+    return _FIRST_TPDO_ID <= base <= _LAST_TPDO_ID and (base - _FIRST_TPDO_ID) % _PDO_STEP == 0
+
+
+@njit(cache=True, error_model="numpy")
+def _is_channel(limits: np.void, subindex: int) -> bool:
+    channel = limits["drive_channel"]
+    return subindex == channel[0] or subindex == channel[1] or subindex == channel[2]
+
+
+@njit(cache=True, error_model="numpy")
+def _is_drive_field(limits: np.void, value: int) -> bool:
+    """All that a PDO may write: three counts, alive counter, CRC. Never 0x6444, 0x2010 or 0x1016."""
+    if value == 0 or value == 0x2000_0108 or value == 0x2000_0208:
+        return True
+    return value & 0xFFFF_00FF == 0x6411_0010 and _is_channel(limits, value >> 8 & 0xFF)
+
+
+def write_words(reason: int, word: int) -> str:
+    """``write_refusal``'s answer for a person."""
+    if reason == WriteReason.COMMAND:
+        return f"SDO command 0x{word & 0xFF:02X} is neither a read nor an expedited write with its size"
+    size, value = size_of(word), word >> 32 & 0xFFFFFFFF
+    name = f"SDO write of 0x{word >> 8 & 0xFFFF:04X}:{word >> 24 & 0xFF:02X}"
+    if reason == WriteReason.BEHIND:
+        return f"{name}: the bytes behind its {size} are not empty"
+    if reason == WriteReason.UNLISTED:
+        return f"{name}: not in the list of objects that may be written"
+    rule = WRITE_RULES[rule_of(word)]
+    if reason == WriteReason.SIZE:
+        return f"{name} ({rule.what}): {size} bytes instead of {rule.size}"
+    return f"{name} ({rule.what}): 0x{value:X} is not permitted; permitted: {rule.permitted}"

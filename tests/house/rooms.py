@@ -33,9 +33,9 @@ HOUSE: Mapping[str, Room] = MappingProxyType({
     "sim.surroundings": Room(("sim.config", "sim.motion"), NUMBERS),
     "sim": Room(("sim.config", "sim.motion", "sim.structure", "sim.surroundings"), (*NUMBERS, *VALUES)),
     # what runs on the target
-    "pkxyz_ctrl.can": Room((), ("pydantic", *VALUES)),
-    "pkxyz_ctrl.safety": Room(("pkxyz_ctrl.can",), ("numpy", "numba", *VALUES)),
     "pkxyz_ctrl.compiled": Room(),
+    "pkxyz_ctrl.can": Room((), ("pydantic", *VALUES)),
+    "pkxyz_ctrl.safety": Room(("pkxyz_ctrl.compiled", "pkxyz_ctrl.can"), ("numpy", "numba", *VALUES)),
     "pkxyz_ctrl.config": Room(("pkxyz_ctrl.can", "pkxyz_ctrl.safety")),
     "pkxyz_ctrl.core": Room(("pkxyz_ctrl.config",), NUMBERS),
     "pkxyz_ctrl.io": Room(("pkxyz_ctrl.can", "pkxyz_ctrl.config")),

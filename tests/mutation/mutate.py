@@ -32,6 +32,7 @@ FEW = 8  # mutants, for which it does not pay to measure the tests beforehand
 PINNED = "safety/test_safety_pinned.py"
 TARGETS = {
     "pkxyz_ctrl.safety.gate": ("safety/test_safety_gate.py", "safety/test_safety_gate_sweep.py"),
+    "pkxyz_ctrl.safety.gate_rules": ("safety/test_safety_gate.py", "safety/test_safety_gate_sweep.py"),
     "pkxyz_ctrl.safety.sdo_rules": ("safety/test_safety_gate.py", "safety/test_safety_gate_sweep.py"),
     "pkxyz_ctrl.safety.modes": ("safety/test_safety_modes.py",),
     "pkxyz_ctrl.safety.monitors": ("safety/test_safety_monitors.py",),

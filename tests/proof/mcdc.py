@@ -23,6 +23,7 @@ from typing import Any
 ROOT = Path(__file__).parents[2]
 MODULES = (
     "pkxyz_ctrl.safety.gate",
+    "pkxyz_ctrl.safety.gate_rules",
     "pkxyz_ctrl.safety.modes",
     "pkxyz_ctrl.safety.monitors",
     "pkxyz_ctrl.safety.sdo_rules",

@@ -17,6 +17,7 @@ that are alike (the exploration would not come to an end), never merge two that 
 
 import hashlib
 import marshal
+import struct
 from collections import deque
 from collections.abc import Callable, Iterable
 from enum import Enum
@@ -40,7 +41,7 @@ UNREAD = {
     ("Controller", "faults"),
     ("Controller", "missed_ticks"),
     ("Controller", "_reference"),
-    ("TransmitGate", "blocked_frames"),
+    ("TransmitGate", "memory.blocked_frames"),
     ("AmplifierDriver", "emergencies"),
     ("AmplifierDriver", "lost"),
     ("StartSequence", "lost"),
@@ -64,21 +65,22 @@ UNREAD = {
 TEXTS = {
     ("Controller", "_blocked"),
     ("TransmitGate", "latched"),
+    ("TransmitGate", "memory.latched"),
     ("AmplifierDriver", "failure"),
     ("StartSequence", "failure"),
     ("SdoDialogue", "failure"),
 }
-INSTANTS = {("TransmitGate", "_time_us"), ("Alarm", "due_us")}
-AGES = {("TransmitGate", "_time_us"), ("AmplifierDriver", "_node_heartbeat_us"), ("SenseTransmitter", "_sync_us")}
+INSTANTS = {("TransmitGate", "memory.time_us"), ("Alarm", "due_us")}
+AGES = {("TransmitGate", "memory.time_us"), ("AmplifierDriver", "_node_heartbeat_us"), ("SenseTransmitter", "_sync_us")}
 DURATIONS = {"_cycle_us", "_period_us", "_time_us", "_event_us", "_drive_timeout_us"}
-DRIVE_COUNTERS = {("TransmitGate", "_counter"), ("TransmitGate", "_counter_next")}
+DRIVE_COUNTERS = {("TransmitGate", "memory.counter"), ("TransmitGate", "memory.counter_next")}
 SENSE_COUNTERS = {("SenseInput", "_counter")}
 SENT_COUNTERS = {
     ("AmplifierDriver", "_drive_counter"),
     ("SenseTransmitter", "counter"),
     ("AmplifierDriver", "_sync_index"),
 }
-SATURATED = {("TransmitGate", "_syncs"): 2, ("AmplifierNode", "_silent_syncs"): 4}
+SATURATED = {("TransmitGate", "memory.syncs"): 2, ("AmplifierNode", "_silent_syncs"): 4}
 DICTIONARY_UNREAD = {0x1001, 0x1003, 0x2000, 0x2001, 0x6401, 0x6411}
 
 # Of the controller's record, what the law computes with and writes down is left out: any law is explored.
@@ -96,27 +98,18 @@ CONSTANT = {
     "_w0",
     "_w1",
     "_w2",
-    "_rows",
-    "_formats",
     "_heartbeat_frame",
     "_sense_id",
     "_drive_id",
-    "_sdo_id",
     "_sdo_request_id",
     "_sdo_response_id",
     "_emergency_id",
     "_node_heartbeat_id",
-    "_heartbeat_id",
     "_flags_sent",
     "period_us",
     "_heartbeat_period_us",
     "_node_timeout_us",
     "_node_period_us",
-    "_crc_start",
-    "_drive_length",
-    "_spacing_us",
-    "_count_max",
-    "_count_slew_max",
     "_drive_timeout_syncs",
     "node_id",
     "_protection",
@@ -128,14 +121,15 @@ CONSTANT = {
     "config",
     "_config",
     "_heartbeat",
-    "_written",
     "can",
     "law",
-    "memory",
     "row",
     "_consumers",
     "_plant",
 }
+
+RECORDS = {"TransmitGate"}
+"""Whose ``memory`` is a record of integers: each field is an attribute, ``memory.counter``."""
 
 _MUTABLE = {list, dict, set, deque, bytearray}
 
@@ -161,6 +155,8 @@ def _is_constant(kind: str, name: str, value: object) -> bool:
     """What is never rebound, or says nothing: parts that are walked themselves, settings, functions, tables."""
     if kind in CONSTANT_KINDS or name in CONSTANT:
         return True
+    if name == "memory":
+        return kind not in RECORDS
     if (kind, name) in {
         ("StartSequence", "_dialogue"),
         ("DriveReceiver", "receive"),
@@ -293,9 +289,18 @@ class Snapshot:
         names = {key: f"o{n}" for n, key in enumerate(objects)}
         space: dict[str, Any] = {names[key]: o for key, o in objects.items()}
         space |= {"plain": plain, "_PLAIN": _PLAIN, "node": self._node}
-        reads, writes, keys = [], [], []
+        reads, writes, unpacks, keys = [], [], [], []
         for n, (o, kind, name) in enumerate(self.attributes):
             held, place = getattr(o, name), f"{names[id(o)]}.{name}"
+            if isinstance(held, np.ndarray):
+                fields, layout = _layout_of(held.dtype)
+                space |= {f"b{n}": held.view(np.uint8).data, f"u{n}": struct.Struct(layout).unpack}
+                reads.append(f"b{n}.tobytes()")
+                writes.append(f"    b{n}[:] = s[{n}]")
+                unpacks.append(f"    f{n} = u{n}(s[{n}])\n")
+                rules = (_rule(kind, f"{name}.{field}", f"f{n}[{k}]") for k, field in enumerate(fields))
+                keys += [f"({rule})" for rule in rules if rule is not None]
+                continue
             copies = type(held) in _MUTABLE
             maybe = " if {} is not None else None" if held is None else ""
             reads.append(f"{place}.copy(){maybe.format(place)}" if copies else place)
@@ -304,7 +309,7 @@ class Snapshot:
             if rule is not None:
                 keys.append(f"({rule})")
         source = f"def read():\n    return ({', '.join(reads)},)\ndef write(s):\n" + "\n".join(writes)
-        source += f"\ndef name(s, now_us, drive, sense, sync):\n    return ({', '.join(keys)},)\n"
+        source += f"\ndef name(s, now_us, drive, sense, sync):\n{''.join(unpacks)}    return ({', '.join(keys)},)\n"
         exec(compile(source, "<state>", "exec"), space)
         return space["read"], space["write"], space["name"]
 
@@ -340,7 +345,11 @@ class Snapshot:
 
     def describe(self, taken: tuple[Any, ...], bases: Bases) -> dict[str, Any]:
         """The parts of the key by name, to see what keeps two states apart."""
-        places = [(n, kind, name) for n, (_, kind, name) in enumerate(self.attributes)]
+        places = [
+            (n, kind, part)
+            for n, (value, kind, name) in enumerate(self.attributes)
+            for part in _parts_of(getattr(value, name), name)
+        ]
         kept = [place for place in places if _rule(place[1], place[2], "x") is not None]
         named = self._name(taken[0], bases.now_us, bases.drive, bases.sense, bases.sync)
         found: dict[str, Any] = {f"{n} {kind}.{name}": v for (n, kind, name), v in zip(kept, named, strict=True)}
@@ -385,6 +394,22 @@ def _mask_of(dtype: np.dtype[Any]) -> np.ndarray[Any, Any]:
     first_count = _offset(dtype, ("tick", "count"))
     whole[first_count : first_count + 12] = 0xFF
     return whole
+
+
+def _layout_of(dtype: np.dtype[Any]) -> tuple[list[str], str]:
+    """Names of all numbers in a record, and its bytes as ``struct`` reads them."""
+    names, layout, end = [], "<", 0
+    assert dtype.fields is not None
+    for name, (inner, offset) in ((name, dtype.fields[name][:2]) for name in dtype.names or ()):
+        count = int(np.prod(inner.shape, dtype=int))
+        layout += f"{offset - end}x{count}{inner.base.char}"
+        names += [name] if count == 1 else [f"{name}[{place}]" for place in range(count)]
+        end = offset + inner.itemsize
+    return names, f"{layout}{dtype.itemsize - end}x".replace("l", "q")
+
+
+def _parts_of(held: object, name: str) -> list[str]:
+    return [f"{name}.{field}" for field in _layout_of(held.dtype)[0]] if isinstance(held, np.ndarray) else [name]
 
 
 def _offset(dtype: np.dtype[Any], path: tuple[str, ...]) -> int:

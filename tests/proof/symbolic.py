@@ -116,6 +116,9 @@ class Number:
 
     __rxor__ = __xor__
 
+    def __rshift__(self, other: int) -> "Number":
+        return Number(self.z >> other)
+
     def __lt__(self, other: Any) -> Truth:
         return Truth(self.z < of(other))
 
@@ -179,6 +182,8 @@ class LinearTable:
         return self.size
 
     def __getitem__(self, index: Any) -> Any:
+        if isinstance(index, Bits):
+            return index.through(self)
         if not isinstance(index, Number):
             return self.table[index]
         _claim(z3.And(index.z >= -self.size, index.z < self.size))
@@ -187,6 +192,52 @@ class LinearTable:
             entry = z3.BitVecVal(self.table[1 << bit] ^ self.table[0], WIDTH)
             found = found ^ z3.If(z3.Extract(bit, bit, index.z) == 1, entry, z3.BitVecVal(0, WIDTH))
         return Number(found)
+
+
+class Bits:
+    """An integer whose bits are sums over GF(2) of unknown bits: bit k is the parity of the unknowns in ``of[k]``, of
+    which bit 64 is the constant 1. What is computed by shifts, masks, exclusive or and linear tables is known exactly.
+    """
+
+    ONE = 1 << 64
+
+    def __init__(self, of: tuple[int, ...]) -> None:
+        self.of = of
+
+    @classmethod
+    def unknown(cls, width: int = 64) -> "Bits":
+        return cls(tuple(1 << k for k in range(width)))
+
+    @classmethod
+    def known(cls, value: int) -> "Bits":
+        return cls(tuple(cls.ONE if value >> k & 1 else 0 for k in range(value.bit_length())))
+
+    def __rshift__(self, by: int) -> "Bits":
+        return Bits(self.of[by:])
+
+    def __and__(self, mask: int) -> "Bits":
+        return Bits(tuple(bit if mask >> k & 1 else 0 for k, bit in enumerate(self.of[: mask.bit_length()])))
+
+    def __xor__(self, other: "Bits | int") -> "Bits":
+        one, two = self.of, (other if isinstance(other, Bits) else Bits.known(other)).of
+        width = max(len(one), len(two))
+        one, two = one + (0,) * (width - len(one)), two + (0,) * (width - len(two))
+        return Bits(tuple(a ^ b for a, b in zip(one, two, strict=True)))
+
+    __rxor__ = __xor__
+
+    def through(self, table: LinearTable) -> "Bits":
+        """The entry of a table at this index."""
+        found = Bits.known(table.table[0])
+        for k, bit in enumerate(self.of):
+            added = table.table[1 << k] ^ table.table[0]
+            found ^= Bits(tuple(bit if added >> place & 1 else 0 for place in range(8)))
+        return found
+
+    def of_width(self, width: int) -> tuple[int, ...]:
+        """Its bits, the lowest first."""
+        assert not any(self.of[width:])
+        return (self.of + (0,) * width)[:width]
 
 
 @dataclass(frozen=True)

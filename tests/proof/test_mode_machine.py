@@ -12,7 +12,7 @@ from typing import NamedTuple
 import pytest
 
 from pkxyz_ctrl.safety import modes
-from pkxyz_ctrl.safety.gate import PERMITTED, FrameKind
+from pkxyz_ctrl.safety.gate_rules import PERMITTED, FrameKind
 from pkxyz_ctrl.safety.modes import MODE_FACTS, TRANSITIONS, Event, Mode
 
 ENOUGH = 3

@@ -14,12 +14,12 @@ from typing import Any
 import pytest
 import z3
 from gate_frames import crc8h2f
-from symbolic import DisprovedError, LinearTable, Number, of, paths, prove, rebuilt, truth, unknown
+from symbolic import Bits, DisprovedError, LinearTable, Number, of, paths, prove, rebuilt, truth, unknown
 
 from hil.node import crc as node_crc
 from hil.node.drive import DriveReceiver
 from pkxyz_ctrl.can.codec import ProcessCodec
-from pkxyz_ctrl.safety import gate as gate_module
+from pkxyz_ctrl.safety import gate_rules
 
 DRIVE, SENSE = 0x30A, 0x28A
 
@@ -73,12 +73,39 @@ def test_every_table_of_ours_is_the_reference(can_id: int) -> None:
     assert codec._counter_crc == bytes(value ^ nothing for value in last)
     assert (first, second, third) == node_crc.WORDS
     assert node_crc.last_byte_table(can_id) == bytes(value ^ nothing for value in last)
-    assert (first[:32768], second[:32768], third[:32768]) == (
-        gate_module._CRC_1,
-        gate_module._CRC_2,
-        gate_module._CRC_3,
-    )
-    assert last == gate_module._CRC
+    assert last == bytes(gate_rules._CRC)  # through which the gate looks up each byte (test_smt_gate.py)
+    assert nothing == gate_rules.crc_start(can_id)
+
+
+def standard_bits(can_id: int) -> tuple[int, ...]:
+    """The eight bits of the CRC under ``can_id``, each by the bits of the payload that it is a sum of."""
+    head = can_id.to_bytes(2, "little")
+    nothing = crc8h2f(head + bytes(7))
+    rows = [Bits.ONE if nothing >> place & 1 else 0 for place in range(8)]
+    for bit in range(56):
+        added = crc8h2f(head + (1 << bit).to_bytes(7, "little")) ^ nothing
+        rows = [row | (1 << bit if added >> place & 1 else 0) for place, row in enumerate(rows)]
+    return tuple(rows)
+
+
+def gate_bits(can_id: int, old: str = "", new: str = "") -> tuple[int, ...]:
+    """The same of the gate's shipped ``crc_of``, by running it."""
+    crc_of = rebuilt(gate_rules.crc_of, {"_CRC": LinearTable(bytes(gate_rules._CRC))}, old, new)
+    found: Bits = crc_of(gate_rules.crc_start(can_id), Bits.unknown())
+    return found.of_width(8)
+
+
+@pytest.mark.parametrize("can_id", [DRIVE, SENSE, 0x301, 0x37F])
+def test_the_gate_computes_the_standard_s_crc(can_id: int) -> None:
+    """Of every payload: both are sums of its bits, and of the same ones."""
+    assert gate_bits(can_id) == standard_bits(can_id)
+
+
+@pytest.mark.parametrize(
+    ("old", "new"), [("8 * place", "4 * place"), ("range(7)", "range(6)"), ("crc ^ (word", "(word"), ("^ start", "")]
+)
+def test_the_gate_s_crc_is_another_with_a_planted_defect(old: str, new: str) -> None:
+    assert gate_bits(DRIVE, old, new) != standard_bits(DRIVE)
 
 
 @pytest.mark.parametrize("flipped", [1, 2, 3])

@@ -1,8 +1,8 @@
 """The transmit gate's arithmetic, proven: for all 16-bit counts, counters, limits and times, and for all histories.
 
-``TransmitGate._judge_drive`` runs with unknowns (``symbolic``): every count of 16 bits, every counter, CRC, time,
-limit, and every state that its memory can be in. What is to hold of all histories is shown by induction: it holds at
-the beginning, and whatever frame comes, it holds afterwards if it held before.
+``gate_rules.judge_drive`` runs with unknowns (``symbolic``): every payload of eight bytes, every time and limit, and
+every state that its memory can be in. What is to hold of all histories is shown by induction: it holds at the
+beginning, and whatever frame comes, it holds afterwards if it held before.
 """
 
 from dataclasses import dataclass
@@ -12,17 +12,17 @@ from typing import Any
 import pytest
 import z3
 from gate_frames import crc8h2f
-from symbolic import DisprovedError, LinearTable, Number, Truth, of, paths, prove, rebuilt, truth, unknown
+from symbolic import DisprovedError, Number, of, paths, prove, rebuilt, unknown
 from test_smt_crc import reference_tables
 
 from pkxyz_ctrl.can.frame import Frame
-from pkxyz_ctrl.safety import gate as gate_module
-from pkxyz_ctrl.safety.gate import PERMITTED, FrameKind, GateConfig, TransmitGate
+from pkxyz_ctrl.safety import gate_rules
+from pkxyz_ctrl.safety.gate import GateConfig, TransmitGate
+from pkxyz_ctrl.safety.gate_rules import PERMITTED, FrameKind
 from pkxyz_ctrl.safety.modes import Mode
 
 CONFIG = GateConfig(count_max=20000, count_slew_max=1000, period_us=200)
-TABLES = {name: LinearTable(getattr(gate_module, name)) for name in ("_CRC", "_CRC_1", "_CRC_2", "_CRC_3")}
-KNOWN = z3.Bool("known")
+DRIVE_ID = 0x300 + CONFIG.node_id
 
 
 @dataclass(frozen=True)
@@ -38,14 +38,23 @@ class Unknowns:
 
 def unknowns() -> Unknowns:
     ranges = {
-        "a": (-32768, 32767), "b": (-32768, 32767), "c": (-32768, 32767), "counter": (0, 255), "crc": (0, 255),
-        "was_a": (0, 32767), "was_b": (0, 32767), "was_c": (0, 32767),
+        "was_a": (0, 32767), "was_b": (0, 32767), "was_c": (0, 32767), "known": (0, 1),
         "last": (-1, 255), "next": (0, 255), "syncs": (0, 2), "row": (0, 1023),
         "maximum": (0, 32767), "slew": (1, 32767), "spacing": (0, 1_000_000),
         "now": (0, 1 << 60), "before": (-(1 << 62), 1 << 60),
     }  # fmt: skip
     made = {name: unknown(name, low, high) for name, (low, high) in ranges.items()}
-    u = Unknowns({name: number for name, (number, _) in made.items()}, tuple(c for _, c in made.values()))
+    word = z3.BitVec("word", 64)
+    payload = {
+        "word": word,
+        "a": z3.SignExt(48, z3.Extract(15, 0, word)),
+        "b": z3.SignExt(48, z3.Extract(31, 16, word)),
+        "c": z3.SignExt(48, z3.Extract(47, 32, word)),
+        "counter": z3.ZeroExt(56, z3.Extract(55, 48, word)),
+        "crc": z3.ZeroExt(56, z3.Extract(63, 56, word)),
+    }
+    names = {name: number for name, (number, _) in made.items()} | {name: Number(x) for name, x in payload.items()}
+    u = Unknowns(names, tuple(c for _, c in made.values()))
     return Unknowns(u.names, (*u.assume, memory_holds(u), u.now >= u.before))
 
 
@@ -53,26 +62,28 @@ def memory_holds(u: Any) -> Any:
     """What is true of the gate's memory at any time: the invariant of the induction."""
     return z3.And(
         z3.Implies(u.last >= 0, u.next == (u.last + 1) & 0xFF),
-        z3.Implies(KNOWN, z3.And(u.was_a <= u.maximum, u.was_b <= u.maximum, u.was_c <= u.maximum)),
+        z3.Implies(u.known == 1, z3.And(u.was_a <= u.maximum, u.was_b <= u.maximum, u.was_c <= u.maximum)),
         z3.And(u.was_a >= 0, u.was_b >= 0, u.was_c >= 0),
     )
 
 
 def judge(u: Unknowns, old: str = "", new: str = "") -> Any:
-    """A call of the shipped ``_judge_drive`` on unknowns; returns its answer and the gate's memory afterwards."""
+    """A call of the shipped ``judge_drive`` on unknowns; returns its answer and the gate's memory afterwards.
+
+    In place of ``crc_of`` stands the standard's CRC, which it is (``test_smt_crc.py``).
+    """
     n = u.names
-    frame = [n[name] for name in ("a", "b", "c", "counter", "crc")]
-    function = rebuilt(TransmitGate._judge_drive, TABLES | {"_PROTECTED": lambda data: frame}, old, new)
-    real = TransmitGate(CONFIG)
+    function = rebuilt(gate_rules.judge_drive, {"crc_of": lambda start, word: Number(crc_term(u, DRIVE_ID))}, old, new)
+    settled = CONFIG.record[0]
 
     def call() -> tuple[Any, Any]:
-        gate = SimpleNamespace(**vars(real))
-        gate._counts = (n["was_a"], n["was_b"], n["was_c"])
-        gate._time_us, gate._counter, gate._counter_next = n["before"], n["last"], n["next"]
-        gate._syncs, gate._known, gate.latched = n["syncs"], Truth(KNOWN), ""
-        gate._count_max, gate._count_slew_max, gate._spacing_us = n["maximum"], n["slew"], n["spacing"]
-        gate._too_soon = lambda t_us: "too soon"
-        return function(gate, bytes(8), n["row"], n["now"]), gate
+        config = {name: settled[name] for name in settled.dtype.names}
+        config |= {"count_max": n["maximum"], "count_slew_max": n["slew"], "spacing_us": n["spacing"]}
+        memory = {
+            "count": [n["was_a"], n["was_b"], n["was_c"]], "time_us": n["before"], "counter": n["last"],
+            "counter_next": n["next"], "syncs": n["syncs"], "known": n["known"], "latched": 0,
+        }  # fmt: skip
+        return function(config, memory, 8, n["word"], n["row"], n["now"]), memory
 
     return call
 
@@ -97,7 +108,7 @@ PROPERTIES = {
     "voltage": lambda u, g: z3.And(*(z3.And(x >= 0, x <= u.maximum) for x in (u.a, u.b, u.c))),
     "slew": lambda u, g: z3.Implies(
         is_voltage(u),
-        z3.And(KNOWN, within(u.a, u.was_a, u.slew), within(u.b, u.was_b, u.slew), within(u.c, u.was_c, u.slew)),
+        z3.And(u.known == 1, within(u.a, u.was_a, u.slew), within(u.b, u.was_b, u.slew), within(u.c, u.was_c, u.slew)),
     ),
     "one voltage a SYNC": lambda u, g: z3.Implies(is_voltage(u), u.syncs == 1),
     "spacing": lambda u, g: z3.Implies(is_voltage(u), u.now - u.before >= u.spacing),
@@ -105,16 +116,16 @@ PROPERTIES = {
         u.counter != u.last, z3.Implies(z3.And(is_voltage(u), u.last >= 0), u.counter == (u.last + 1) & 0xFF)
     ),
     "mode": lambda u, g: u.row & z3.If(is_voltage(u), of(FrameKind.DRIVE), of(FrameKind.DRIVE_ZERO)) != 0,
-    "CRC": lambda u, g: u.crc == crc_term(u, 0x300 + CONFIG.node_id),
+    "CRC": lambda u, g: u.crc == crc_term(u, DRIVE_ID),
     "remembered": lambda u, g: z3.And(
-        *(of(now) == x for now, x in zip(g._counts, (u.a, u.b, u.c), strict=True)),
-        of(g._counter) == u.counter,
-        of(g._counter_next) == (u.counter + 1) & 0xFF,
-        of(g._time_us) == u.now,
-        of(g._syncs) == 0,
+        *(of(now) == x for now, x in zip(g["count"], (u.a, u.b, u.c), strict=True)),
+        of(g["counter"]) == u.counter,
+        of(g["counter_next"]) == (u.counter + 1) & 0xFF,
+        of(g["time_us"]) == u.now,
+        of(g["syncs"]) == 0,
     ),
     "known after": lambda u, g: z3.Implies(
-        z3.And(truth(g._known), u.last >= 0), z3.Or(is_voltage(u), u.counter == (u.last + 1) & 0xFF)
+        z3.And(of(g["known"]) == 1, u.last >= 0), z3.Or(is_voltage(u), u.counter == (u.last + 1) & 0xFF)
     ),
 }
 
@@ -125,7 +136,7 @@ def prove_property(name: str, old: str = "", new: str = "") -> int:
     for path in paths(judge(u, old, new), list(u.assume)):
         answer, gate = path.result
         count += 1
-        if answer is None:
+        if answer == 0:
             prove(path.condition, PROPERTIES[name](u, gate), name)
     return count
 
@@ -141,17 +152,17 @@ def test_the_memory_is_what_the_induction_needs_after_any_drive_frame() -> None:
     for path in paths(judge(u), list(u.assume)):
         answer, gate = path.result
         after = SimpleNamespace(
-            last=of(gate._counter), next=of(gate._counter_next), maximum=u.maximum,
-            was_a=of(gate._counts[0]), was_b=of(gate._counts[1]), was_c=of(gate._counts[2]),
+            last=of(gate["counter"]), next=of(gate["counter_next"]), maximum=u.maximum, known=of(gate["known"]),
+            was_a=of(gate["count"][0]), was_b=of(gate["count"][1]), was_c=of(gate["count"][2]),
         )  # fmt: skip
-        holds = z3.substitute(memory_holds(after), (KNOWN, truth(gate._known)))
-        prove(path.condition, holds, "the invariant of the memory")
-        if answer is not None:
+        prove(path.condition, memory_holds(after), "the invariant of the memory")
+        if answer != 0:
             same = [
-                (gate._counts[0], u.was_a),
-                (gate._counter, u.last),
-                (gate._time_us, u.before),
-                (gate._syncs, u.syncs),
+                (gate["count"][0], u.was_a),
+                (gate["counter"], u.last),
+                (gate["time_us"], u.before),
+                (gate["syncs"], u.syncs),
+                (gate["known"], u.known),
             ]
             prove(path.condition, z3.And(*(of(x) == y for x, y in same)), "a frame that is held back leaves no trace")
 
@@ -165,57 +176,63 @@ def test_no_sum_or_look_up_goes_beyond_its_bounds() -> None:
     assert claims > 100
 
 
+def remembering() -> TransmitGate:
+    """A gate whose memory no rule has to explain."""
+    gate = TransmitGate(CONFIG)
+    record = gate.memory[0]
+    record["known"], record["count"], record["counter"], record["counter_next"] = 1, (5, 6, 7), 9, 10
+    return gate
+
+
+def remembered(gate: TransmitGate) -> tuple[object, ...]:
+    record = gate.memory[0]
+    return int(record["known"]), tuple(record["count"].tolist()), int(record["counter"]), int(record["counter_next"])
+
+
 def test_the_induction_begins_and_no_other_frame_breaks_it() -> None:
     """At the start nothing is known; SYNC only counts, NMT makes the combs unknown, everything else changes nothing."""
-    new = TransmitGate(CONFIG)
-    assert not new._known
-    assert new._counts == (0, 0, 0)
-    assert new._counter == -1
+    assert remembered(TransmitGate(CONFIG))[:3] == (0, (0, 0, 0), -1)
     for mode in Mode:
-        gate = TransmitGate(CONFIG)
-        gate._known, gate._counts, gate._counter, gate._counter_next = True, (5, 6, 7), 9, 10
+        gate = remembering()
         for expected in (1, 2, 2):
             assert gate.check(Frame(0x080, b"\x01"), mode, 0) is None
-            assert gate._syncs == expected
-        assert (gate._known, gate._counts, gate._counter, gate._counter_next) == (True, (5, 6, 7), 9, 10)
+            assert gate.memory["syncs"] == expected
+        assert remembered(gate) == (1, (5, 6, 7), 9, 10)
         for command, kind in (
             (1, FrameKind.NMT_START),
             (2, FrameKind.NMT_STOP),
             (128, FrameKind.NMT_PRE_OPERATIONAL),
             (129, FrameKind.NMT_RESET),
         ):
-            gate = TransmitGate(CONFIG)
-            gate._known, gate._counts, gate._counter, gate._counter_next = True, (5, 6, 7), 9, 10
+            gate = remembering()
             passed = gate.check(Frame(0x000, bytes((command, CONFIG.node_id))), mode, 0) is None
             assert passed == bool(PERMITTED[mode] & kind)
-            assert gate._known == (not passed)
-            assert gate._counts == (5, 6, 7)
-            assert gate._counter == (-1 if passed and command == 129 else 9)
-        gate = TransmitGate(CONFIG)
-        gate._known, gate._counts, gate._counter, gate._counter_next = True, (5, 6, 7), 9, 10
+            counter = -1 if passed and command == 129 else 9
+            assert remembered(gate) == (int(not passed), (5, 6, 7), counter, 10)
+        gate = remembering()
         gate.clear()
-        assert (gate._known, gate._counts, gate._counter, gate._counter_next) == (True, (5, 6, 7), 9, 10)
+        assert remembered(gate) == (1, (5, 6, 7), 9, 10)
 
 
 PLANTED = [
     ("voltage", "0 <= c <= maximum", "c <= maximum"),
     ("voltage", "0 <= a <= maximum", "0 <= a <= maximum + 1"),
     ("voltage", "0 <= b <= maximum and ", ""),
-    ("slew", "-slew <= b - was_b <= slew", "-slew <= b - was_a <= slew"),
-    ("slew", "c - was_c <= slew)", "c - was_c <= slew + 1)"),
-    ("slew", "not self._known or self._syncs == 2", "self._syncs == 2"),
-    ("slew", "a == b == c == 0", "a == b == 0"),
-    ("one voltage a SYNC", "if self._syncs == 0:", "if self._syncs < 0:"),
-    ("one voltage a SYNC", "or self._syncs == 2", ""),
-    ("spacing", "if t_us - self._time_us < self._spacing_us:", "if t_us - self._time_us < 0:"),
-    ("freshness", "if protected and counter == self._counter:", "if protected and counter == self._counter_next:"),
-    ("freshness", "if protected and counter != self._counter_next:", "if protected and counter == self._counter:"),
-    ("mode", "if not row & _DRIVE:", "if not row:"),
-    ("CRC", "^ _CRC[counter]", ""),
-    ("CRC", "_CRC_2[b]", "_CRC_3[b]"),
-    ("remembered", "self._counts = (a, b, c)", "self._counts = (a, b, b)"),
+    ("slew", "-slew <= b - was[1] <= slew", "-slew <= b - was[0] <= slew"),
+    ("slew", "c - was[2] <= slew)", "c - was[2] <= slew + 1)"),
+    ("slew", 'memory["known"] == 0 or memory["syncs"] == 2', 'memory["syncs"] == 2'),
+    ("slew", "a == 0 and b == 0 and c == 0", "a == 0 and b == 0"),
+    ("one voltage a SYNC", 'if memory["syncs"] == 0:', 'if memory["syncs"] < 0:'),
+    ("one voltage a SYNC", 'or memory["syncs"] == 2', ""),
+    ("spacing", '        if since_us < config["spacing_us"]:', "        if since_us < 0:"),
+    ("freshness", 'counter == memory["counter"]:', 'counter == memory["counter_next"]:'),
+    ("freshness", 'counter != memory["counter_next"]:', 'counter == memory["counter"]:'),
+    ("mode", "if permitted & _DRIVE == 0:", "if permitted == 0:"),
+    ("CRC", "word >> 56 & 0xFF != crc_of", "word >> 56 & 0x7F != crc_of"),
+    ("CRC", "    if protected:\n        if word", "    if protected and not known:\n        if word"),
+    ("remembered", "was[0], was[1], was[2] = a, b, c", "was[0], was[1], was[2] = a, b, b"),
     ("remembered", "counter + 1 & 0xFF", "counter + 1 & 0x7F"),
-    ("known after", "or counter == self._counter_next", "or counter != self._counter"),
+    ("known after", 'or counter == memory["counter_next"]', 'or counter != memory["counter"]'),
 ]  # fmt: skip
 
 

@@ -463,8 +463,8 @@ class World:
 
         Combs at 0 V that the gate takes for energised (no drive frame arrives) are the business of the loop's monitors.
         """
-        gate = self.controller.gate
-        believes = gate._known and not gate.latched and MAY_ENERGISE[self.controller.mode]
+        gate: Any = self.controller.gate.memory[0]
+        believes = gate["known"] and not gate["latched"] and MAY_ENERGISE[self.controller.mode]
         if not believes or not any(self.plant.counts) or self.plant.counts == self.believed:
             self.apart = 0
         else:
@@ -474,7 +474,7 @@ class World:
                 raise ViolationError(
                     f"for {self.apart} ticks the gate takes combs at {self.plant.counts} to be at {self.believed}"
                 )
-        self.believed = gate._counts if believes else (0, 0, 0)
+        self.believed = tuple(gate["count"].tolist()) if believes else (0, 0, 0)
 
     @property
     def is_running(self) -> bool:

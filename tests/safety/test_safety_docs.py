@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from loop_rig import monitor_limits
 
-from pkxyz_ctrl.safety.gate import PERMITTED, FrameKind
+from pkxyz_ctrl.safety.gate_rules import PERMITTED, FrameKind
 from pkxyz_ctrl.safety.modes import TRANSITIONS, Mode
 
 

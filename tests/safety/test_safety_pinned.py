@@ -7,21 +7,14 @@ import pytest
 from loop_rig import monitor_limits
 
 from pkxyz_ctrl.can.codec import ProcessCodec
-from pkxyz_ctrl.safety.gate import PERMITTED, FrameKind, GateConfig
+from pkxyz_ctrl.safety.gate import GateConfig
+from pkxyz_ctrl.safety.gate_rules import PERMITTED, FrameKind
 from pkxyz_ctrl.safety.modes import Mode
 from pkxyz_ctrl.safety.monitors import NodeEvent, SenseStatus
-from pkxyz_ctrl.safety.sdo_rules import WriteContext, write_refusal
+from pkxyz_ctrl.safety.sdo_rules import write_refusal
 from pkxyz_ctrl.safety.trips import Trip
 
-LIMITS = WriteContext(
-    node_id=10,
-    controller_node_id=127,
-    heartbeat_timeout_max_ms=1000,
-    count_slew_max=500,
-    drive_index=0x1401,
-    drive_id=0x30A,
-    drive_channels=(1, 2, 3),
-)
+LIMITS = GateConfig(count_max=30000, count_slew_max=500, period_us=200).record[0]["writes"]
 
 # Bits of a recording that somebody may read in years.
 TRIPS = [
@@ -105,7 +98,7 @@ COMMAND = {1: 0x2F, 2: 0x2B, 3: 0x27, 4: 0x23}
 
 def refused(index: int, subindex: int, size: int, value: int) -> bool:
     data = struct.pack("<BHBI", COMMAND[size], index, subindex, value)
-    return write_refusal(data, LIMITS) is not None
+    return write_refusal(LIMITS, int.from_bytes(data, "little", signed=True)) != 0
 
 
 def test_writes_at_every_corner_and_one_step_beyond() -> None:
@@ -165,7 +158,7 @@ def test_nothing_may_stand_behind_the_value(index: int, subindex: int, size: int
     """Of objects that may hold anything: whatever is refused, is so for the bytes behind."""
     for bit in range(32):
         data = struct.pack("<BHBI", COMMAND[size], index, subindex, 1 << bit)
-        assert (write_refusal(data, LIMITS) is not None) == (bit >= 8 * size)
+        assert (write_refusal(LIMITS, int.from_bytes(data, "little", signed=True)) != 0) == (bit >= 8 * size)
 
 
 GATE_RANGES = {
