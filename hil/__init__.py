@@ -20,6 +20,7 @@ if TYPE_CHECKING:
     from hil.api.run import open_run as open_run
     from hil.api.run import run as run
     from hil.api.tune import tune as tune
+    from hil.api.tune import tune_taps as tune_taps
     from hil.lanes.lane import Lane as Lane
     from hil.runs.scenario import Scenario as Scenario
     from hil.runs.scenario import build_scenario as build_scenario
@@ -40,6 +41,7 @@ _HOME = {
     "open_run": "hil.api.run",
     "run": "hil.api.run",
     "tune": "hil.api.tune",
+    "tune_taps": "hil.api.tune",
 }
 
 __all__ = [
@@ -56,6 +58,7 @@ __all__ = [
     "open_run",
     "run",
     "tune",
+    "tune_taps",
 ]
 
 

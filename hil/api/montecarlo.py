@@ -21,6 +21,8 @@ class SampledPlants:
     study: Study
     results: tuple[Result, ...]
     """in the order of their seeds"""
+    interrupted: bool = False
+    """ended early by Ctrl-C: these are what was done"""
 
     @property
     def summary(self) -> dict[str, Any]:
@@ -40,19 +42,27 @@ def montecarlo(
     tolerances: str = "wide",
     out: str | Path,
     workers: int | None = None,
+    dask: str | None = None,
     on_progress: Progress = lambda done, total: None,
 ) -> SampledPlants:
     """Run a scenario on ``plants`` plants sampled from a tolerances file, each seeded by its own number.
 
-    Results are kept in ``out``/results.jsonl at once: called again it goes on, also after an interruption. ``workers``:
-    processes, by default as many as cores; a program that uses more than one starts under ``if __name__ ==
-    "__main__":``. Raises ``ConfigError``.
+    Results are kept in ``out``/results.jsonl at once: called again it goes on, also after an interruption, which is
+    passed on only where nothing is done yet. ``workers``: processes, by default as many as cores; a program that uses
+    more than one starts under ``if __name__ == "__main__":``. ``dask``: address of a cluster's scheduler to work on
+    instead. Raises ``ConfigError``.
     """
     loaded = scenario if isinstance(scenario, Scenario) else load_scenario(scenario)
     study = Study(loaded, load("tolerances", tolerances, Tolerances))
     folder = Path(out)
     folder.mkdir(parents=True, exist_ok=True)
     results = Results(folder / "results.jsonl", study)
-    seeds = range(first_seed, first_seed + plants)
-    run_study(study, seeds, results, workers or cores(), None, on_progress)
-    return SampledPlants(study, tuple(results.found[seed] for seed in seeds))
+    seeds, interrupted = range(first_seed, first_seed + plants), False
+    try:
+        run_study(study, seeds, results, workers or cores(), dask, on_progress)
+    except KeyboardInterrupt:
+        interrupted = True
+    found = tuple(results.found[seed] for seed in seeds if seed in results.found)
+    if not found and interrupted:
+        raise KeyboardInterrupt
+    return SampledPlants(study, found, interrupted)

@@ -1,7 +1,9 @@
 """The public interface of ``hil``: what it promises, without a name that begins with an underscore."""
 
+import ast
 import subprocess
 import sys
+from collections.abc import Callable
 from pathlib import Path
 
 import numpy as np
@@ -105,3 +107,37 @@ def test_identify_finds_the_resonances() -> None:
     assert np.abs(hz / np.sort(found.drawn_hz) - 1.0).max() < 0.002
     with pytest.raises(ConfigError, match="only feeds forward"):
         hil.identify(controller="open_loop")
+
+
+def test_commands_call_what_programs_call() -> None:
+    """What ``pkxyz`` does, a program does with the same function: no second way from options to figures."""
+    folder = Path(hil.__file__).parent / "commands" / "studies"
+    for command, module in {
+        "margins": "hil.api.design", "identify": "hil.api.identify", "montecarlo": "hil.api.montecarlo",
+        "tune": "hil.api.tune",
+    }.items():  # fmt: skip
+        tree = ast.parse((folder / f"{command}.py").read_text(encoding="utf-8"))
+        used = {node.module for node in ast.walk(tree) if isinstance(node, ast.ImportFrom)}
+        assert module in used, command
+        assert "hil.studies.spread.workers" not in used, command
+
+
+def test_a_program_that_is_interrupted_has_what_was_done(tmp_path: Path) -> None:
+    scenario = hil.build_scenario(BRIEF)
+
+    def stop_after(plants: int) -> Callable[[int, int], None]:
+        def stop(done: int, total: int) -> None:
+            if done == plants:
+                raise KeyboardInterrupt
+
+        return stop
+
+    some = hil.montecarlo(scenario, plants=3, workers=1, out=tmp_path, on_progress=stop_after(1))
+    assert (some.interrupted, len(some.results)) == (True, 1)
+    with pytest.raises(KeyboardInterrupt):
+        hil.montecarlo(scenario, plants=3, first_seed=7, workers=1, out=tmp_path, on_progress=stop_after(0))
+
+
+def test_a_search_of_taps_says_who_finds_them() -> None:
+    with pytest.raises(ConfigError, match=r"youla: asks for taps.*hil\.tune_taps"):
+        hil.tune("youla")

@@ -13,8 +13,6 @@ LONGER = {
     "hil.commands.sil.sil": "options of a command, each with its help",
     "hil.commands.studies.identify.identify": "options of a command, each with its help",
     "hil.commands.studies.margins.margins": "options of a command, each with its help",
-    "hil.commands.studies.montecarlo.montecarlo": "options of a command, each with its help",
-    "hil.commands.studies.tune.tune": "options of a command, each with its help",
     "pkxyz_ctrl.design.identification.modal_fit.fit_modes": "one fit: start, three rounds of refinement, covariance",
     "pkxyz_ctrl.mechanics.published._flexures": "a table: a line for each number of the paper",
     "pkxyz_ctrl.mechanics.published_device.dimensions": "a table: a line for each number of the paper",

@@ -4,7 +4,7 @@ import dataclasses
 import json
 import shlex
 from pathlib import Path
-from typing import Annotated, Any
+from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
@@ -13,6 +13,9 @@ from hil.screen.first_run import say_if_compiling
 from hil.screen.outputs import folder_to_write
 from hil.screen.progress import progress_bar
 from hil.screen.terminal import bad, plain_table, print_whole, say
+
+if TYPE_CHECKING:
+    from hil.runs.scenario import Scenario
 
 
 def montecarlo(
@@ -40,35 +43,26 @@ def montecarlo(
 
     Exit code 0 if every loop held, 1 if one did not, 2 for bad input, 130 if interrupted (what is done is kept).
     """
+    from hil.api.montecarlo import montecarlo as sampled_plants
     from hil.pictures.montecarlo import draw_montecarlo
     from hil.runs.scenario import load_scenario
-    from hil.studies.montecarlo import Results, Study, run_study, summary
-    from hil.studies.spread.workers import cores
-    from pkxyz_ctrl.config.files import load
-    from pkxyz_ctrl.design.margins.tolerances import Tolerances
 
     loaded = load_scenario(scenario, controller=controller, stage=stage, plant=plant, bus=bus)
-    study = Study(loaded, load("tolerances", tolerances, Tolerances))
     if alone is not None:
-        _run_alone(study, alone, out, as_json=as_json)
+        _run_alone(loaded, tolerances, alone, out, as_json=as_json)
     folder_to_write(out)
     say_if_compiling(quiet=as_json)
-    results = Results(out / "results.jsonl", study)
-    seeds, interrupted = range(seed, seed + plants), False
     with progress_bar("plants", quiet=as_json) as tell:
-        try:
-            run_study(study, seeds, results, workers or cores(), dask, tell)
-        except KeyboardInterrupt:
-            interrupted = True
-    found = [results.found[n] for n in seeds if n in results.found]
-    if not found:
-        raise KeyboardInterrupt
-    data = summary(found) | {
+        found = sampled_plants(
+            loaded, plants=plants, first_seed=seed, tolerances=tolerances, out=out, workers=workers, dask=dask,
+            on_progress=tell,
+        )  # fmt: skip
+    data = found.summary | {
         "controller": loaded.controller.name, "scenario": loaded.config.name, "tolerances": tolerances,
-        "digest": study.digest(), "first_seed": seed, "interrupted": interrupted, "folder": str(out),
+        "digest": found.study.digest(), "first_seed": seed, "interrupted": found.interrupted, "folder": str(out),
     }  # fmt: skip
     (out / "summary.json").write_text(json.dumps(data, indent=2, allow_nan=False) + "\n", encoding="utf-8")
-    draw_montecarlo(study, found, out / "distributions.png")
+    draw_montecarlo(found.study, found.results, out / "distributions.png")
     if as_json:
         print(json.dumps(data, allow_nan=False))
     else:
@@ -78,16 +72,19 @@ def montecarlo(
         }  # fmt: skip
         words = [word for name, value in options.items() if value is not None for word in (name, value)]
         _show(data, shlex.join(["pkxyz", "montecarlo", scenario, *words]))
-    raise typer.Exit(130 if interrupted else 1 if data["not_held"] else 0)
+    raise typer.Exit(130 if found.interrupted else 1 if data["not_held"] else 0)
 
 
-def _run_alone(study: Any, seed: int, out: Path, *, as_json: bool) -> None:
+def _run_alone(loaded: "Scenario", tolerances: str, seed: int, out: Path, *, as_json: bool) -> None:
     """One plant with everything a run leaves; the figures are those of the study, bit for bit."""
     from hil.pictures.run import draw
     from hil.runs.run import run_into
     from hil.runs.run_folder import RunFolder
-    from hil.studies.montecarlo import run_one
+    from hil.studies.montecarlo import Study, run_one
+    from pkxyz_ctrl.config.files import load
+    from pkxyz_ctrl.design.margins.tolerances import Tolerances
 
+    study = Study(loaded, load("tolerances", tolerances, Tolerances))
     scenario = study.sampled(seed)
     folder = RunFolder(out / f"seed-{seed}", replace=True)
     ran = run_into(folder, scenario, Lane.FAST)

@@ -39,67 +39,48 @@ def tune(
     Exit code 0 if numbers were found that keep every constraint, 1 if not, 2 for bad input,
     130 if interrupted (what is done is kept).
     """
-    from hil.studies.spread.workers import cores
-    from hil.studies.tune.search import load_problem
+    from hil.api.tune import tune as search_on
     from hil.studies.tune.taps import asks_for_taps
-    from hil.studies.tune.tuning import best, importances, judged, nearest, open_study, write_controller
-    from hil.studies.tune.tuning import search as run_search
 
     if asks_for_taps(search):
         _tune_taps(search, stage, out, as_json=as_json)
         return
     if stage is not None:
         raise ConfigError(f"--stage: the search {search!r} names its stage itself; --stage is for a search of taps")
-    problem = load_problem(search)
     folder_to_write(out)
     say_if_compiling(quiet=as_json)
-    study = open_study(problem, storage or f"sqlite:///{(out / 'study.db').absolute()}", seed)
-    interrupted = False
-    if trials:
-        try:
-            with progress_bar(problem.search.name, quiet=as_json) as tell:
-                run_search(study, problem, trials, workers or cores(), dask, tell)
-        except KeyboardInterrupt:
-            interrupted = True
-    found = best(study, problem)
-    tried = judged(study)
-    importance = importances(study)
-    if tried:
+    with progress_bar(search, quiet=as_json) as tell:
+        tuned = search_on(
+            search, trials=trials, out=out, workers=workers, seed=seed, dask=dask, storage=storage, on_progress=tell
+        )
+    problem, found = tuned.problem, tuned.best
+    if tuned.trials:
         from hil.pictures.tuning import draw_tuning
 
-        draw_tuning(study, problem, importance, out)
-    path = out / f"{problem.search.name}_tuned.toml"
-    if found is not None:
-        write_controller(problem, found, path)
+        draw_tuning(tuned.study, problem, tuned.importance, out)
     data = {
-        "search": problem.search.name, "digest": problem.digest(), "seed": seed, "trials": len(tried),
-        "best": None if found is None else vars(found) | {"controller": str(path)},
-        "missed": {} if found is not None else nearest(study), "importance": importance, "interrupted": interrupted,
+        "search": problem.search.name, "digest": problem.digest(), "seed": seed, "trials": tuned.trials,
+        "best": None if found is None else vars(found) | {"controller": str(tuned.controller)},
+        "missed": tuned.missed, "importance": tuned.importance, "interrupted": tuned.interrupted,
     }  # fmt: skip
     if as_json:
         print(json.dumps(data, allow_nan=False))
     else:
         _show(data, problem.search.objective)
-    raise typer.Exit(130 if interrupted else 0 if found is not None else 1)
+    raise typer.Exit(130 if tuned.interrupted else 0 if found is not None else 1)
 
 
 def _tune_taps(search: str, stage: str | None, out: Path, *, as_json: bool) -> None:
-    from hil.studies.tune.taps import TapsSearch, find_taps, write_taps
-    from pkxyz_ctrl.config.files import load
+    from hil.api.tune import tune_taps
 
-    asked = load("searches", search, TapsSearch)
-    if stage is not None:
-        asked = asked.model_copy(update={"stage": stage})
     folder_to_write(out)
-    found = find_taps(asked, on_progress=lambda line: None if as_json else say(line))
-    path = out / f"{asked.name}_tuned.toml"
-    write_taps(asked, found, path)
-    noise_nm = dict(zip(("plane", "z"), (1e9 * v for v in found.hold_noise_m), strict=True))
+    tuned = tune_taps(search, stage=stage, out=out, on_progress=lambda line: None if as_json else say(line))
+    noise_nm = dict(zip(("plane", "z"), (1e9 * v for v in tuned.found.hold_noise_m), strict=True))
     if as_json:
-        print(json.dumps({"search": asked.name, "hold_noise_nm": noise_nm, "controller": str(path)}))
+        print(json.dumps({"search": tuned.search, "hold_noise_nm": noise_nm, "controller": str(tuned.controller)}))
     else:
         say(f"noise at hold {noise_nm['plane']:.2f} nm in x and y, {noise_nm['z']:.2f} nm in z")
-        say(f"run it: pkxyz sil --controller {path}")
+        say(f"run it: pkxyz sil --controller {tuned.controller}")
 
 
 def _show(data: dict, objective: str) -> None:  # type: ignore[type-arg]
