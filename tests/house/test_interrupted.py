@@ -9,7 +9,22 @@ import time
 import pytest
 from command_line import ROOT
 
-_BEGIN = "import hil.__main__ as way_in; print('begun', flush=True); way_in.main()"
+_BEGIN = """
+import signal
+import hil.__main__ as way_in
+
+own = signal.signal
+
+
+def tell(*words):  # our first line has run: from here on Ctrl-C has an owner
+    signal.signal = own
+    own(*words)
+    print("begun", flush=True)
+
+
+signal.signal = tell
+way_in.main()
+"""
 
 
 @pytest.mark.parametrize(
