@@ -7,6 +7,7 @@ from pathlib import Path
 
 import optuna
 
+from hil.studies.spread.cluster import cluster_at
 from hil.studies.spread.workers import cores
 from hil.studies.tune.search import Problem, load_problem
 from hil.studies.tune.taps import FoundTaps, TapsSearch, asks_for_taps, find_taps, write_taps
@@ -65,6 +66,7 @@ def tune(
     workers: int | None = None,
     seed: int = 1,
     dask: str | None = None,
+    dask_tls: str | Path | None = None,
     storage: str | None = None,
     on_progress: Progress = lambda done, total: None,
 ) -> Tuned:
@@ -72,8 +74,10 @@ def tune(
 
     ``search_file``: a shipped search's name or a TOML file. The study is kept in ``out``/study.db, or the database at
     the URL ``storage``: called again it goes on. ``workers``: processes, by default as many as cores; ``dask``: address
-    of a cluster's scheduler to work on instead. Raises ``ConfigError``, also for a search of taps.
+    of a cluster's scheduler to work on instead; ``dask_tls``: folder of its certificates, as ``cluster_at`` wants them.
+    Raises ``ConfigError``, also for a search of taps.
     """
+    cluster = cluster_at(dask, dask_tls)
     if asks_for_taps(str(search_file)):
         raise ConfigError(f"{search_file}: asks for taps, which are found at once, without trials: hil.tune_taps")
     problem = load_problem(str(search_file))
@@ -83,7 +87,7 @@ def tune(
     interrupted = False
     if trials:
         try:
-            search(study, problem, trials, workers or cores(), dask, on_progress)
+            search(study, problem, trials, workers or cores(), cluster, on_progress)
         except KeyboardInterrupt:
             interrupted = True
     found = best(study, problem)

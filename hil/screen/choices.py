@@ -1,7 +1,10 @@
 """What several commands let one choose."""
 
 from enum import StrEnum
-from typing import TYPE_CHECKING
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated
+
+import typer
 
 from pkxyz_ctrl.config.files import ConfigError
 
@@ -31,3 +34,11 @@ def require_simulated(bus: "BusConfig", command: str) -> None:
             f"`pkxyz {command}` simulates: run on it with `pkxyz run --bus {bus.name}`, or simulate with --bus fd_5k, "
             "classic_2k or local_20k"
         )
+
+
+Dask = Annotated[
+    str | None, typer.Option(metavar="ADDRESS", help="Scheduler of a Dask cluster to work on instead: tls://HOST:PORT.")
+]
+DaskTls = Annotated[
+    Path | None, typer.Option(metavar="DIR", help="Folder with ca.pem, cert.pem and key.pem for a scheduler at tls://.")
+]

@@ -18,6 +18,7 @@ from hil.lanes.lane import Lane
 from hil.runs.metrics import Metrics
 from hil.runs.scenario import Scenario, resolve
 from hil.studies.margins.loop import Loop
+from hil.studies.spread.cluster import Cluster
 from hil.studies.spread.workers import as_done, with_constant, worker_pool
 from pkxyz_ctrl.config import files as config
 from pkxyz_ctrl.config.files import ConfigError
@@ -156,7 +157,7 @@ def run_study(
     seeds: Sequence[int],
     results: Results,
     workers: int,
-    scheduler: str | None = None,
+    cluster: Cluster | None = None,
     on_progress: Callable[[int, int], None] = lambda done, total: None,
 ) -> None:
     """Run the seeds that have no result yet. Interrupted, it keeps those that are done."""
@@ -165,7 +166,7 @@ def run_study(
     on_progress(done, len(seeds))
     if not left:
         return
-    with worker_pool(workers, scheduler) as (pool, width):
+    with worker_pool(workers, cluster) as (pool, width):
         for n, (_, result) in enumerate(_all_done(pool, width, study, left), start=1):
             results.add(result)
             on_progress(done + n, len(seeds))

@@ -10,6 +10,7 @@ from typer.testing import CliRunner
 from hil.cli import app
 from hil.pictures.tuning import draw_tuning
 from hil.studies.margins.loop import Loop, over_changed_plants
+from hil.studies.spread.cluster import Cluster
 from hil.studies.spread.workers import as_done, worker_pool
 from hil.studies.tune.search import UNUSABLE, evaluate, load_problem
 from hil.studies.tune.taps import asks_for_taps
@@ -152,7 +153,7 @@ def test_a_dask_cluster_does_the_same_as_processes():
 
     with (
         LocalCluster(n_workers=1, threads_per_worker=2, processes=False, dashboard_address=None) as cluster,
-        worker_pool(1, cluster.scheduler_address) as (pool, width),
+        worker_pool(1, Cluster(cluster.scheduler_address)) as (pool, width),
     ):
         assert width == 2
         assert dict(as_done(pool, width, square, range(20))) == {n: n * n for n in range(20)}
@@ -167,7 +168,7 @@ def test_no_scheduler_is_one_line(monkeypatch):
     monkeypatch.setattr(distributed, "Client", refuse)
     with (
         pytest.raises(ConfigError, match=r"no scheduler answers at tcp://127\.0\.0\.1:1"),
-        worker_pool(1, "tcp://127.0.0.1:1"),
+        worker_pool(1, Cluster("tcp://127.0.0.1:1")),
     ):
         pass
 

@@ -6,6 +6,7 @@ from typing import Annotated
 
 import typer
 
+from hil.screen.choices import Dask, DaskTls
 from hil.screen.first_run import say_if_compiling
 from hil.screen.outputs import folder_to_write
 from hil.screen.progress import progress_bar
@@ -17,9 +18,8 @@ def tune(
     search: Annotated[str, typer.Argument(help="A shipped search's name or a TOML file.")] = "lqg",
     trials: Annotated[int, typer.Option(min=0, help="How many to add to the study; 0 only shows it.")] = 100,
     workers: Annotated[int | None, typer.Option(min=1, help="Processes; default: as many as cores.")] = None,
-    dask: Annotated[
-        str | None, typer.Option(metavar="ADDRESS", help="Scheduler of a Dask cluster to work on instead.")
-    ] = None,
+    dask: Dask = None,
+    dask_tls: DaskTls = None,
     storage: Annotated[
         str | None, typer.Option(metavar="URL", help="Database of the study; default: study.db in the folder.")
     ] = None,
@@ -51,8 +51,9 @@ def tune(
     say_if_compiling(quiet=as_json)
     with progress_bar(search, quiet=as_json) as tell:
         tuned = search_on(
-            search, trials=trials, out=out, workers=workers, seed=seed, dask=dask, storage=storage, on_progress=tell
-        )
+            search, trials=trials, out=out, workers=workers, seed=seed, dask=dask, dask_tls=dask_tls, storage=storage,
+            on_progress=tell,
+        )  # fmt: skip
     problem, found = tuned.problem, tuned.best
     if tuned.trials:
         from hil.pictures.tuning import draw_tuning

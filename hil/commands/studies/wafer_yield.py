@@ -8,12 +8,14 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
+from hil.screen.choices import Dask, DaskTls
 from hil.screen.first_run import say_if_compiling
 from hil.screen.outputs import folder_to_write, writing
 from hil.screen.progress import progress_bar
 from hil.screen.terminal import bad, good, plain_table, print_whole, say
 
 if TYPE_CHECKING:
+    from hil.studies.spread.cluster import Cluster
     from hil.studies.wafer.causes import Causes
     from hil.studies.wafer.closed_loop import ClosedLoops
     from hil.studies.wafer.table import Table
@@ -36,9 +38,8 @@ def wafer_yield(
         bool, typer.Option("--known/--shipped", help="Also under a law for what an identification would find, or not.")
     ] = True,
     workers: Annotated[int | None, typer.Option(min=1, help="Processes; default: as many as cores.")] = None,
-    dask: Annotated[
-        str | None, typer.Option(metavar="ADDRESS", help="Scheduler of a Dask cluster to work on instead.")
-    ] = None,
+    dask: Dask = None,
+    dask_tls: DaskTls = None,
     alone: Annotated[int | None, typer.Option(metavar="NUMBER", min=0, help="This device alone.")] = None,
     out: Annotated[
         Path, typer.Option(help="Folder for devices/ and loops/ (Parquet), summary.json and pictures.")
@@ -50,6 +51,7 @@ def wafer_yield(
     Exit code 0, 2 for bad input, 130 if interrupted: then with the result of what was done, which is kept.
     """
     from hil.runs.scenario import load_scenario
+    from hil.studies.spread.cluster import cluster_at
     from hil.studies.spread.workers import cores
     from hil.studies.wafer.closed_loop import ClosedLoops
     from hil.studies.wafer.study import WaferStudy
@@ -62,10 +64,11 @@ def wafer_yield(
     if alone is not None:
         _alone({**(closed.device(alone) if loops else {}), **study.alone(alone)}, as_json=as_json)
         return
+    cluster = cluster_at(dask, dask_tls)
     folder_to_write(out)
     if loops:
         say_if_compiling(quiet=as_json)
-    asked = _Asked(closed, devices, loops, sensitivity, workers or cores(), dask, out, as_json)
+    asked = _Asked(closed, devices, loops, sensitivity, workers or cores(), cluster, out, as_json)
     with writing(out):
         data = asked.worked()
     if as_json:
@@ -84,7 +87,7 @@ class _Asked:
     loops: int
     sensitivity: int
     workers: int
-    dask: str | None
+    cluster: "Cluster | None"
     out: Path
     quiet: bool
 
@@ -100,10 +103,10 @@ class _Asked:
         loops = Table(self.out / "loops", self.closed.digest()) if self.loops else None
         try:
             with progress_bar("devices", quiet=self.quiet) as tell:
-                run_study(study, parts_for(study.process, self.devices), table, self.workers, self.dask, tell)
+                run_study(study, parts_for(study.process, self.devices), table, self.workers, self.cluster, tell)
             if loops is not None:
                 with progress_bar("loops", quiet=self.quiet) as tell:
-                    run_study(self.closed, -(-self.loops // PART_DEVICES), loops, self.workers, self.dask, tell)
+                    run_study(self.closed, -(-self.loops // PART_DEVICES), loops, self.workers, self.cluster, tell)
             if self.sensitivity:
                 with progress_bar("causes", quiet=self.quiet) as tell:
                     found = causes(study, self.sensitivity, tell)

@@ -12,6 +12,7 @@ from contextlib import contextmanager
 from functools import lru_cache, partial
 from typing import Any, TypeVar, cast
 
+from hil.studies.spread.cluster import Cluster
 from hil.studies.spread.processes import processes
 from pkxyz_ctrl.config.files import ConfigError
 
@@ -27,11 +28,12 @@ def cores() -> int:
 
 
 @contextmanager
-def worker_pool(workers: int, scheduler: str | None = None) -> Iterator[tuple[Executor, int]]:
-    """An executor and how many pieces it can work at: processes here, or the threads of a Dask cluster whose scheduler
-    has the address. Raises ``ConfigError`` for a scheduler that doesn't answer or has no workers.
+def worker_pool(workers: int, cluster: Cluster | None = None) -> Iterator[tuple[Executor, int]]:
+    """An executor and how many pieces it can work at: processes here, or the threads of a Dask cluster.
+
+    Raises ``ConfigError`` for a scheduler that doesn't answer or has no workers.
     """
-    if scheduler is None:
+    if cluster is None:
         before = {name: os.environ.get(name) for name in _THREADS}
         os.environ.update(dict.fromkeys(_THREADS, "1"))  # read by the libraries when a process starts
         try:
@@ -46,13 +48,17 @@ def worker_pool(workers: int, scheduler: str | None = None) -> Iterator[tuple[Ex
     except ImportError:
         raise ConfigError("--dask needs the package 'distributed'; install this one with its extra [cluster]") from None
     try:
-        client: Any = cast(Any, Connect)(scheduler, timeout="10s", set_as_default=False)
+        client: Any = cast(Any, Connect)(
+            cluster.address, timeout="10s", set_as_default=False, security=cluster.security
+        )
     except (OSError, ValueError) as error:
-        raise ConfigError(f"--dask: no scheduler answers at {scheduler}: {error}") from None
+        raise ConfigError(f"--dask: no scheduler answers at {cluster.address}: {error}") from None
     with client:
         threads = sum(client.nthreads().values())
         if threads == 0:
-            raise ConfigError(f"--dask: the scheduler at {scheduler} has no workers; start some with 'dask worker'")
+            raise ConfigError(
+                f"--dask: the scheduler at {cluster.address} has no workers; start some with 'dask worker'"
+            )
         yield client.get_executor(pure=False), threads
 
 

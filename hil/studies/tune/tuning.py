@@ -14,6 +14,7 @@ import numpy as np
 import optuna
 import tomlkit
 
+from hil.studies.spread.cluster import Cluster
 from hil.studies.spread.workers import as_done, with_constant, worker_pool
 from hil.studies.tune.search import Evaluation, Problem, evaluate, put
 from pkxyz_ctrl.config.files import ConfigError
@@ -75,7 +76,7 @@ def search(
     problem: Problem,
     trials: int,
     workers: int,
-    scheduler: str | None = None,
+    cluster: Cluster | None = None,
     on_progress: Callable[[int, int], None] = lambda done, total: None,
 ) -> None:
     """Add so many trials to the study. Interrupted, it keeps those that are done. One worker and one seed give the
@@ -90,7 +91,7 @@ def search(
             yield trial.number, _numbers(trial, problem)
 
     try:
-        with worker_pool(workers, scheduler) as (pool, width):
+        with worker_pool(workers, cluster) as (pool, width):
             valued = as_done(pool, width, with_constant(_valued, problem), choices())
             for done, ((number, _), evaluation) in enumerate(valued, start=1):
                 _tell(study, asked.pop(number), evaluation)

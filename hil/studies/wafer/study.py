@@ -12,6 +12,7 @@ from typing import Any, Protocol
 import numpy as np
 from numpy.typing import NDArray
 
+from hil.studies.spread.cluster import Cluster
 from hil.studies.spread.workers import as_done, with_constant, worker_pool
 from hil.studies.wafer.table import Table
 from pkxyz_ctrl.config import files as config
@@ -128,7 +129,7 @@ def run_study(
     parts: int,
     table: Table,
     workers: int,
-    scheduler: str | None = None,
+    cluster: Cluster | None = None,
     on_progress: Callable[[int, int], None] = lambda done, total: None,
 ) -> None:
     """Work out those of the first ``parts`` parts that are not in the table yet. Interrupted, it keeps those that are
@@ -136,10 +137,10 @@ def run_study(
     """
     left = [part for part in range(parts) if part not in table.parts]
     on_progress(parts - len(left), parts)
-    if workers == 1 and scheduler is None:
+    if workers == 1 and cluster is None:
         _keep(((part, study.part(part)) for part in left), table, parts - len(left), parts, on_progress)
     elif left:
-        with worker_pool(workers, scheduler) as (pool, width):
+        with worker_pool(workers, cluster) as (pool, width):
             done = as_done(pool, width, with_constant(_part, study), left, ahead=width)
             _keep(done, table, parts - len(left), parts, on_progress)
 
