@@ -24,6 +24,7 @@ COMMANDS = {
     "plant": ("hil.commands.run:plant", "Serve amplifier and plant for run."),
     "serve": ("hil.commands.serve:serve", "Operate a stage: page and clients."),
     "ask": ("hil.commands.ask:ask", "Ask a stage in operation: move, stop, status."),
+    "ioc": ("hil.commands.instrument:ioc", "A stage in operation for EPICS."),
     "operate": ("hil.commands.operate:operate", "The loop that serve operates."),
     "check-amplifier": ("hil.commands.check_amplifier:check_amplifier", "May this amplifier be enabled?"),
     "export": ("hil.commands.export:export", "The controller as C for a board."),

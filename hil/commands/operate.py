@@ -15,6 +15,10 @@ Silence = Annotated[
     str, typer.Option(help="What becomes of a moving stage when the server falls silent: hold or park.")
 ]
 
+SilentFor = Annotated[
+    float, typer.Option(help="After how long a silent server is taken to be gone.", min=0.03, max=10.0)
+]
+
 
 def operate(
     bus: Annotated[str, typer.Option(help="Name or file of the bus.")] = "unix_2k",
@@ -23,6 +27,7 @@ def operate(
     name: Name = "stage",
     on_silence: Silence = "hold",
     report: Report = None,
+    silence_s: SilentFor = 0.06,
 ) -> None:
     """Run the loop of a stage that `pkxyz serve` operates, until Ctrl-C or SIGTERM; at its end the combs are at 0 V."""
     from hil.conformance.proven import with_report
@@ -34,7 +39,7 @@ def operate(
     from pkxyz_ctrl.config.files import load
     from pkxyz_ctrl.loop.controller import StartUpError
 
-    settings = Settings(on_silence=_silence(on_silence))
+    settings = Settings(on_silence=_silence(on_silence), silence_s=silence_s)
     config = load("buses", bus, BusConfig)
     if report is not None:
         config = with_report(config, report)

@@ -6,6 +6,7 @@ from typing import Annotated
 
 import typer
 
+from hil.commands.operate import SilentFor
 from hil.commands.run import Report
 from hil.screen.first_run import say_if_compiling
 
@@ -21,6 +22,7 @@ def serve(
     on_silence: Annotated[
         str, typer.Option(help="What becomes of a moving stage when the server falls silent: hold or park.")
     ] = "hold",
+    silence_s: SilentFor = 0.06,
     host: Annotated[str, typer.Option(help="Address to listen at. Others than this machine's can reach it then.")] = (
         "127.0.0.1"
     ),
@@ -49,7 +51,7 @@ def serve(
     def tell(url: str) -> None:
         print(json.dumps({"url": url}) if as_json else f"the stage is at {url}", flush=True)
 
-    served = Served(name, stage, controller, plant, bus, on_silence, host, port, is_simulated, report)
+    served = Served(name, stage, controller, plant, bus, on_silence, silence_s, host, port, is_simulated, report)
     raise typer.Exit(serve(served, tell))
 
 

@@ -87,6 +87,7 @@ class Desk:
         self._numbers = 0
         self._frames = (0, 0, 0)
         self._load = 0.0
+        self._ranges: tuple[list[float], list[list[float | None]]] = ([], [])
 
     # -- clients -------------------------------------------------------------------------------------------------------
 
@@ -280,10 +281,17 @@ class Desk:
         else:
             self._look_at_load(newest)
             status = status_of(newest, self.link.description, self._load) | {"alive": self.link.is_alive}
+            status["range_m"] = self._ranges_at(newest["session"]["target_m"])
         status |= {"last_fault": self.last_fault, "held": self.holder is not None, "clients": len(self.clients)}
         text = json.dumps({"status": status}, allow_nan=False)
         for client in self.clients:
             client.tell_text(text)
+
+    def _ranges_at(self, target_m: np.ndarray) -> list[list[float | None]]:
+        """How far each axis can go; looked for when the target is another."""
+        if self._ranges[0] != target_m.tolist():
+            self._ranges = (target_m.tolist(), self._planner.ranges(target_m.copy()))
+        return self._ranges[1]
 
     def _look_at_load(self, newest: np.void) -> None:
         now = (int(newest["row"]["t_us"]), int(newest["session"]["wire_ns"]), int(newest["session"]["missed"]))

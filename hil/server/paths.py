@@ -85,6 +85,11 @@ class Planner:
             for a, b in ((0, 1), (0, 2), (1, 2))
         }
 
+    def ranges(self, target_m: Array) -> list[list[float | None]]:
+        """Least and greatest target of each axis that the combs can hold with the others at theirs, in m."""
+        found = [self._reach.range_along(target_m, axis) for axis in range(3)]
+        return [[None, None] if low_high is None else list(low_high) for low_high in found]
+
     def of_scenario(self, name: str) -> StagePath:
         """The reference of a shipped scenario: names only, as a client can't be let into our files."""
         if "/" in name or "\\" in name or "." in name:

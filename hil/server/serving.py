@@ -39,6 +39,7 @@ class Served:
     plant: str
     bus: str
     on_silence: str
+    silence_s: float
     host: str
     port: int
     is_simulated: bool
@@ -157,7 +158,8 @@ def _start(children: _Children, served: Served) -> None:
         place.write(served.name, "plant", {"pid": pid})
     children.start(
         "loop", "operate", *common, "--controller", served.controller, "--name", served.name, "--on-silence",
-        served.on_silence, *(("--report", str(served.report)) if served.report is not None else ()),
+        served.on_silence, "--silence-s", str(served.silence_s),
+        *(("--report", str(served.report)) if served.report is not None else ()),
     )  # fmt: skip
 
 

@@ -78,6 +78,7 @@ class Stage:
     limits = _waited(AsyncStage.limits)
     take_control = _waited(AsyncStage.take_control)
     give_control = _waited(AsyncStage.give_control)
+    next_status = _waited(AsyncStage.next_status)
     wait_in_position = _waited(AsyncStage.wait_in_position)
     capture = _waited(AsyncStage.capture)
 

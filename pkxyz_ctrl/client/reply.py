@@ -45,6 +45,8 @@ class Status:
     """(3,)"""
     target_m: NDArray[np.float64]
     """(3,), where the present motion ends"""
+    range_m: NDArray[np.float64]
+    """(3, 2), least and greatest target of each axis that the combs can hold with the others at theirs"""
     voltage_v: NDArray[np.float64]
     """(3,), of the combs"""
     headroom_v: float
@@ -62,6 +64,8 @@ class Status:
         values: dict[str, Any] = {name: data.get(name) for name in cls.__dataclass_fields__}
         for name in ("position_m", "setpoint_m", "target_m", "voltage_v"):
             values[name] = np.array([np.nan if v is None else v for v in values[name] or [None] * 3], np.float64)
+        low_high = [[np.nan if v is None else v for v in pair] for pair in values["range_m"] or [[None] * 2] * 3]
+        values["range_m"] = np.array(low_high, np.float64)
         plain: dict[str, Any] = {"homed": False, "driven": False, "in_position": False, "missed_ticks": 0}
         plain |= dict.fromkeys(("t_s", "headroom_v", "progress", "bus_load"), 0.0)
         return cls(**{name: plain.get(name, "") if value is None else value for name, value in values.items()})

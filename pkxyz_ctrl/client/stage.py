@@ -193,6 +193,10 @@ class AsyncStage:
         """What the loop says of itself: stage, controller, bus, period_us, limits, middle_m, ..."""
         return self._connection.description
 
+    async def next_status(self) -> Status:
+        """The next one that comes, within a tenth of a second. Raises ``NoStageError``."""
+        return await self._connection.next_status()
+
     async def wait_in_position(self, timeout_s: float = 10.0) -> Status:
         """Until the stage is in position. Raises ``StageError`` after ``timeout_s``."""
         try:

@@ -44,6 +44,7 @@ HOUSE: Mapping[str, Room] = MappingProxyType({
     ),
     "pkxyz_ctrl.export": Room(("pkxyz_ctrl.safety", "pkxyz_ctrl.compiled", "pkxyz_ctrl.core", "pkxyz_ctrl.loop")),
     "pkxyz_ctrl.client": Room(),
+    "pkxyz_ctrl.instrument": Room(("pkxyz_ctrl.client",)),
     # the device, and what is designed for it offline
     "pkxyz_ctrl.elements": Room(("pkxyz_ctrl.config",)),
     "pkxyz_ctrl": Room(

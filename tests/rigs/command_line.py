@@ -1,11 +1,23 @@
-"""``pkxyz`` in a process of its own, as a user starts it."""
+"""``pkxyz`` in a process of its own, as a user starts it; and a stage that it serves, patiently, over loopback."""
 
+import contextlib
 import os
+import signal
 import subprocess
 import sys
+import time
+from collections.abc import Iterator
 from pathlib import Path
 
+from patience import patient_bus, patient_law
+
+import pkxyz_ctrl
+from pkxyz_ctrl.client import place
+from pkxyz_ctrl.client.plain import Stage
+
 ROOT = Path(__file__).parents[2]
+STARTS_S = 200.0
+"""The kernels may have to be compiled."""
 
 
 def pkxyz(*words, cwd):
@@ -19,3 +31,68 @@ def pkxyz(*words, cwd):
         check=False,
         timeout=600,
     )
+
+
+class Server:
+    """``err``: what it said on its standard error."""
+
+    def __init__(self, law: Path, bus: Path) -> None:
+        words = ["serve", "--controller", str(law), "--bus", str(bus), "--port", "0", "--json"]
+        words += ["--silence-s", "0.25"]
+        self._command = [sys.executable, "-m", "hil", *words]
+        self.process: subprocess.Popen[str]
+        self.err = law.parent / "err"
+
+    def start(self) -> None:
+        with self.err.open("wb") as err:
+            self.process = subprocess.Popen(
+                self._command, stdout=subprocess.PIPE, stderr=err, stdin=subprocess.DEVNULL, text=True
+            )
+        assert self.process.stdout is not None
+        assert self.process.stdout.readline().startswith('{"url": "http://127.0.0.1:')
+
+    def end(self) -> int:
+        self.process.send_signal(signal.SIGTERM)
+        return self.process.wait(20)
+
+
+@contextlib.contextmanager
+def served(folder: Path) -> Iterator[Server]:
+    """One that is found by its default name while this lasts; whatever becomes of the test, it is ended."""
+    before = os.environ.get("XDG_RUNTIME_DIR")
+    os.environ["XDG_RUNTIME_DIR"] = str(folder)
+    server = Server(patient_law(folder, "youla"), patient_bus(folder / "bus.toml"))
+    try:
+        server.start()
+        yield server
+        server.end()
+    finally:
+        for kind in ("server", "loop", "plant"):
+            if (found := place.read("stage", kind)) is not None:
+                with contextlib.suppress(ProcessLookupError):
+                    os.kill(found["pid"], signal.SIGKILL)
+        os.environ.pop("XDG_RUNTIME_DIR")
+        if before is not None:
+            os.environ["XDG_RUNTIME_DIR"] = before
+
+
+@contextlib.contextmanager
+def alive(control: bool = True) -> Iterator[Stage]:
+    """Connected, once the loop is there."""
+    with pkxyz_ctrl.connect(control=control) as stage:
+        end_s = time.monotonic() + STARTS_S
+        while stage.status.activity == "starting" and time.monotonic() < end_s:
+            time.sleep(0.05)
+        if stage.status.activity == "fault":  # a machine that stood still
+            stage.clear()
+        yield stage
+
+
+def driven(stage: Stage) -> None:
+    """In the middle of the workspace."""
+    if stage.status.activity == "fault":
+        stage.clear()
+    if not stage.status.driven:
+        stage.home()
+        stage.enable()
+    stage.move_to(0.0, 0.0, 18e-6)

@@ -2,11 +2,7 @@
 
 import contextlib
 import http.client
-import os
-import signal
 import socket
-import subprocess
-import sys
 import time
 from collections.abc import Iterator
 from pathlib import Path
@@ -14,79 +10,21 @@ from urllib.parse import urlsplit
 
 import numpy as np
 import pytest
-from patience import patient_bus, patient_law
+from command_line import Server, alive, driven, served
 from websockets.exceptions import InvalidStatus
 from websockets.sync.client import connect as plain_connect
 from websockets.typing import Subprotocol
 
-import pkxyz_ctrl
 from hil.server.app import CLIENTS_MOST
 from pkxyz_ctrl.client import place
-from pkxyz_ctrl.client.plain import Stage
 from pkxyz_ctrl.client.protocol import SUBPROTOCOL, TOKEN_PREFIX
 from pkxyz_ctrl.client.reply import RefusedError
-
-STARTS_S = 200.0  # the kernels may have to be compiled
-
-
-class Server:
-    def __init__(self, law: Path, bus: Path) -> None:
-        words = ["serve", "--controller", str(law), "--bus", str(bus), "--port", "0", "--json"]
-        self._command = [sys.executable, "-m", "hil", *words]
-        self.process: subprocess.Popen[str]
-        self.err = law.parent / "err"
-
-    def start(self) -> None:
-        with self.err.open("wb") as err:
-            self.process = subprocess.Popen(
-                self._command, stdout=subprocess.PIPE, stderr=err, stdin=subprocess.DEVNULL, text=True
-            )
-        assert self.process.stdout is not None
-        assert self.process.stdout.readline().startswith('{"url": "http://127.0.0.1:')
-
-    def end(self) -> int:
-        self.process.send_signal(signal.SIGTERM)
-        return self.process.wait(20)
 
 
 @pytest.fixture(scope="module")
 def server(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Server]:
-    folder = tmp_path_factory.mktemp("serve")
-    before = os.environ.get("XDG_RUNTIME_DIR")
-    os.environ["XDG_RUNTIME_DIR"] = str(folder)
-    served = Server(patient_law(folder, "youla"), patient_bus(folder / "bus.toml"))
-    try:
-        served.start()
-        yield served
-        served.end()
-    finally:
-        for kind in ("server", "loop", "plant"):
-            if (found := place.read("stage", kind)) is not None:
-                with contextlib.suppress(ProcessLookupError):
-                    os.kill(found["pid"], signal.SIGKILL)
-        os.environ.pop("XDG_RUNTIME_DIR")
-        if before is not None:
-            os.environ["XDG_RUNTIME_DIR"] = before
-
-
-@contextlib.contextmanager
-def alive(control: bool = True) -> Iterator[Stage]:
-    with pkxyz_ctrl.connect(control=control) as stage:
-        end_s = time.monotonic() + STARTS_S
-        while stage.status.activity == "starting" and time.monotonic() < end_s:
-            time.sleep(0.05)
-        if stage.status.activity == "fault":  # a machine that stood still
-            stage.clear()
-        yield stage
-
-
-def driven(stage: Stage) -> None:
-    if stage.status.activity == "fault":
-        stage.clear()
-    if not stage.status.driven:
-        stage.home()
-        stage.enable()
-    stage.move_to(0.0, 0.0, 18e-6)
+    with served(tmp_path_factory.mktemp("serve")) as server:
+        yield server
 
 
 def address() -> tuple[str, str]:

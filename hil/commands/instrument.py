@@ -1,0 +1,54 @@
+"""``pkxyz ioc`` and ``pkxyz scpi``: a stage that ``pkxyz serve`` operates, for other laboratory software."""
+
+import asyncio
+import signal
+import sys
+from collections.abc import Callable, Coroutine
+from functools import partial
+from typing import Annotated, Any
+
+import typer
+
+from pkxyz_ctrl.config.files import ConfigError
+
+Name = Annotated[str, typer.Option(help="What the stage is called, where there are several.")]
+Url = Annotated[str | None, typer.Option(help="The address that serve printed, for a stage elsewhere.")]
+Host = Annotated[str, typer.Option(help="Address to listen at. Others than this machine's can reach it then.")]
+
+
+def ioc(
+    prefix: Annotated[str, typer.Option(help="Before the names of all channels.")] = "pkxyz:",
+    name: Name = "stage",
+    url: Url = None,
+    host: Host = "127.0.0.1",
+    port: Annotated[int, typer.Option(help="For Channel Access.", min=1, max=65535)] = 5064,
+) -> None:
+    """Serve a stage in operation to EPICS: a motor record per axis, and its verbs, until Ctrl-C."""
+    import pkxyz_ctrl
+
+    try:
+        from pkxyz_ctrl.instrument.ioc import serve_ioc
+    except ModuleNotFoundError as error:
+        raise ConfigError(f"{error.name} is missing: pip install 'pkxyz-ctrl[epics]'") from None
+    stage = pkxyz_ctrl.connect_async(url, name=name, control=False)
+    _until_ended(partial(serve_ioc, stage, prefix, host, port, _tell))
+
+
+def _tell(words: str) -> None:
+    print(words, flush=True)
+
+
+def _until_ended(serve: Callable[[asyncio.Event], Coroutine[Any, Any, None]]) -> None:
+    from pkxyz_ctrl.client.reply import StageError
+
+    async def main() -> None:
+        ended = asyncio.Event()
+        for number in (signal.SIGINT, signal.SIGTERM):
+            asyncio.get_running_loop().add_signal_handler(number, ended.set)
+        await serve(ended)
+
+    try:
+        asyncio.run(main())
+    except (StageError, OSError) as error:
+        print(f"pkxyz: {error}", file=sys.stderr)
+        raise typer.Exit(1) from None
