@@ -9,8 +9,9 @@ from hil.bench.figure import Figure
 from hil.lanes.excitation import excitation, tones
 from hil.lanes.lane import Lane
 from hil.lanes.setup import bare_setup
+from hil.studies.margins.excited import at_point
 from hil.studies.margins.loop import Loop, agreement, over_changed_plants
-from hil.studies.margins.measured import at_point, measure
+from hil.studies.margins.measured import measure
 from hil.studies.operating_point import operating_strokes
 from pkxyz_ctrl.config.bus import BusConfig
 from pkxyz_ctrl.config.controller import ControllerConfig
@@ -97,5 +98,5 @@ def _measured(loop: Loop, strokes_m: NDArray[np.float64]) -> float:
     config = load("controllers", LAW, ControllerConfig)
     run = at_point(bare_setup("reconstructed", "nominal", config, loop.bus, 1), strokes_m, added)
     seen = measure(run, Lane.FAST)
-    compared = agreement(seen, loop.response(strokes_m, seen.frequency_hz), PERIODS)
+    compared = agreement(seen, loop.response(strokes_m, seen.frequency_hz))
     return compared.largest / compared.bound

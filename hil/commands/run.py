@@ -8,8 +8,10 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
+from hil.screen.errors import amplifier_errors
 from hil.screen.figures import error_lines, lacking_lines, where_to_read
 from hil.screen.first_run import say_if_compiling
+from hil.screen.terminal import note
 from pkxyz_ctrl.config.files import ConfigError
 from pkxyz_ctrl.config.refused import reason
 
@@ -80,7 +82,6 @@ def run(
     from hil.runs.run_folder import RunFolder, next_free
     from hil.screen.live_status import LiveStatus
     from pkxyz_ctrl.design.model.design_error import DesignError
-    from pkxyz_ctrl.loop.controller import StartUpError
 
     learning = learning_of(learn, apply, refresh)
     require_seconds(duration_s)
@@ -99,14 +100,13 @@ def run(
     path = out if out is not None else next_free(Path("runs"), loaded.config.name, Lane.WALL)
     folder = RunFolder(path, replace=replace_earlier)
     try:
-        ran = run_into(folder, loaded, _tell, _quiet if as_json else live, wait_s)
+        with amplifier_errors(loaded.bus, bus):
+            ran = run_into(folder, loaded, note, _quiet if as_json else live, wait_s)
         draw(folder, ran.summary, ran.lateness_us)
     except RecordingError as error:
         raise ConfigError(str(error)) from None
-    except (StartUpError, DesignError) as error:
-        on_this_machine = isinstance(error, StartUpError) and require_real_bus(loaded.bus).interface == "pkxyz-unix"
-        hint = f"; here the amplifier is another process: is `pkxyz plant --bus {bus or loaded.bus.name}` running?"
-        print(f"pkxyz: {error}{hint if on_this_machine else ''}", file=sys.stderr)
+    except DesignError as error:
+        print(f"pkxyz: {error}", file=sys.stderr)
         raise typer.Exit(1) from None
     if as_json:
         print(json.dumps(ran.summary.as_json() | {"folder": str(folder.path)}, allow_nan=False))
@@ -147,7 +147,7 @@ def plant(
     try:
         with Ending() as ending, open_bus(can_config, loaded.bus.name) as opened:
             served = WallPlant(loaded.setup(), can_config, opened, show, truth)
-            _tell(go_real_time())
+            note(go_real_time())
             settle_memory()
             try:
                 served.serve(ending.check)
@@ -188,7 +188,7 @@ def _met(scenario: str, *, measured: bool = False, **instead: Any) -> Any:
     if measured:
         buses = (load("buses", name, BusConfig) for name in _MEETING_BUSES)
         meeting, why = fastest_that_fits(buses, loaded.controller.monitors.overrun_count)
-    _tell(f"the scenario's bus, {loaded.bus.name}, is simulated; meeting on {meeting.name}: {why}")
+    note(f"the scenario's bus, {loaded.bus.name}, is simulated; meeting on {meeting.name}: {why}")
     return load_scenario(scenario, **instead | {"bus": meeting.name})
 
 
@@ -206,10 +206,6 @@ def _lasting(loaded: Any, duration_s: float | None) -> Any:
 
 def _quiet(row: object) -> None:
     """Say nothing of a row."""
-
-
-def _tell(words: str) -> None:
-    print(words, file=sys.stderr, flush=True)
 
 
 def _show(summary: "Summary", folder: Path) -> None:

@@ -5,6 +5,7 @@ leakage, and periods beyond the first show what noise there is.
 """
 
 from dataclasses import dataclass
+from functools import cached_property
 from typing import Literal
 
 import numpy as np
@@ -55,25 +56,40 @@ class Excitation:
         """Trajectory tick at which the measured periods of a passage begin."""
         return self.first_tick + passage * self.passage_ticks + SETTLE_PERIODS * self.period_ticks
 
+    def undisturbed(self, passage: int, spoilt: NDArray[np.bool_]) -> NDArray[np.int64]:
+        """Which of its measured periods, from 0, ran through as played, and the one before them too, whose transients
+        they would show; ``spoilt`` (ticks,) says at which ticks of the trajectory the loop did not see what it should.
+        """
+        begin = self.measured_from(passage) - self.period_ticks
+        played = spoilt[begin : begin + (self.periods + 1) * self.period_ticks].reshape(-1, self.period_ticks)
+        broken = played.sum(axis=1)
+        return np.flatnonzero(broken[1:] + broken[:-1] == 0)
+
+    def ticks_of(self, passage: int, periods: NDArray[np.int64]) -> NDArray[np.int64]:
+        """(len(periods) N,) ticks of the trajectory of some of its measured periods."""
+        first = self.measured_from(passage) + self.period_ticks * periods
+        return np.asarray((first[:, None] + np.arange(self.period_ticks)).ravel())
+
     def sample(self, first_tick: int, count: int) -> Array:
         """(count, 3) in m at ticks first_tick, first_tick + 1, ... of the trajectory."""
         out = np.zeros((count, 3))
-        begin = self.first_tick
-        for passage in self.passages:
-            low, high = max(begin, first_tick), min(begin + self.passage_ticks, first_tick + count)
-            if low < high:
-                rows = slice(low - first_tick, high - first_tick)
-                out[rows, passage.axis] = self._period(passage)[
-                    np.arange(low - begin, high - begin) % self.period_ticks
-                ]
-            begin += self.passage_ticks
+        past, length = first_tick - self.first_tick, self.passage_ticks
+        for n in range(max(past // length, 0), min((past + count - 1) // length + 1, len(self.passages))):
+            begin = self.first_tick + n * length
+            low, high = max(begin, first_tick), min(begin + length, first_tick + count)
+            rows = slice(low - first_tick, high - first_tick)
+            at = np.arange(low - begin, high - begin) % self.period_ticks
+            out[rows, self.passages[n].axis] = self._one_period[n][at]
         return out
 
-    def _period(self, passage: Passage) -> Array:
-        """(N,) one period; from the inverse transform, so its bins are exact."""
-        spectrum = np.zeros(self.period_ticks // 2 + 1, np.complex128)
-        spectrum[passage.bins] = np.exp(1j * passage.phase_rad)
-        return self.amplitude_m * np.fft.irfft(spectrum * (0.5 * self.period_ticks), self.period_ticks)
+    @cached_property
+    def _one_period(self) -> list[Array]:
+        """(N,) of each passage; from the inverse transform, so its bins are exact."""
+        spectra = np.zeros((len(self.passages), self.period_ticks // 2 + 1), np.complex128)
+        for spectrum, passage in zip(spectra, self.passages, strict=True):
+            spectrum[passage.bins] = np.exp(1j * passage.phase_rad)
+        scaled = spectra * (0.5 * self.period_ticks)
+        return [self.amplitude_m * np.fft.irfft(each, self.period_ticks) for each in scaled]
 
 
 def tones(period_ticks: int, count: int, lowest: int = 5) -> NDArray[np.int64]:

@@ -4,6 +4,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from hil.lanes.blocks import PREVIEW_ROWS
+from hil.lanes.excitation import Excitation
 from pkxyz_ctrl.loop.reference import REFERENCE, write_rows
 from pkxyz_ctrl.trajectory import Trajectory
 
@@ -19,9 +20,12 @@ class StreamedReference:
     A reference that begins anew, as after a fault that was cleared, is sampled in that tick.
     """
 
-    def __init__(self, trajectory: Trajectory, period_us: int, memory: NDArray[np.void]) -> None:
+    def __init__(
+        self, trajectory: Trajectory, period_us: int, memory: NDArray[np.void], excitation: Excitation | None = None
+    ) -> None:
         """``memory``: the controller's, (1,) of ``cycle.MEMORY``; says where the path is."""
         self._trajectory = trajectory
+        self._excitation = excitation
         self._period_us = period_us
         self._memory = memory
         self._rows, self._next = (np.zeros(BLOCK_ROWS + PREVIEW_ROWS, REFERENCE) for _ in range(2))
@@ -44,12 +48,17 @@ class StreamedReference:
         begin, end = self._filled, min(self._filled + PIECE_ROWS, len(self._next))
         if begin < end:
             first = self._base + BLOCK_ROWS + begin
-            write_rows(self._next[begin:end], self._trajectory.sample(first, end - begin, self._period_us), first)
+            self._write(self._next[begin:end], first)
             self._filled = end
 
     def _begin(self, at: int) -> None:
-        write_rows(self._rows, self._trajectory.sample(at, len(self._rows), self._period_us), at)
+        self._write(self._rows, at)
         self._take(at)
+
+    def _write(self, rows: NDArray[np.void], first: int) -> None:
+        write_rows(rows, self._trajectory.sample(first, len(rows), self._period_us), first)
+        if self._excitation is not None:
+            rows["added_m"] = self._excitation.sample(first, len(rows))
 
     def _take(self, at: int) -> None:
         """The rows in use begin at trajectory tick ``at``; of those after them there is none yet."""

@@ -168,7 +168,8 @@ class WallRig:
         """Run all ticks of an amplifier that is started. Raises ``AmplifierGoneError`` and ``Ended``."""
         row, take = self.controller.row, self._recorder.row
         live, memory = self.live, self.controller.memory
-        streamed = StreamedReference(self.setup.trajectory, self.setup.bus.period_us, memory)
+        setup = self.setup
+        streamed = StreamedReference(setup.trajectory, setup.bus.period_us, memory, setup.excitation)
 
         controller, fault = self.controller, int(Mode.FAULT)
 

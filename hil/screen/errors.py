@@ -3,16 +3,22 @@
 import sys
 from collections.abc import Iterator
 from contextlib import contextmanager
+from typing import TYPE_CHECKING
+
+import typer
 
 from hil.screen.outputs import what_to_do
 from pkxyz_ctrl.compiled.kernel_cache import forget_damaged
 from pkxyz_ctrl.config.files import ConfigError
 
+if TYPE_CHECKING:
+    from pkxyz_ctrl.config.bus import BusConfig
+
 
 @contextmanager
 def one_line_errors() -> Iterator[None]:
     """Raise ``ConfigError`` with the words of a design, a law, a pose, a measurement or a fit that came to nothing."""
-    from hil.studies.margins.measured import MeasurementError
+    from hil.studies.margins.excited import MeasurementError
     from pkxyz_ctrl.design.identification.modal_fit import FitError
     from pkxyz_ctrl.design.model.design_error import DesignError
     from pkxyz_ctrl.design.model.discrete_law import LawError
@@ -22,6 +28,25 @@ def one_line_errors() -> Iterator[None]:
         yield
     except (DesignError, FitError, LawError, MeasurementError, StageDomainError) as error:
         raise ConfigError(str(error)) from None
+
+
+@contextmanager
+def amplifier_errors(bus: "BusConfig", given: str | None) -> Iterator[None]:
+    """End the command with a line where the amplifier doesn't start (exit code 1, with what to start on this machine,
+    for the bus that was ``given``), and with 128 + signal where somebody asked for the end.
+    """
+    from hil.lanes.ending import Ended
+    from pkxyz_ctrl.loop.controller import StartUpError
+
+    try:
+        yield
+    except StartUpError as error:
+        on_this_machine = bus.can is not None and bus.can.interface == "pkxyz-unix"
+        hint = f"; here the amplifier is another process: is `pkxyz plant --bus {given or bus.name}` running?"
+        print(f"pkxyz: {error}{hint if on_this_machine else ''}", file=sys.stderr)
+        raise typer.Exit(1) from None
+    except Ended as end:
+        raise typer.Exit(128 + end.signal_number) from None
 
 
 def told(error: BaseException) -> int:

@@ -1,5 +1,6 @@
 """The terminal. What is printed are words: nothing in them is markup, whatever brackets a file name or a fault has."""
 
+import sys
 from functools import cache
 from typing import TYPE_CHECKING
 
@@ -28,6 +29,11 @@ def notes() -> "Console":
 def say(*words: "str | Text") -> None:
     """A line of the result, as long as it is; pieces are joined without a blank."""
     screen().print(*words, sep="", soft_wrap=True)
+
+
+def note(words: str) -> None:
+    """A line on standard error, at once."""
+    print(words, file=sys.stderr, flush=True)
 
 
 def good(words: str) -> "Text":

@@ -93,8 +93,15 @@ def test_where_none_fits_it_is_said_in_a_line_with_what_to_do(monkeypatch):
 
 
 @pytest.mark.parametrize("bus", ["unix_1k", "socketcan_fd"])
-@pytest.mark.parametrize("words", ["sil raster", "identify --plant harsh", "margins --measured"])
-def test_what_simulates_refuses_a_bus_that_leads_out_of_the_process(bus, words, tmp_path, capsys, monkeypatch):
+@pytest.mark.parametrize(
+    ("words", "instead"),
+    [
+        ("sil raster", "`pkxyz run --bus {bus}`"),
+        ("identify --plant harsh", "`pkxyz plant --plant harsh` serves this one"),
+        ("margins --measured --lane fast", "leave --lane"),
+    ],
+)
+def test_what_simulates_refuses_a_bus_that_leads_out_of_the_process(bus, words, instead, tmp_path, capsys, monkeypatch):
     """It would take its rate and scales, and simulate the rest without a word."""
     monkeypatch.chdir(tmp_path)
     monkeypatch.setattr(sys, "argv", ["pkxyz", *words.split(), "--bus", bus])
@@ -102,6 +109,6 @@ def test_what_simulates_refuses_a_bus_that_leads_out_of_the_process(bus, words, 
         main()
     assert ended.value.code == 2
     (line,) = [words for words in capsys.readouterr().err.splitlines() if words.startswith("pkxyz: ")]
-    assert f"pkxyz run --bus {bus}" in line
+    assert instead.format(bus=bus) in line
     assert "fd_5k" in line
     assert list(tmp_path.iterdir()) == []

@@ -246,6 +246,12 @@ def test_limits_in_counts_never_exceed_those_in_volts():
         assert counts * (200 / 32767) <= slew * 200e-6 * (1 + 1e-9) < (counts + 1) * (200 / 32767)
 
 
+def test_where_a_tick_is_long_a_step_may_be_all_that_a_frame_carries():
+    """At 100 Hz the shipped 100 kV/s are 1000 V a tick, which no gate takes as a number of counts."""
+    slow = bus().model_copy(update={"period_us": 10_000})
+    assert slew_counts(controller(), slow) == 32767
+
+
 def test_a_stage_that_bears_less_than_the_controller_allows_sets_the_limit():
     config = load("stages", "reconstructed", StageConfig)
     weak = Stage(config.model_copy(update={"limits": config.limits.model_copy(update={"voltage_max_v": 150.0})}))

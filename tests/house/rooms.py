@@ -100,7 +100,7 @@ HOUSE: Mapping[str, Room] = MappingProxyType({
         "hil.studies.identify", "hil.studies.tune", "hil.studies.faults", "hil.studies",
     )),
     "hil.pictures.wafer": Room(("pkxyz_ctrl.*", "hil.pictures", "hil.studies.wafer")),
-    "hil.screen": Room(("pkxyz_ctrl.*", "hil.runs", "hil.studies.margins")),
+    "hil.screen": Room(("pkxyz_ctrl.*", "hil.lanes", "hil.runs", "hil.studies.margins")),
     "hil.bench.rigs": Room(("sim.motion", "sim", "pkxyz_ctrl.*", "hil.lanes", "hil.runs")),
     "hil.bench": Room((
         "pkxyz_ctrl.*", "hil.bus", "hil.plant", "hil.recording", "hil.lanes", "hil.runs", "hil.studies.spread",

@@ -14,8 +14,9 @@ from typer.testing import CliRunner
 from hil.cli import app
 from hil.lanes.excitation import excitation, tones
 from hil.lanes.fast import run_block, run_block_in_steps
+from hil.studies.margins.excited import at_point
 from hil.studies.margins.loop import Loop, agreement
-from hil.studies.margins.measured import at_point, measure
+from hil.studies.margins.measured import measure
 from pkxyz_ctrl.config.controller import ControllerConfig
 from pkxyz_ctrl.config.files import ConfigError, load, parse, plain
 from pkxyz_ctrl.core import predictive
@@ -154,7 +155,7 @@ def test_its_margins_are_those_of_the_running_loop():
     seen = measure(at_point(dataclasses.replace(setup(), controller=mpc()), strokes, added), "fast")
     for name, kind in (("mpc", law()), ("lqg", setup().law)):
         computed = Loop(stage(), bus(), kind).response(strokes, seen.frequency_hz)
-        compared = agreement(seen, computed, 4)
+        compared = agreement(seen, computed)
         excess, spread = compared.mean_square - compared.expected_mean_square, 8.0 / np.sqrt(seen.s.size)
         assert (abs(excess) < spread) == (name == "mpc")  # lqg is another law, and it shows
     middle = Loop(stage(), bus(), law()).margins(np.full(3, 12.5e-6))

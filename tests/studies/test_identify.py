@@ -17,13 +17,14 @@ from typer.testing import CliRunner
 
 import hil
 from hil.cli import app
-from hil.lanes.excitation import Passage, excitation, tones
+from hil.lanes.excitation import Excitation, Passage, excitation, tones
+from hil.lanes.lane import Lane
 from hil.lanes.setup import bare_setup
 from hil.studies.identify.calibrated_stage import write_calibrated_stage
 from hil.studies.identify.identification import as_json, exciting, identify, modes_hz
 from hil.studies.identify.outside_scale import outside_scale, read_points
-from hil.studies.identify.plant_response import _spectra, measure_plant
-from hil.studies.margins.measured import at_point
+from hil.studies.identify.plant_response import _spectra, _trend, measure_plant
+from hil.studies.margins.excited import at_point
 from pkxyz_ctrl.config.files import ConfigError, find
 from pkxyz_ctrl.design.identification.modal_fit import FitError, fit_modes
 from sim.motion.geometry import strokes
@@ -82,7 +83,7 @@ def test_the_lab_with_its_slow_sense_chain():
 def test_no_tone_lies_on_a_line_of_the_mains():
     """It is alike in all periods: 50 Hz of the lab alone made a chi-square of 1.8."""
     for kind, seconds in (("multisine", 1.0), ("stepped", 0.1)):
-        hz = np.concatenate([p.bins for p in exciting(bench(), MIDDLE, kind, 5e-9, 6).passages]) / seconds
+        hz = np.concatenate([p.bins for p in exciting(bench(), MIDDLE, Lane.FAST, kind, 5e-9, 6).passages]) / seconds
         assert len(hz) > 60
         assert not (np.isin(np.round(hz) % 50, 0) | np.isin(np.round(hz) % 60, 0)).any()
 
@@ -155,7 +156,8 @@ def test_what_drifts_is_no_tone(ramp, seconds, bend, seed):
     turns = np.exp(2j * np.pi * np.outer(t, passage.bins))
     drift = ramp * t + bend * t**2 + np.exp(-t / max(seconds, 3.0))
     samples = (turns @ spectrum).real + drift[:, None]
-    seen = _spectra(samples, passage, m)
+    played = Excitation(n, m, 1.0, 0, (passage,))
+    seen = _spectra(samples, passage, _trend(played, np.arange(m)))
     assert np.abs(seen - spectrum).max() < 1e-4
     plain = 2 / n * np.fft.rfft(samples.reshape(m, n, 3), axis=1)[:, passage.bins]
     assert np.abs(seen - spectrum).max() <= np.abs(plain - spectrum).max() + 1e-12
@@ -216,7 +218,7 @@ def test_too_few_tones_are_refused():
 
 
 def test_stepped_tones_crowd_about_the_modes():
-    added = exciting(bench(), MIDDLE, "stepped", 25e-9, 6)
+    added = exciting(bench(), MIDDLE, Lane.FAST, "stepped", 25e-9, 6)
     hz = np.unique(np.concatenate([p.bins for p in added.passages])) / (added.period_ticks * 200e-6)
     near = (hz > 500) & (hz < 900)
     assert near.sum() > 15

@@ -14,8 +14,9 @@ from typer.testing import CliRunner
 from hil.cli import app
 from hil.lanes.excitation import excitation, tones
 from hil.lanes.lane import Lane
+from hil.studies.margins.excited import MeasurementError, at_point
 from hil.studies.margins.loop import Loop, agreement, as_json, over_changed_plants
-from hil.studies.margins.measured import MeasurementError, at_point, measure, sampled_margins
+from hil.studies.margins.measured import measure, sampled_margins
 from pkxyz_ctrl.config.files import ConfigError, load, parse, plain
 from pkxyz_ctrl.core.demand import LINEAR
 from pkxyz_ctrl.design.law_about import law_about
@@ -58,7 +59,7 @@ def measured(kind="multisine", combs=(0.0, 0.0, 0.0)):
 def test_measured_and_computed_sensitivity_differ_by_noise_alone(kind):
     """All nine entries at all tones; the mean square distance is that of the distribution, so no bias hides in it."""
     seen = measured(kind)
-    compared = agreement(seen, loop().response(OFF_CENTRE, seen.frequency_hz), PERIODS)
+    compared = agreement(seen, loop().response(OFF_CENTRE, seen.frequency_hz))
     assert compared.holds
     entries = seen.s.size
     spread = 4.0 / np.sqrt(entries)  # four standard errors of a mean of F(2, 8), whose standard deviation is below 2
@@ -69,9 +70,9 @@ def test_measured_and_computed_sensitivity_differ_by_noise_alone(kind):
 def test_a_plant_that_is_not_the_computed_one_is_noticed_and_is_the_changed_one():
     """Combs 10 % off: disagrees with the drawing, agrees with the perturbation that says so."""
     seen = measured(combs=(0.1, -0.1, 0.1))
-    assert not agreement(seen, loop().response(OFF_CENTRE, seen.frequency_hz), PERIODS).holds
+    assert not agreement(seen, loop().response(OFF_CENTRE, seen.frequency_hz)).holds
     changed = Perturbation(comb_gain=(0.1, -0.1, 0.1))
-    compared = agreement(seen, loop().response(OFF_CENTRE, seen.frequency_hz, changed), PERIODS)
+    compared = agreement(seen, loop().response(OFF_CENTRE, seen.frequency_hz, changed))
     assert compared.holds
 
 

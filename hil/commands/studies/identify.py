@@ -7,12 +7,12 @@ from typing import TYPE_CHECKING, Annotated, Any
 import typer
 
 from hil.lanes.lane import Lane
-from hil.screen.choices import InProcessLane, Tones, require_simulated
-from hil.screen.errors import one_line_errors
+from hil.screen.choices import InProcessLane, Tones
+from hil.screen.errors import amplifier_errors, one_line_errors
 from hil.screen.first_run import say_if_compiling
 from hil.screen.outputs import folder_to_write, writing
-from hil.screen.progress import progress_bar
-from hil.screen.terminal import bad, plain_table, print_whole, say
+from hil.screen.progress import bar_apart, progress_bar
+from hil.screen.terminal import bad, note, plain_table, print_whole, say
 from pkxyz_ctrl.config.files import ConfigError, find, load
 
 if TYPE_CHECKING:
@@ -24,12 +24,15 @@ STAGE = "stage.toml"
 
 def identify(
     stage: Annotated[str, typer.Option(help="Name or file.")] = "reconstructed",
-    plant: Annotated[str, typer.Option(help="Name or file of the plant that is identified.")] = "nominal",
+    plant: Annotated[str | None, typer.Option(help="Name or file of the simulated plant; default: nominal.")] = None,
     controller: Annotated[str, typer.Option(help="Name or file.")] = "lqg",
-    bus: Annotated[str, typer.Option(help="Name or file.")] = "fd_5k",
+    bus: Annotated[
+        str, typer.Option(help="Name or file. One that leads to other processes or devices is excited at rate.")
+    ] = "fd_5k",
     lane: Annotated[
-        InProcessLane, typer.Option(help="lockstep: over the simulated bus; fast: compiled, no frames, the same bits.")
-    ] = InProcessLane.FAST,
+        InProcessLane | None,
+        typer.Option(help="Where simulated. lockstep: over the bus; fast (default): compiled, without frames."),
+    ] = None,
     tones: Annotated[Tones, typer.Option(help="All tones at once, or one after another.")] = Tones.MULTISINE,
     amplitude_nm: Annotated[
         float | None,
@@ -63,6 +66,7 @@ def identify(
     from dataclasses import replace
 
     from hil.api.identify import identify as identified
+    from hil.studies.excited_lane import lane_on
     from hil.studies.identify import identification
     from hil.studies.identify.outside_scale import outside_scale, read_points
     from pkxyz_ctrl.config.bus import BusConfig
@@ -72,13 +76,16 @@ def identify(
         folder_to_write(out)
         if (out / STAGE).exists() and (out / STAGE).samefile(find("stages", stage)):
             raise ConfigError(f"--out: {out}: its {STAGE} is the --stage that is identified; give another folder")
-    require_simulated(load("buses", bus, BusConfig), "identify")
+    on_bus = load("buses", bus, BusConfig)
+    closed_in = lane_on(on_bus, lane, plant)
     say_if_compiling(quiet=as_json)
     outside = None if reference is None else outside_scale(Stage.load(stage), *read_points(reference))
-    with one_line_errors(), progress_bar("exciting the loop", quiet=as_json) as tell:
+    bar = bar_apart if closed_in == Lane.WALL else progress_bar
+    errors = amplifier_errors(on_bus, bus)
+    with errors, one_line_errors(), bar("exciting the loop", quiet=as_json) as tell:
         found = identified(
-            stage=stage, plant=plant, controller=controller, bus=bus, lane=Lane(lane.value), tones=tones.value,
-            amplitude_nm=amplitude_nm, periods=periods, at_um=at_um, seed=seed, on_progress=tell,
+            stage=stage, plant=plant, controller=controller, bus=bus, lane=closed_in, tones=tones.value,
+            amplitude_nm=amplitude_nm, periods=periods, at_um=at_um, seed=seed, on_progress=tell, say=note,
         )  # fmt: skip
     found = replace(found, outside=outside)
     with one_line_errors():
@@ -97,7 +104,7 @@ def _write(out: Path | None, found: "Identification", data: dict[str, Any], stag
     from hil.studies.identify.calibrated_stage import write_calibrated_stage
     from hil.studies.identify.identification import response_csv
 
-    folder = folder_to_write(out or next_free(Path("runs"), f"identify_{found.setup.plant.name}", found.lane))
+    folder = folder_to_write(out or next_free(Path("runs"), f"identify_{found.plant.replace(' ', '_')}", found.lane))
     with writing(folder):
         text = json.dumps(data, indent=2, allow_nan=False) + "\n"
         (folder / "identification.json").write_text(text, encoding="utf-8")

@@ -8,19 +8,20 @@ from typing import TYPE_CHECKING, Annotated, Any
 import typer
 
 from hil.lanes.lane import Lane
-from hil.screen.choices import InProcessLane, Tones, require_simulated
-from hil.screen.errors import one_line_errors
+from hil.screen.choices import InProcessLane, Tones
+from hil.screen.errors import amplifier_errors, one_line_errors
 from hil.screen.first_run import say_if_compiling
 from hil.screen.outputs import folder_to_write, writing
-from hil.screen.progress import progress_bar
-from hil.screen.terminal import bad, plain_table, print_whole, say, warned
-from pkxyz_ctrl.config.files import ConfigError, load
+from hil.screen.progress import bar_apart, progress_bar
+from hil.screen.terminal import bad, note, plain_table, print_whole, say, warned
+from pkxyz_ctrl.config.files import load
 
 if TYPE_CHECKING:
     from collections.abc import Callable
 
     from rich.table import Table
 
+    from hil.lanes.setup import Setup
     from hil.studies.margins.loop import Agreement, ChangedPlants, Loop
     from hil.studies.margins.measured import MeasuredLoop
     from pkxyz_ctrl.design.margins.margins import Margins, Sensitivities
@@ -37,11 +38,16 @@ def margins(
     perturbed: Annotated[bool, typer.Option("--perturbed", help="Also Ms over the changed plants.")] = False,
     tolerances: Annotated[str, typer.Option(help="Name or file of what changes, for --perturbed.")] = "wide",
     measured: Annotated[bool, typer.Option("--measured", help="Also measure by exciting the running loop.")] = False,
-    lane: Annotated[InProcessLane, typer.Option(help="Where to measure.")] = InProcessLane.FAST,
+    lane: Annotated[
+        InProcessLane | None,
+        typer.Option(help="Where to measure: simulated, fast by default; a bus that leads to devices goes at rate."),
+    ] = None,
     tones: Annotated[
         Tones, typer.Option(help="All tones at once, or one after another (20 of them).")
     ] = Tones.MULTISINE,
-    plant: Annotated[str, typer.Option(help="Name or file of the plant that is measured.")] = "nominal",
+    plant: Annotated[
+        str | None, typer.Option(help="Name or file of the simulated plant that is measured; default: nominal.")
+    ] = None,
     amplitude_nm: Annotated[float, typer.Option(min=0.1, max=100.0, help="Of each tone.")] = 5.0,
     periods: Annotated[int, typer.Option(min=3, max=1000, help="Of one second, measured on each axis.")] = 6,
     seed: Annotated[int, typer.Option(min=0, help="Of the noise and of the tones' phases.")] = 1,
@@ -54,6 +60,8 @@ def margins(
     not; 2 for bad input.
     """
     from hil.api.design import design
+    from hil.lanes.setup import bare_setup
+    from hil.studies.excited_lane import lane_on
     from hil.studies.margins import loop as loops
     from hil.studies.margins.loop import agreement, over_changed_plants
     from hil.studies.operating_point import operating_strokes
@@ -65,8 +73,9 @@ def margins(
     strokes = operating_strokes(Stage.load(stage), at_um)
     if out is not None:
         folder_to_write(out)
+    closed_in = None
     if measured:
-        require_simulated(load("buses", bus, BusConfig), "margins --measured")
+        closed_in = lane_on(load("buses", bus, BusConfig), lane, plant)
         say_if_compiling(quiet=as_json)
     with one_line_errors():
         law = design(controller, stage=stage, bus=bus)
@@ -83,15 +92,17 @@ def margins(
                 changed = over_changed_plants(loop, wide.cases(), tell)
             data["perturbed"] = _changed_data(changed, wide.name)
         response = compared = None
-        if measured:
-            with progress_bar("exciting the loop", quiet=as_json) as tell:
-                response = _measure(
-                    stage, plant, config, on_bus, strokes, lane, tones, amplitude_nm, periods, seed, tell
-                )
-            compared = agreement(response, loop.response(strokes, response.frequency_hz), periods)
+        if closed_in is not None:
+            at_rate = closed_in == Lane.WALL
+            bar = bar_apart if at_rate else progress_bar
+            with amplifier_errors(on_bus, bus), bar("exciting the loop", quiet=as_json) as tell:
+                setup = bare_setup(stage, plant or "nominal", config, on_bus, seed)
+                response = _measure(setup, strokes, closed_in, tones, amplitude_nm, periods, tell)
+            compared = agreement(response, loop.response(strokes, response.frequency_hz))
             data["measured"] = loops.as_json(response.margins()) | {
-                "lane": lane.value, "plant": plant, "seed": seed, "tones": len(response.frequency_hz),
-                "amplitude_nm": amplitude_nm, "periods": periods,
+                "lane": closed_in, "plant": None if at_rate else setup.plant.name, "seed": seed,
+                "tones": len(response.frequency_hz), "amplitude_nm": amplitude_nm, "periods": response.periods,
+                "missed_ticks": response.missed_ticks,
                 "agreement": vars(compared) | {"holds": compared.holds},
             }  # fmt: skip
     if out is not None:
@@ -101,28 +112,27 @@ def margins(
     else:
         _show(data, computed, changed, response, compared)
     stable = computed.stable and (changed is None or math.isfinite(changed.worst[1]))
-    agrees = compared is None or compared.holds or plant != "nominal"
+    as_computed = closed_in != Lane.WALL and plant in (None, "nominal")  # what else is there need not be as computed
+    agrees = compared is None or compared.holds or not as_computed
     raise typer.Exit(0 if stable and agrees else 1)
 
 
 def _measure(
-    stage: str, plant: str, config: Any, bus: Any, strokes: Any, lane: InProcessLane, kind: Tones, amplitude_nm: float,
-    periods: int, seed: int, tell: "Callable[[int, int], None]",
+    setup: "Setup", strokes: Any, lane: Lane, kind: Tones, amplitude_nm: float, periods: int,
+    tell: "Callable[[int, int], None]",
 ) -> "MeasuredLoop":  # fmt: skip
     from hil.lanes.excitation import excitation, tones
-    from hil.lanes.setup import bare_setup
-    from hil.studies.margins.measured import at_point, measure
+    from hil.studies.margins.excited import at_point, periods_of
+    from hil.studies.margins.measured import measure
 
-    if lane is InProcessLane.LOCKSTEP and bus.can is None:
-        raise ConfigError(f"bus {bus.name!r} has no [can] and carries no frames; measure with --lane fast")
-    stepped = kind is Tones.STEPPED
-    seconds = 0.1 if stepped else 1.0  # a tone alone needs no such resolution
-    period_ticks = round(seconds / bus.period_s)
+    seconds, measured = periods_of(kind.value, lane, periods)
+    period_ticks = round(seconds / setup.bus.period_s)
+    count, lowest = (20, 1) if kind is Tones.STEPPED else (120, math.ceil(5 * seconds))
     added = excitation(
-        kind.value, tones(period_ticks, 20 if stepped else 120, 1 if stepped else 5), period_ticks=period_ticks,
-        periods=periods, amplitude_m=amplitude_nm * 1e-9, first_tick=0, seed=seed,
+        kind.value, tones(period_ticks, count, lowest), period_ticks=period_ticks, periods=measured,
+        amplitude_m=amplitude_nm * 1e-9, first_tick=0, seed=setup.seed,
     )  # fmt: skip
-    return measure(at_point(bare_setup(stage, plant, config, bus, seed), strokes, added), Lane(lane.value), tell)
+    return measure(at_point(setup, strokes, added), lane, tell, note)
 
 
 def _changed_data(changed: "ChangedPlants", tolerances: str) -> dict[str, Any]:

@@ -1,10 +1,12 @@
 """Identification of a stage in its running loop: the excitation that does it, its response, its modes."""
 
 import importlib.metadata
+import math
 from collections.abc import Callable
 from dataclasses import dataclass
 from functools import cached_property
-from typing import Any, Literal
+from hashlib import sha256
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -14,7 +16,7 @@ from hil.lanes.lane import Lane
 from hil.lanes.setup import Setup
 from hil.studies.identify.outside_scale import OutsideScale
 from hil.studies.identify.plant_response import PlantResponse, measure_plant
-from hil.studies.margins.measured import at_point
+from hil.studies.margins.excited import Tones, at_point, periods_of
 from pkxyz_ctrl.config.calibration import Calibration, SenseScale
 from pkxyz_ctrl.config.files import digest, plain
 from pkxyz_ctrl.design.identification.calibrate import Calibrated, SenseGain, calibrate
@@ -33,11 +35,16 @@ class Identification:
 
     setup: Setup
     lane: Lane
-    kind: Literal["multisine", "stepped"]
+    kind: Tones
     response: PlantResponse
     modes: ModalFit
     outside: OutsideScale | None = None
     """what an instrument saw, if there was one"""
+
+    @property
+    def plant(self) -> str:
+        """What was identified, by name."""
+        return f"device on {self.setup.bus.name}" if self.lane == Lane.WALL else self.setup.plant.name
 
     @property
     def chain_gain(self) -> tuple[Array, Array]:
@@ -114,13 +121,12 @@ def modes_hz(setup: Setup, strokes_m: Array) -> Array:
     return np.asarray(np.sqrt(np.linalg.eigvalsh(held) / stage.mass_kg) / (2.0 * np.pi))
 
 
-def exciting(
-    setup: Setup, strokes_m: Array, kind: Literal["multisine", "stepped"], amplitude_m: float, periods: int
-) -> Excitation:
+def exciting(setup: Setup, strokes_m: Array, lane: Lane, kind: Tones, amplitude_m: float, periods: int) -> Excitation:
     """All tones at once in periods of 1 s, or, in periods of 0.1 s, one after another; many of them about the modes.
     None lies on a line of the mains, which is alike in all periods and so would pass for an answer.
     """
-    seconds, count, lowest, near = (1.0, 120, 5, 60) if kind == "multisine" else (0.1, 14, 1, 24)
+    seconds, measured = periods_of(kind, lane, periods)
+    count, lowest, near = (120, math.ceil(5 * seconds), 60) if kind == "multisine" else (14, 1, 24)
     period_ticks = round(seconds / setup.bus.period_s)
     hz = modes_hz(setup, strokes_m)
     about = np.round(np.linspace(0.85 * hz.min(), 1.15 * hz.max(), near) * seconds).astype(np.int64)
@@ -128,7 +134,7 @@ def exciting(
     off_mains = np.all([np.round(bins / seconds) % mains_hz != 0 for mains_hz in MAINS_HZ], axis=0)
     bins = bins[(bins < period_ticks // 2) & off_mains]
     return excitation(
-        kind, bins, period_ticks=period_ticks, periods=periods, amplitude_m=amplitude_m, first_tick=0, seed=setup.seed
+        kind, bins, period_ticks=period_ticks, periods=measured, amplitude_m=amplitude_m, first_tick=0, seed=setup.seed
     )
 
 
@@ -137,16 +143,17 @@ def identify(
     strokes_m: Array,
     lane: Lane,
     *,
-    kind: Literal["multisine", "stepped"] = "multisine",
+    kind: Tones = "multisine",
     amplitude_m: float = 5e-9,
     periods: int = 6,
     on_progress: Callable[[int, int], None] = lambda done, total: None,
+    say: Callable[[str], object] = lambda words: None,
 ) -> Identification:
     """Excite the loop of a setup about the position of ``strokes_m`` (3,) and fit the modes. Raises
     ``MeasurementError`` where the loop opens, ``FitError`` where the response doesn't tell the modes.
     """
-    run = at_point(setup, strokes_m, exciting(setup, strokes_m, kind, amplitude_m, periods))
-    response = measure_plant(run, lane, on_progress)
+    run = at_point(setup, strokes_m, exciting(setup, strokes_m, lane, kind, amplitude_m, periods))
+    response = measure_plant(run, lane, on_progress, say)
     modes = fit_modes(
         response.frequency_hz,
         response.drive_v2,
@@ -161,18 +168,22 @@ def identify(
 
 
 def provenance(found: Identification) -> dict[str, Any]:
-    """What decides about the result, with a digest of all of it: equal digest, equal bits."""
+    """What decides about the result, with a digest of all of it: equal digest, equal bits. On a real bus, whose device
+    no file describes, what it answered stands for it.
+    """
     setup, added = found.setup, found.setup.excitation
     assert added is not None
+    simulated, response = found.lane != Lane.WALL, found.response
+    device = setup.plant.model_dump(mode="json") if simulated else sha256(response.sense_count.tobytes()).hexdigest()
     inputs = {
-        "stage": plain(setup.stage), "plant": setup.plant.model_dump(mode="json"), "bus": plain(setup.bus),
+        "stage": plain(setup.stage), "plant": device, "bus": plain(setup.bus),
         "controller": plain(setup.controller), "seed": setup.seed, "tones": found.kind,
         "bins": [p.bins.tolist() for p in added.passages], "period_ticks": added.period_ticks,
         "periods": added.periods, "amplitude_m": added.amplitude_m,
-        "strokes_m": [float(q) for q in found.response.strokes_m],
+        "strokes_m": [float(q) for q in response.strokes_m],
     }  # fmt: skip
     return {
-        "stage": setup.stage.name, "plant": setup.plant.name, "controller": setup.controller.name,
+        "stage": setup.stage.name, "plant": found.plant, "controller": setup.controller.name,
         "bus": setup.bus.name, "lane": found.lane, "seed": setup.seed, "tones": found.kind,
         "amplitude_nm": added.amplitude_m * 1e9, "periods": added.periods, "digest": digest(inputs),
         "versions": {name: importlib.metadata.version(name) for name in ("pkxyz-ctrl", "numpy", "scipy")},
@@ -210,6 +221,7 @@ def as_json(found: Identification) -> dict[str, Any]:
             "noise_alone": modes.noise_alone,
             "pole_pairs": int(modes.apart.sum()),
             "tones": len(response.frequency_hz),
+            "missed_ticks": response.missed_ticks,
             "lowest_hz": modes.used_hz[0],
             "highest_hz": modes.used_hz[1],
             "least_coherence": float(response.coherence[response.frequency_hz <= modes.used_hz[1]].min()),

@@ -14,12 +14,10 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from hil.lanes import in_process as lanes
 from hil.lanes.excitation import Excitation, Passage
 from hil.lanes.lane import Lane
 from hil.lanes.setup import Setup
-from hil.studies.margins.measured import MeasurementError
-from pkxyz_ctrl.safety.modes import Mode
+from hil.studies.margins.excited import Excited, excite
 
 Array = NDArray[np.float64]
 Complex = NDArray[np.complex128]
@@ -66,6 +64,8 @@ class PlantResponse:
     measured_s: float
     """middle of the measured periods after the arrival at the point"""
     zero: SenseZero
+    missed_ticks: int
+    """while it was excited; their periods, and those after them, are left out"""
 
     @property
     def p(self) -> Complex:
@@ -80,61 +80,43 @@ class PlantResponse:
 
 
 def measure_plant(
-    setup: Setup, lane: Lane, on_progress: Callable[[int, int], None] = lambda done, total: None
+    setup: Setup,
+    lane: Lane,
+    on_progress: Callable[[int, int], None] = lambda done, total: None,
+    say: Callable[[str], object] = lambda words: None,
 ) -> PlantResponse:
     """Run a setup of ``at_point`` in a lane and take P from it. Raises ``MeasurementError`` where the loop did not stay
     closed to the end.
     """
-    excitation = setup.excitation
-    if excitation is None:
-        raise ValueError("there is nothing to measure without an excitation")
-    seen, asked = np.full((excitation.ticks, 3), np.nan), np.zeros((excitation.ticks, 3))
-    homing: list[NDArray[np.int32]] = []
-    zero_f, stroke_per_f = np.zeros(3), setup.law[0]["tick"]["sense"]["metre_per_farad"]
+    excited = excite(setup, lane, ("sense_count", "drive_count"), on_progress, say)
     scale, offset = setup.bus.analog.sense_farad_per_count, setup.bus.analog.sense_offset_f
-
-    def on_block(block: NDArray[np.void]) -> None:
-        tick = block["reference_tick"]
-        tracked = (tick >= 0) & (tick < len(seen))
-        seen[tick[tracked]] = block["sense_count"][tracked]
-        asked[tick[tracked]] = block["drive_count"][tracked]
-        homing.append(block["sense_count"][block["mode"] == Mode.HOMING])
-        if tracked.any():
-            last = block[tracked][-1]
-            zero_f[:] = offset + scale * last["sense_count"] - last["sense_f"]
-
-    result = lanes.run(setup, lane, on_block=on_block, on_progress=on_progress)
-    if result.faults:
-        raise MeasurementError(f"the loop opened while it was measured: {result.faults[0]}")
-    if not np.isfinite(seen).all():
-        raise MeasurementError(f"the loop was closed for {np.isfinite(seen[:, 0]).sum()} of {len(seen)} ticks only")
-    at_rest = np.concatenate(homing)
+    zero_f = offset + scale * excited.last["sense_count"] - excited.last["sense_f"]
+    at_rest = excited.homing_count
     error_f = scale * at_rest.std(axis=0, ddof=1) / np.sqrt(len(at_rest))
-    zero = SenseZero(zero_f, zero_f / scale, error_f, len(at_rest))
-    squared = (setup.bus.analog.drive_volt_per_count * asked) ** 2
-    rest_f = float(setup.law[0]["tick"]["sense"]["rest_f"])
-    first = excitation.measured_from(0)
-    mean_f = offset + scale * seen[first:].mean(axis=0) - zero_f - rest_f
-    return _from_periods(setup, excitation, squared, seen, mean_f * stroke_per_f, zero)
+    return _from_periods(setup, excited, SenseZero(zero_f, zero_f / scale, error_f, len(at_rest)))
 
 
-def _from_periods(
-    setup: Setup, excitation: Excitation, squared_v2: Array, seen: Array, strokes_m: Array, zero: SenseZero
-) -> PlantResponse:
-    n, m = excitation.period_ticks, excitation.periods
+def _from_periods(setup: Setup, excited: Excited, zero: SenseZero) -> PlantResponse:
+    excitation, seen = excited.excitation, excited.seen["sense_count"]
+    squared_v2 = (setup.bus.analog.drive_volt_per_count * excited.seen["drive_count"]) ** 2
+    n, m = excitation.period_ticks, len(excited.periods[0])
     bins = np.unique(np.concatenate([p.bins for p in excitation.passages]))
     u, y = (np.zeros((m, len(bins), 3, 3), np.complex128) for _ in range(2))
     for k, passage in enumerate(excitation.passages):
-        rows = slice(excitation.measured_from(k), excitation.measured_from(k) + n * m)
-        at = np.searchsorted(bins, passage.bins)
-        u[..., passage.axis][:, at] = _spectra(squared_v2[rows], passage, m)
-        y[..., passage.axis][:, at] = _spectra(seen[rows], passage, m)
+        rows, periods = excitation.ticks_of(k, excited.periods[k]), excited.periods[k]
+        at, trend = np.searchsorted(bins, passage.bins), _trend(excitation, periods)
+        u[..., passage.axis][:, at] = _spectra(squared_v2[rows], passage, trend)
+        y[..., passage.axis][:, at] = _spectra(seen[rows], passage, trend)
     mean_u, mean_y = u.mean(axis=0), y.mean(axis=0)
     p = mean_y @ np.linalg.inv(mean_u)
     unexplained = y - p @ u  # (m, k, 3, 3); its mean is 0
     power = (np.abs(unexplained) ** 2).sum(axis=(0, 3)) / (3 * (m - 1))  # of one period, (k, 3)
     explained = (np.abs(p @ mean_u) ** 2).mean(axis=2)
     first = excitation.measured_from(0)
+    rest_f = float(setup.law[0]["tick"]["sense"]["rest_f"])
+    stroke_per_f = setup.law[0]["tick"]["sense"]["metre_per_farad"]
+    analog = setup.bus.analog
+    mean_f = analog.sense_offset_f + analog.sense_farad_per_count * seen[first:].mean(axis=0) - zero.offset_f - rest_f
     return PlantResponse(
         frequency_hz=bins / (n * setup.bus.period_s),
         drive_v2=mean_u,
@@ -144,19 +126,26 @@ def _from_periods(
         period_s=setup.bus.period_s,
         delay_periods=setup.bus.delay_periods,
         mean_v2=squared_v2[first:].mean(axis=0),
-        strokes_m=strokes_m,
+        strokes_m=mean_f * stroke_per_f,
         measured_s=(0.5 * (first + excitation.ticks) - excitation.first_tick) * setup.bus.period_s,
         zero=zero,
+        missed_ticks=excited.missed_ticks,
     )
 
 
-def _spectra(samples: Array, passage: Passage, periods: int) -> Complex:
-    """(m, tones, 3) at the tones of a passage, of m periods (m N, 3) less their trend."""
-    n = len(samples) // periods
-    trend = np.polynomial.legendre.legvander(np.linspace(-1.0, 1.0, len(samples)), TREND_DEGREE)[:, 1:]
-    split = (periods, n, -1)
-    apart = (trend.reshape(split) - trend.reshape(split).mean(axis=0)).reshape(len(samples), -1)
-    changing = (samples.reshape(split) - samples.reshape(split).mean(axis=0)).reshape(len(samples), -1)
+def _trend(excitation: Excitation, periods: NDArray[np.int64]) -> Array:
+    """(m, N, degree) polynomials over the whole passage, at the ticks of some of its periods."""
+    whole = np.linspace(-1.0, 1.0, excitation.periods * excitation.period_ticks)
+    at = whole.reshape(excitation.periods, -1)[periods]
+    return np.asarray(np.polynomial.legendre.legvander(at, TREND_DEGREE)[..., 1:])
+
+
+def _spectra(samples: Array, passage: Passage, trend: Array) -> Complex:
+    """(m, tones, 3) at the tones of a passage, of m periods (m N, 3) less their trend (m, N, degree)."""
+    m, n, degree = trend.shape
+    split = samples.reshape(m, n, -1)
+    apart = (trend - trend.mean(axis=0)).reshape(m * n, degree)
+    changing = (split - split.mean(axis=0)).reshape(m * n, -1)
     weight = np.linalg.lstsq(apart, changing, rcond=None)[0]
-    steady = (samples - trend @ weight).reshape(split)
+    steady = split - trend @ weight
     return np.asarray(2.0 / n * np.fft.rfft(steady, axis=1)[:, passage.bins])

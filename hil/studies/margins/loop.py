@@ -95,8 +95,9 @@ class Agreement:
         return self.largest <= self.bound
 
 
-def agreement(measured: MeasuredLoop, computed: LoopResponse, periods: int) -> Agreement:
+def agreement(measured: MeasuredLoop, computed: LoopResponse) -> Agreement:
     """Compare S entry by entry, at the same frequencies. Needs three periods at least."""
+    periods = measured.periods
     difference = np.abs(measured.s - computed.s)
     distance = difference / measured.standard_error
     each = CONFIDENCE ** (1.0 / distance.size)

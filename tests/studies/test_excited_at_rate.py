@@ -1,0 +1,162 @@
+"""A loop excited at the machine's clock: what is measured there is what is measured in the lanes, and ticks that a busy
+machine misses spoil their periods and not the result.
+"""
+
+import dataclasses
+import json
+import os
+import subprocess
+import sys
+from contextlib import contextmanager
+from pathlib import Path
+
+import numpy as np
+import pytest
+from loop_rig import MIDDLE, setup
+from patience import patient_bus, patient_law, replaced
+
+from hil.lanes import in_process
+from hil.lanes.excitation import Excitation, Passage, excitation, tones
+from hil.lanes.lane import Lane
+from hil.lanes.streamed_reference import StreamedReference
+from hil.studies.excited_lane import lane_on
+from hil.studies.margins import excited
+from hil.studies.margins.excited import PERIODS_LEAST, MeasurementError, at_point
+from hil.studies.margins.measured import measure
+from pkxyz_ctrl.config.bus import BusConfig
+from pkxyz_ctrl.config.files import ConfigError, load
+from pkxyz_ctrl.loop.cycle import MEMORY
+
+ROOT = Path(__file__).parents[2]
+PERIOD_TICKS = 250
+
+
+def five_periods():
+    added = excitation(
+        "multisine", tones(PERIOD_TICKS, 12, 3), period_ticks=PERIOD_TICKS, periods=5, amplitude_m=8e-9, first_tick=0,
+        seed=3,
+    )  # fmt: skip
+    return at_point(setup(), MIDDLE, added)
+
+
+def played_back(run, monkeypatch, change=lambda rows: None):
+    """What is measured where the machine's clock gives the rows of the fast lane, ``change``d."""
+    blocks = []
+    in_process.run(run, Lane.FAST, on_block=lambda block: blocks.append(block.copy()))
+    rows = np.concatenate(blocks)
+    change(rows)
+    monkeypatch.setattr(excited, "run_at_rate", lambda setup, say, on_progress: (rows, ()))
+    return measure(run, Lane.WALL)
+
+
+def test_the_same_rows_measure_the_same(monkeypatch):
+    run = five_periods()
+    at_rate, fast = played_back(run, monkeypatch), measure(run, Lane.FAST)
+    assert np.array_equal(at_rate.s, fast.s)
+    assert np.array_equal(at_rate.standard_error, fast.standard_error)
+    assert (at_rate.periods, at_rate.missed_ticks) == (5, 0)
+
+
+@pytest.mark.parametrize("how", ["overrun", "sense_status"])
+def test_a_missed_tick_costs_its_period_and_the_next_and_nothing_else(how, monkeypatch):
+    """Nonsense in both changes not a bit of what the other three periods of each axis say."""
+    run = five_periods()
+    second = run.excitation.measured_from(0) + PERIOD_TICKS
+
+    def miss(rows):
+        at = np.flatnonzero(rows["reference_tick"] == second + 100)[0]
+        rows[how][at] |= 1
+        spoilt = slice(at, at + 2 * PERIOD_TICKS - 100)
+        rows["measurement_m"][spoilt] += np.random.default_rng(1).normal(0.0, 1e-6, (spoilt.stop - at, 3))
+
+    seen = played_back(run, monkeypatch, miss)
+    assert (seen.periods, seen.missed_ticks) == (3, 1)
+    untouched = measure(run, Lane.FAST)
+    assert np.abs(seen.s - untouched.s).max() < 6.0 * untouched.standard_error.max()
+    kept = excited.excite(run, Lane.WALL, ("measurement_m",)).periods
+    assert [list(each) for each in kept] == [[0, 3, 4], [0, 1, 2], [0, 1, 2]]
+
+
+def test_a_machine_that_misses_too_many_measures_nothing(monkeypatch):
+    run = five_periods()
+
+    def miss(rows):
+        rows["overrun"][np.isin(rows["reference_tick"], run.excitation.measured_from(1) + np.array([30, 500]))] = 3
+
+    with pytest.raises(MeasurementError, match=f"2 ticks were missed, which leaves 1 .*{PERIODS_LEAST} are"):
+        played_back(run, monkeypatch, miss)
+
+
+def test_a_period_after_a_spoilt_one_is_left_out_wherever_it_lies():
+    """Exhaustively: one tick of one passage, the settling period included."""
+    n, m = 4, 5
+    played = Excitation(n, m, 1.0, 7, (Passage(0, np.array([1]), np.zeros(1)), Passage(1, np.array([1]), np.zeros(1))))
+    for tick in range(played.ticks):
+        spoilt = np.zeros(played.ticks, np.bool_)
+        spoilt[tick] = True
+        for passage in range(2):
+            within = (tick - played.measured_from(passage)) // n  # -1 is the settling period
+            lost = {within, within + 1} & set(range(m)) if -1 <= within < m else set()
+            assert set(played.undisturbed(passage, spoilt)) == set(range(m)) - lost
+
+
+def test_an_excitation_streamed_in_pieces_is_that_of_the_lanes():
+    run = dataclasses.replace(five_periods(), duration_s=1.0)
+    memory = np.zeros(1, MEMORY)
+    streamed = StreamedReference(run.trajectory, run.bus.period_us, memory, run.excitation)
+    for tick in range(run.excitation.ticks):
+        memory["reference_tick"] = tick
+        rows = streamed(tick)
+        at = tick - int(rows["tick"][0])
+        assert rows["tick"][at] == tick
+        if tick % 7 == 0:
+            assert np.array_equal(rows["added_m"][at], run.excitation.sample(tick, 1)[0])
+        streamed.prepare()
+
+
+def test_bus_lane_and_plant_go_together_or_it_is_said():
+    fd_5k, unix_2k = (load("buses", name, BusConfig) for name in ("fd_5k", "unix_2k"))
+    assert lane_on(fd_5k, None, "harsh") == Lane.FAST
+    assert lane_on(fd_5k, Lane.LOCKSTEP, None) == Lane.LOCKSTEP
+    assert lane_on(unix_2k, None, None) == Lane.WALL
+    for bus, lane, plant, words in (
+        (unix_2k, Lane.FAST, None, "leads to other processes or devices, where no lane can be chosen"),
+        (unix_2k, None, "harsh", "`pkxyz plant --plant harsh` serves this one"),
+        (fd_5k, Lane.WALL, None, "is simulated and ends with this process; give a --bus"),
+    ):
+        with pytest.raises(ConfigError, match=words):
+            lane_on(bus, lane, plant)
+
+
+@contextmanager
+def served(bus):
+    """A plant in a process of its own."""
+    words = [sys.executable, "-m", "hil", "plant", "--bus", str(bus), "--json"]
+    env = {**os.environ, "PYTHONPATH": str(ROOT)}
+    with subprocess.Popen(words, stdout=subprocess.PIPE, stderr=subprocess.DEVNULL, text=True, env=env) as plant:
+        try:
+            assert "pre-operational" in plant.stdout.readline()
+            yield
+        finally:
+            plant.terminate()
+
+
+def test_sensitivity_is_measured_over_a_bus_to_another_process(tmp_path):
+    """At 100 Hz, where even a busy machine misses no tick: S as computed for that loop, and the combs at 0 V after."""
+    bus = patient_bus(tmp_path / "bus.toml")
+    text = bus.read_text(encoding="utf-8")
+    for key, value in (("period", 10_000), ("sense_deadline", 8000), ("heartbeat_deadline", 9900)):
+        text = replaced(rf"^{key}_us = \d+", f"{key}_us = {value}", text)
+    bus.write_text(text, encoding="utf-8")
+    words = ["margins", "--measured", "--bus", bus, "--controller", patient_law(tmp_path), "--periods", "3", "--json"]
+    with served(bus):
+        done = subprocess.run(
+            [sys.executable, "-m", "hil", *map(str, words)], cwd=tmp_path, capture_output=True, text=True, timeout=300,
+            check=False, env={**os.environ, "PYTHONPATH": str(ROOT)},
+        )  # fmt: skip
+    assert done.returncode == 0, done.stderr
+    measured = json.loads(done.stdout)["measured"]
+    assert measured["lane"] == "wall"
+    assert PERIODS_LEAST <= measured["periods"] <= 12
+    assert measured["tones"] >= 8
+    assert measured["agreement"]["largest_difference"] < 0.1
