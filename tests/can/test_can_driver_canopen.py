@@ -12,10 +12,10 @@ import canopen
 import pytest
 from canopen.objectdictionary import ODVariable
 
-from pkxyz_ctrl.can.codec import crc8
 from pkxyz_ctrl.can.driver import NODE_REBOOTED, AmplifierDriver
 from pkxyz_ctrl.can.driver_config import DriverConfig, ProvenModule
 from pkxyz_ctrl.can.frame import Frame
+from pkxyz_ctrl.can.process_pdo import crc8
 from pkxyz_ctrl.can.sense_input import SENSE_COUNTER, SENSE_MISSING
 from pkxyz_ctrl.can.start_sequence import DriverState
 from pkxyz_ctrl.can.startup import settings

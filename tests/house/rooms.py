@@ -34,7 +34,7 @@ HOUSE: Mapping[str, Room] = MappingProxyType({
     "sim": Room(("sim.config", "sim.motion", "sim.structure", "sim.surroundings"), (*NUMBERS, *VALUES)),
     # what runs on the target
     "pkxyz_ctrl.compiled": Room(),
-    "pkxyz_ctrl.can": Room((), ("pydantic", *VALUES)),
+    "pkxyz_ctrl.can": Room(("pkxyz_ctrl.compiled",), ("pydantic", "operator", "numpy", "numba", *VALUES)),
     "pkxyz_ctrl.safety": Room(("pkxyz_ctrl.compiled", "pkxyz_ctrl.can"), ("numpy", "numba", *VALUES)),
     "pkxyz_ctrl.config": Room(("pkxyz_ctrl.can", "pkxyz_ctrl.safety")),
     "pkxyz_ctrl.core": Room(("pkxyz_ctrl.config",), NUMBERS),

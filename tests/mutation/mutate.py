@@ -40,6 +40,7 @@ TARGETS = {
     "pkxyz_ctrl.safety.trips": ("safety/test_safety_monitors.py", "safety/test_safety_modes.py"),
     "pkxyz_ctrl.core.voltage": ("core/test_core_voltage.py",),
     "pkxyz_ctrl.core.allocation": ("core/test_core_allocation.py",),
+    "pkxyz_ctrl.can.process_pdo": ("can/test_can_codec.py",),
     "pkxyz_ctrl.can.codec": ("can/test_can_codec.py",),
     "pkxyz_ctrl.can.sense_input": ("can/test_can_sense.py",),
     "pkxyz_ctrl.can.driver": (

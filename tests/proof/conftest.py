@@ -5,10 +5,9 @@ from collections.abc import Iterator
 import pytest
 
 from hil.node.emergency import FrameErrors
-from pkxyz_ctrl.can import sense_input, start_sequence
+from pkxyz_ctrl.can import start_sequence
 
 SHIPPED = (
-    (sense_input, "_SYNCS_UNCOUNTABLE", sense_input._SYNCS_UNCOUNTABLE),
     (FrameErrors, "HOLD_US", FrameErrors.HOLD_US),
     (start_sequence, "survey", start_sequence.survey),
     (start_sequence, "plan", start_sequence.plan),

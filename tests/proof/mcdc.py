@@ -29,6 +29,7 @@ MODULES = (
     "pkxyz_ctrl.safety.sdo_rules",
     "pkxyz_ctrl.safety.trips",
     "pkxyz_ctrl.can.codec",
+    "pkxyz_ctrl.can.process_pdo",
     "pkxyz_ctrl.can.driver",
     "pkxyz_ctrl.can.sense_input",
     "hil.node.drive",

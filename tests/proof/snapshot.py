@@ -58,9 +58,8 @@ UNREAD = {
     ("Lockstep", "now_us"),
     ("Lockstep", "running"),
     ("Lockstep", "_heap"),  # the alarms and due times that put them there are in the key
-    ("SenseInput", "_count_1"),  # the plant stands still: always the same counts, or a status that says otherwise
-    ("SenseInput", "_count_2"),
-    ("SenseInput", "_count_3"),
+    # the plant stands still: always the same counts, or a status that says otherwise
+    *(("SenseInput", f"memory.count[{place}]") for place in range(3)),
 }
 TEXTS = {
     ("Controller", "_blocked"),
@@ -74,7 +73,7 @@ INSTANTS = {("TransmitGate", "memory.time_us"), ("Alarm", "due_us")}
 AGES = {("TransmitGate", "memory.time_us"), ("AmplifierDriver", "_node_heartbeat_us"), ("SenseTransmitter", "_sync_us")}
 DURATIONS = {"_cycle_us", "_period_us", "_time_us", "_event_us", "_drive_timeout_us"}
 DRIVE_COUNTERS = {("TransmitGate", "memory.counter"), ("TransmitGate", "memory.counter_next")}
-SENSE_COUNTERS = {("SenseInput", "_counter")}
+SENSE_COUNTERS = {("SenseInput", "memory.counter")}
 SENT_COUNTERS = {
     ("AmplifierDriver", "_drive_counter"),
     ("SenseTransmitter", "counter"),
@@ -128,7 +127,7 @@ CONSTANT = {
     "_plant",
 }
 
-RECORDS = {"TransmitGate"}
+RECORDS = {"TransmitGate", "SenseInput"}
 """Whose ``memory`` is a record of integers: each field is an attribute, ``memory.counter``."""
 
 _MUTABLE = {list, dict, set, deque, bytearray}

@@ -205,15 +205,24 @@ class Bits:
         self.of = of
 
     @classmethod
-    def unknown(cls, width: int = 64) -> "Bits":
-        return cls(tuple(1 << k for k in range(width)))
+    def unknown(cls, width: int = 64, first: int = 0) -> "Bits":
+        return cls(tuple(1 << first + k for k in range(width)))
 
     @classmethod
     def known(cls, value: int) -> "Bits":
+        value = int(value)
         return cls(tuple(cls.ONE if value >> k & 1 else 0 for k in range(value.bit_length())))
 
     def __rshift__(self, by: int) -> "Bits":
         return Bits(self.of[by:])
+
+    def __lshift__(self, by: int) -> "Bits":
+        return Bits((0,) * by + self.of)
+
+    def __or__(self, other: "Bits") -> "Bits":
+        """Of what has no place in common: it would be no sum."""
+        assert not any(a and b for a, b in zip(self.of, other.of, strict=False))
+        return self ^ other
 
     def __and__(self, mask: int) -> "Bits":
         return Bits(tuple(bit if mask >> k & 1 else 0 for k, bit in enumerate(self.of[: mask.bit_length()])))

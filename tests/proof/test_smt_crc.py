@@ -6,7 +6,6 @@ over GF(2), for all registers and bytes; hence the CRC of a payload is the exclu
 every table of ours is held against that, entry by entry.
 """
 
-import struct
 from functools import cache
 from types import SimpleNamespace
 from typing import Any
@@ -14,11 +13,13 @@ from typing import Any
 import pytest
 import z3
 from gate_frames import crc8h2f
-from symbolic import Bits, DisprovedError, LinearTable, Number, of, paths, prove, rebuilt, truth, unknown
+from symbolic import Bits, DisprovedError, LinearTable, Number, of, paths, prove, rebuilt, unknown
 
 from hil.node import crc as node_crc
 from hil.node.drive import DriveReceiver
+from pkxyz_ctrl.can import process_pdo
 from pkxyz_ctrl.can.codec import ProcessCodec
+from pkxyz_ctrl.can.process_pdo import pdo_record
 from pkxyz_ctrl.safety import gate_rules
 
 DRIVE, SENSE = 0x30A, 0x28A
@@ -68,9 +69,6 @@ def test_every_table_of_ours_is_the_reference(can_id: int) -> None:
     """Codec, gate and node look up the same numbers, each in tables that it has made its own way."""
     first, second, third, last = (table.table for table in reference_tables(can_id))
     nothing = crc8h2f(can_id.to_bytes(2, "little") + bytes(7))
-    codec = ProcessCodec(can_id, True)
-    assert (codec._word_1_crc, codec._word_2_crc, codec._word_3_crc) == (first, second, third)
-    assert codec._counter_crc == bytes(value ^ nothing for value in last)
     assert (first, second, third) == node_crc.WORDS
     assert node_crc.last_byte_table(can_id) == bytes(value ^ nothing for value in last)
     assert last == bytes(gate_rules._CRC)  # through which the gate looks up each byte (test_smt_gate.py)
@@ -126,72 +124,77 @@ def test_the_hamming_distance_is_four_and_no_more() -> None:
         test_no_damage_of_up_to_three_bits_passes(4)
 
 
-def payload() -> tuple[list[Number], list[Any]]:
-    ranges = [("a", -32768, 32767), ("b", -32768, 32767), ("c", -32768, 32767), ("counter", 0, 255), ("crc", 0, 255)]
-    made = [unknown(*row) for row in ranges]
-    return [number for number, _ in made], [assume for _, assume in made]
-
-
-def codec_with_unknowns(can_id: int) -> Any:
-    real = ProcessCodec(can_id, True)
-    tables = {
-        name: LinearTable(getattr(real, name)) for name in ("_word_1_crc", "_word_2_crc", "_word_3_crc", "_counter_crc")
-    }
-    return SimpleNamespace(protected=True, cob_id=can_id, length=8, **tables)
-
-
 def crc_of(numbers: list[Number], can_id: int) -> Any:
     tables = reference_tables(can_id)
     terms = [table[number].z for table, number in zip(tables, numbers, strict=True)]
     return terms[0] ^ terms[1] ^ terms[2] ^ terms[3] ^ crc8h2f(can_id.to_bytes(2, "little") + bytes(7))
 
 
-def prove_codec(can_id: int = DRIVE, old: str = "", new: str = "", which: str = "encode") -> int:
-    """What is encoded is decoded as it was, with a CRC that is right; any other CRC is wrong. Returns the paths."""
-    seen = 0
-    numbers, assume = payload()
-    pack = SimpleNamespace(pack=lambda *fields: list(fields), unpack=list)
-    change = {which: (old, new)} if old else {}
-    encode = rebuilt(ProcessCodec.encode, {"_PROTECTED": pack}, *change.get("encode", ()))
-    decode = rebuilt(ProcessCodec.decode, {"_PROTECTED": pack}, *change.get("decode", ()))
-    codec = codec_with_unknowns(can_id)
-    for path in paths(lambda: encode(codec, tuple(numbers[:3]), numbers[3]), assume):
-        sent = path.result
-        same = z3.And(*(of(x) == y.z for x, y in zip(sent, numbers[:4], strict=False)))
-        prove(path.condition, z3.And(same, of(sent[4]) == crc_of(numbers[:4], can_id), *path.claims), "encode")
-    for path in paths(lambda: decode(codec, numbers), assume):
-        *fields, is_right = path.result
-        same = z3.And(*(of(x) == y.z for x, y in zip(fields, numbers, strict=False)))
-        prove(
-            path.condition,
-            z3.And(same, truth(is_right) == (numbers[4].z == crc_of(numbers[:4], can_id)), *path.claims),
-            "decode",
-        )
-        seen += 1
-    return seen
+CODEC_TABLE = {"_TABLE": LinearTable(bytes(process_pdo._TABLE))}
 
 
-@pytest.mark.parametrize("can_id", [DRIVE, SENSE])
-def test_codec(can_id: int) -> None:
-    assert prove_codec(can_id) > 0
+def codec_bits(can_id: int, old: str = "", new: str = "") -> tuple[int, ...]:
+    """The codec's ``crc_of``, as the gate's above."""
+    found: Bits = rebuilt(process_pdo.crc_of, CODEC_TABLE, old, new)(pdo_record(can_id, True), Bits.unknown())
+    return found.of_width(8)
 
 
-@pytest.mark.parametrize(
-    ("which", "old", "new"),
-    [
-        ("encode", "^ self._word_3_crc[third]", "^ self._word_2_crc[third]"),
-        ("encode", "first, second, third, counter, crc)", "first, third, second, counter, crc)"),
-        ("decode", "^ self._word_2_crc[second]", ""),
-        ("decode", "^ self._counter_crc[counter]", "^ self._counter_crc[crc]"),
-    ],
-)
-def test_the_codec_s_proof_fails_for_a_planted_defect(which: str, old: str, new: str) -> None:
-    with pytest.raises(DisprovedError, match=which):
-        prove_codec(DRIVE, old, new, which)
+def encoded_bits(can_id: int, old: str = "", new: str = "") -> tuple[int, ...]:
+    """What ``encode`` makes of any counts and counter: each bit of the payload by theirs, in their order."""
+    crc_of = rebuilt(process_pdo.crc_of, CODEC_TABLE)
+    counts = (Bits.unknown(16, 16 * place) for place in range(3))
+    encode = rebuilt(process_pdo.encode, {"crc_of": crc_of, "int": lambda value: value}, old, new)
+    found: Bits = encode(pdo_record(can_id, True), *counts, Bits.unknown(8, 48))
+    return found.of_width(64)
+
+
+@pytest.mark.parametrize("can_id", [DRIVE, SENSE, 0x301, 0x37F])
+def test_the_codec(can_id: int) -> None:
+    """For every payload: the counts and the counter as they are, and the standard's CRC behind them."""
+    assert codec_bits(can_id) == standard_bits(can_id)
+    assert encoded_bits(can_id) == (*(1 << bit for bit in range(56)), *standard_bits(can_id))
+
+
+def prove_decoding(old: str = "", new: str = "") -> None:
+    """What stands in a payload is read as it was written, with its sign."""
+    word = z3.BitVec("word", 64)
+    count_of = rebuilt(process_pdo.count_of, {}, old, new)
+    for place in range(3):
+        written = z3.SignExt(48, z3.Extract(16 * place + 15, 16 * place, word))
+        for path in paths(lambda place=place: count_of(Number(word), place), []):  # type: ignore[misc]
+            prove(path.condition, z3.And(of(path.result) == written, *path.claims), "decode")
+    counter = rebuilt(process_pdo.counter_of, {})(Number(word))
+    prove(z3.BoolVal(True), of(counter) == z3.ZeroExt(56, z3.Extract(55, 48, word)), "decode")
+
+
+def test_what_was_encoded_is_decoded() -> None:
+    prove_decoding()
+
+
+@pytest.mark.parametrize("bit", range(64))
+def test_a_payload_is_right_or_not_by_its_crc(bit: int) -> None:
+    codec = ProcessCodec(SENSE, True)
+    payload = int.from_bytes(codec.encode((-3, 17, 32767), 200), "little")
+    assert codec.decode(payload.to_bytes(8, "little"))[4]
+    assert not codec.decode((payload ^ 1 << bit).to_bytes(8, "little"))[4]
+
+
+def test_the_codec_s_proofs_fail_for_a_planted_defect() -> None:
+    assert codec_bits(DRIVE, "8 * place", "7 * place") != standard_bits(DRIVE)
+    whole = encoded_bits(DRIVE)
+    for old, new in (
+        ("(third & 0xFFFF)", "(third & 0x7FFF)"),
+        ("<< 56", "<< 57"),
+        ("(counter & 0xFF)", "(second & 0xFF)"),
+    ):
+        with pytest.raises(AssertionError):
+            assert encoded_bits(DRIVE, old, new) == whole
+    with pytest.raises(DisprovedError, match="decode"):
+        prove_decoding("^ 0x8000) - 0x8000", "^ 0x8000) - 0x7FFF")
 
 
 def test_counts_that_do_not_fit_are_an_error_and_nothing_else() -> None:
-    """struct's own limits are the codec's: one past each end."""
+    """One past each end."""
     codec = ProcessCodec(DRIVE, True)
     for low, high, place in ((-32769, 32768, 0), (-32769, 32768, 2), (-1, 256, 3)):
         for value in (low, high):
@@ -199,7 +202,6 @@ def test_counts_that_do_not_fit_are_an_error_and_nothing_else() -> None:
             numbers[place] = value
             with pytest.raises(ValueError, match="cannot carry"):
                 codec.encode((numbers[0], numbers[1], numbers[2]), numbers[3])
-    assert struct.calcsize("<3hBB") == 8
 
 
 # -- the node's side -----------------------------------------------------------------------------------------

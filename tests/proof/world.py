@@ -23,7 +23,7 @@ from snapshot import Attributes, Bases, Snapshot
 from hil.bus.clock import Lockstep
 from hil.node.amplifier import AmplifierNode, NmtState
 from hil.node.emergency import FrameErrors
-from pkxyz_ctrl.can import sense_input, start_sequence, startup
+from pkxyz_ctrl.can import start_sequence, startup
 from pkxyz_ctrl.can.codec import Counts, ProcessCodec
 from pkxyz_ctrl.can.driver_config import DriverConfig
 from pkxyz_ctrl.can.frame import Frame
@@ -136,7 +136,6 @@ class World:
     """One state of the composition at a time; see the module."""
 
     def __init__(self, configuration: Configuration, attributes: Attributes | None = None) -> None:
-        sense_input._SYNCS_UNCOUNTABLE = 4
         FrameErrors.HOLD_US = 30_000
         start_sequence.survey = startup.survey if configuration.whole_dialogue else _few_questions
         start_sequence.plan = startup.plan if configuration.whole_dialogue else _few_writes
@@ -156,6 +155,7 @@ class World:
         self.held: tuple[Held, ...] = ()
         self.plant = Plant(self)
         self.controller = Controller(self.law, bus, gate, self._from_controller)
+        self.controller.driver.sense.record["syncs_uncountable"] = 4
         self.node = AmplifierNode(
             NODE_ID, self.clock, self.wire.append, self.plant, EDS,
             turnaround_us=TURNAROUND_US, fd=driver.fd, protection=driver.protection,
