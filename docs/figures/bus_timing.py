@@ -2,11 +2,10 @@
 
     python docs/figures/bus_timing.py
 
-Each table stands between ``<!-- generated: NAME -->`` and ``<!-- end -->``. The figure shows a cycle that the wire
-really ran; its numbers and the tables' come from ``hil.bus.frame_time``.
+The figure shows a cycle that the wire really ran; its numbers and those of the tables, which the site takes from here,
+come from ``hil.bus.frame_time``.
 """
 
-import re
 from math import floor
 from pathlib import Path
 from typing import NamedTuple
@@ -17,7 +16,6 @@ from hil.bus.wire import Wire
 from hil.pictures.style import BLUE, FAINT, GREEN, TINY_PT, VERMILION, dress, save, sheet
 from pkxyz_ctrl.can.frame import Frame
 
-PAGE = Path(__file__).parents[1] / "understand" / "bus.md"
 PICTURE = Path(__file__).with_suffix(".png")
 NOMINAL, FAST = 1_000_000, 5_000_000
 PERIOD_US, TURNAROUND_US, COMPUTE_US = 200, 2, 8  # configs/buses/fd_5k.toml
@@ -152,19 +150,5 @@ def draw(passages: list[Passage], load: float) -> None:
     save(figure, PICTURE)
 
 
-def generated() -> dict[str, str]:
-    return {"frames": frame_table(), "budget": budget_table()}
-
-
-def rewritten(page: str) -> str:
-    for name, text in generated().items():
-        block = re.compile(rf"(<!-- generated: {name} -->\n).*?(<!-- end -->)", re.DOTALL)
-        if not block.search(page):
-            raise ValueError(f"{PAGE.name} has no block named {name}")
-        page = block.sub(lambda match, text=text: f"{match[1]}{text}\n{match[2]}", page)
-    return page
-
-
 if __name__ == "__main__":
-    PAGE.write_text(rewritten(PAGE.read_text(encoding="utf-8")), encoding="utf-8")
     draw(*one_cycle())

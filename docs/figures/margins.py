@@ -1,7 +1,8 @@
-"""Writes docs/figures/margins.png and the table of margins.md: the shipped laws on ``fd_5k`` at mid-workspace, and
-over the changed and the sampled plants.
+"""Writes docs/figures/margins.png and margins.json, the table of margins.md: the shipped laws on ``fd_5k`` at
+mid-workspace, and over the changed and the sampled plants.
 """
 
+import json
 import math
 from pathlib import Path
 
@@ -44,7 +45,8 @@ COLOURS = {
 }  # fmt: skip
 SHOWN = ("youla", "lqg", "lqg_wide", "hinf", "pi_notch_robust", "irc_robust", "robust")
 SAMPLED = range(1, 201)
-BEGIN, END = "<!-- table: begin -->\n", "<!-- table: end -->"
+TABLE = Path(__file__).with_suffix(".json")
+"""Of margins.md: header and rows."""
 
 
 def loops(stage: Stage, bus: BusConfig) -> dict[str, Loop]:
@@ -53,15 +55,16 @@ def loops(stage: Stage, bus: BusConfig) -> dict[str, Loop]:
     return {name: Loop(stage, bus, design_law(stage, file, bus, autostart=True)) for name, file in files.items()}
 
 
-def table(all_loops: dict[str, Loop]) -> str:
-    """Markdown: a line for each law."""
+HEADER = (
+    "law", "Ms", "disk margin", "|S| < -3 dB to (Hz)", "gain margin, x (dB)", "hold noise (nm)", "largest |K S| / k",
+    "slowest pole (ms)", "135 changed plants: worst Ms", "200 sampled plants: 95 % of Ms, unstable",
+)  # fmt: skip
+
+
+def rows(all_loops: dict[str, Loop]) -> list[list[str]]:
+    """A row of the table for each law."""
     tolerances = load("tolerances", "wide", Tolerances)
-    lines = [
-        "| law | Ms | disk margin | \\|S\\| < -3 dB to (Hz) | gain margin, x (dB) | hold noise (nm) "
-        "| largest \\|K S\\| / k "
-        "| slowest pole (ms) | 135 changed plants: worst Ms | 200 sampled plants: 95 % of Ms, unstable |",
-        f"|{' --- |' * 10}",
-    ]
+    told = []
     for name, loop in all_loops.items():
         found = loop.margins(MIDDLE)
         plant, law = loop_plant(loop.stage, loop.bus, MIDDLE), law_about(loop.stage, loop.law, MIDDLE)
@@ -71,13 +74,12 @@ def table(all_loops: dict[str, Loop]) -> str:
         sampled = np.array([loop.peak_sensitivity(tolerances.sample(seed)) for seed in SAMPLED])
         lost = int(np.count_nonzero(np.isinf(sampled)))
         most = np.percentile(sampled, 95, method="higher")
-        lines.append(
-            f"| `{name}` | {found.mimo.peak_s:.2f} | {found.mimo.disk_margin:.2f} | {found.mimo.bandwidth_hz:.0f} "
-            f"| {20.0 * math.log10(found.axes[0].gain_margin):.1f} | {noise:.2f} | {effort(loop):.1f} "
-            f"| {slowest_ms:.1f} "
-            f"| {_ms(worst)} | {_ms(most)}, {lost} |"
-        )
-    return "\n".join(lines) + "\n"
+        told.append([
+            f"`{name}`", f"{found.mimo.peak_s:.2f}", f"{found.mimo.disk_margin:.2f}", f"{found.mimo.bandwidth_hz:.0f}",
+            f"{20.0 * math.log10(found.axes[0].gain_margin):.1f}", f"{noise:.2f}", f"{effort(loop):.1f}",
+            f"{slowest_ms:.1f}", _ms(worst), f"{_ms(most)}, {lost}",
+        ])  # fmt: skip
+    return told
 
 
 def _ms(value: float) -> str:
@@ -119,12 +121,11 @@ def draw(all_loops: dict[str, Loop]) -> Figure:
 
 
 def main() -> None:
-    """Draw the picture and put the table into its page."""
+    """Draw the picture and keep the table."""
     all_loops = loops(Stage.load("reconstructed"), load("buses", "fd_5k", BusConfig))
     save(draw(all_loops), Path(__file__).with_suffix(".png"))
-    page = Path(__file__).parents[1] / "understand" / "margins.md"
-    before, rest = page.read_text().split(BEGIN)
-    page.write_text(before + BEGIN + table(all_loops) + END + rest.split(END)[1])
+    kept = {"header": HEADER, "rows": rows(all_loops)}
+    TABLE.write_text(json.dumps(kept, indent=1, ensure_ascii=False) + "\n", encoding="utf-8")
 
 
 if __name__ == "__main__":

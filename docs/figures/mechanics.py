@@ -1,11 +1,8 @@
-"""Writes the figures of docs/understand/mechanics.md, and its generated table.
+"""Writes the figures of docs/understand/mechanics.md, whose table of split modes the site takes from here.
 
-    python docs/figures/mechanics.py
-
-It stands between ``<!-- generated: splitting -->`` and ``<!-- end -->``.
+python docs/figures/mechanics.py
 """
 
-import re
 from pathlib import Path
 
 from hil.pictures.mechanics import (
@@ -25,7 +22,6 @@ from pkxyz_ctrl.mechanics.selection import Requirements, select
 from pkxyz_ctrl.stage import Stage
 
 HERE = Path(__file__).parent
-PAGE = HERE.parent / "understand" / "mechanics.md"
 
 
 def splitting_table() -> str:
@@ -41,14 +37,8 @@ def splitting_table() -> str:
     return "\n".join(lines)
 
 
-def filled_in(page: str) -> str:
-    """The page with the current table."""
-    pattern = re.compile(r"(<!-- generated: splitting -->\n).*?(<!-- end -->)", re.DOTALL)
-    return pattern.sub(lambda m: f"{m[1]}{splitting_table()}\n{m[2]}", page)
-
-
 def main() -> None:
-    """Draw all pictures and renew the page's table."""
+    """Draw all pictures."""
     stages = {name: Stage.load(name) for name in ("printed", "reconstructed")}
     stage = stages["reconstructed"]
     draw_design_space(stages, HERE / "mechanics_design_space.png")
@@ -59,7 +49,6 @@ def main() -> None:
     draw_linearisation(linearisation_study(stage, points=17), stage.config.name, HERE / "mechanics_linearisation.png")
     chosen = select(Requirements(), load("stages", "reconstructed", StageConfig))
     draw_selection(chosen, HERE / "mechanics_selection.png")
-    PAGE.write_text(filled_in(PAGE.read_text(encoding="utf-8")), encoding="utf-8")
 
 
 if __name__ == "__main__":

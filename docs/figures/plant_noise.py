@@ -1,11 +1,11 @@
-"""Writes docs/figures/plant_noise.png, each noise of the plant lab alone at the stage, and its table in plant.md.
+"""Writes docs/figures/plant_noise.png and plant_noise.json, the table of plant.md: each noise of the plant lab alone.
 
     python docs/figures/plant_noise.py
 
 The stage is held by 130 V on each comb, which is close to mid-workspace, without any feedback.
 """
 
-import re
+import json
 from pathlib import Path
 
 import numpy as np
@@ -19,7 +19,8 @@ from sim.plant import Plant
 
 Array = NDArray[np.float64]
 
-PAGE = Path(__file__).parents[1] / "understand" / "plant.md"
+TABLE = Path(__file__).with_suffix(".json")
+"""Standard deviations in nm along x, y, z by noise, and what each does; the site's table."""
 VOLT, REST_S, LOOKED_S = 130.0, 0.2, 20.0
 RANDOM = (
     "drift", "brownian", "amplifier_noise", "base_noise", "floor_vibration", "mains", "sense_noise", "sense_flicker",
@@ -80,13 +81,13 @@ def budget() -> dict[str, tuple[Array, Array]]:
     return found
 
 
-def table(found: dict[str, tuple[Array, Array]]) -> str:
-    """As Markdown."""
-    lines = ["| noise of `lab`, alone | x | y | z | |", "| --- | ---: | ---: | ---: | --- |"]
-    for words, (deviation, _) in found.items():
-        seen = "seen, of stroke 1, 2, 3" if words in SHOWS.values() else "moves the platform"
-        lines.append(f"| {words} | {' | '.join(f'{v:.2g}' for v in deviation)} | {seen} |")
-    return "\n".join(lines)
+def plain(found: dict[str, tuple[Array, Array]]) -> dict[str, list[str]]:
+    """What is kept of the budget."""
+    return {
+        words: [*(f"{v:.2g}" for v in deviation),
+                "seen, of stroke 1, 2, 3" if words in SHOWS.values() else "moves the platform"]
+        for words, (deviation, _) in found.items()
+    }  # fmt: skip
 
 
 def draw(found: dict[str, tuple[Array, Array]]) -> None:
@@ -108,14 +109,7 @@ def draw(found: dict[str, tuple[Array, Array]]) -> None:
     save(figure, Path(__file__).with_suffix(".png"))
 
 
-def renewed(page: str, text: str) -> str:
-    """The page with its table filled in."""
-    pattern = r"(<!-- generated: noise -->\n).*?(<!-- end -->)"
-    return re.sub(pattern, lambda match: f"{match[1]}{text}\n{match[2]}", page, flags=re.DOTALL)
-
-
 if __name__ == "__main__":
     noises = budget()
-    print(table(noises))
-    PAGE.write_text(renewed(PAGE.read_text(encoding="utf-8"), table(noises)), encoding="utf-8")
+    TABLE.write_text(json.dumps(plain(noises), indent=1) + "\n", encoding="utf-8")
     draw(noises)

@@ -26,6 +26,14 @@ from pkxyz_ctrl.stage import Stage
 
 ROOT = Path(__file__).parents[2]
 EDS = ROOT / "configs" / "comb_amplifier.eds"
+EXPLORED = {
+    "well": "none",
+    "one": "one of any kind, cuts included",
+    "two": "two of any kind, cuts included",
+    "slow drive time-out": "one, with a drive time-out longer than that of heartbeats",
+    "whole dialogue": "one, with all SDO steps of the start-up",
+}
+"""The configurations that CI explores, and what may go wrong in each."""
 _MARK = re.compile(r"<!-- built: (\w+) -->")
 
 
@@ -95,6 +103,31 @@ def pdos() -> str:
     return pdo_table(canopen.import_od(str(EDS), 10))
 
 
+def kept(path: str) -> str:
+    """A table that a script of docs/ has left: what takes longer than building a site."""
+    found = json.loads((ROOT / "docs" / path).read_text(encoding="utf-8"))
+    return table(found["header"], found["rows"])
+
+
+def noises() -> str:
+    """Each noise of the plant lab alone, as ``docs/figures/plant_noise.py`` last measured it."""
+    found = json.loads((ROOT / "docs" / "figures" / "plant_noise.json").read_text(encoding="utf-8"))
+    return table(["noise of `lab`, alone", "x", "y", "z", ""], [[words, *cells] for words, cells in found.items()])
+
+
+def explored() -> str:
+    """What the last exploration of all states found, by configuration."""
+    found = json.loads((ROOT / "tests" / "proof" / "explored.json").read_text(encoding="utf-8"))
+    keys = ("states", "transitions", "ticks_to_0_v", "ticks_apart")
+    rows = [[name, words, *(str(found[name][key]) for key in keys)] for name, words in EXPLORED.items()]
+    return table(["configuration", "faults", "states", "transitions", "ticks to 0 V", "ticks apart"], rows)
+
+
+def drawn(script: str, function: str) -> str:
+    """A table that a script of docs/figures makes beside its picture."""
+    return str(runpy.run_path(str(ROOT / "docs" / "figures" / script))[function]())
+
+
 def matrix() -> str:
     """What came of each fault under one law, as ``docs/figures/faults.py`` last found it."""
     drawing = runpy.run_path(str(ROOT / "docs" / "figures" / "faults.py"))
@@ -133,6 +166,13 @@ BUILT = {
     "effects": config_tables.effects,
     "segments": config_tables.segments,
     "matrix": matrix,
+    "margins": partial(kept, "figures/margins.json"),
+    "sampled": partial(kept, "tables/montecarlo.json"),
+    "noises": noises,
+    "explored": explored,
+    "frames": partial(drawn, "bus_timing.py", "frame_table"),
+    "budget": partial(drawn, "bus_timing.py", "budget_table"),
+    "splitting": partial(drawn, "mechanics.py", "splitting_table"),
 }
 
 

@@ -115,7 +115,7 @@ def test_every_table_of_the_code_stands_on_a_page_of_the_site(site: Path, name: 
     assert len(pages) == 1
     text = (site / pages[0].relative_to(ROOT / "docs")).with_suffix(".html").read_text(encoding="utf-8")
     rows = reference_tables.BUILT[name]().splitlines()[2:]
-    assert len(rows) > 5
+    assert len(rows) >= 3
     assert text.count("<tr>") > len(rows)
     assert f"built: {name}" not in text
 

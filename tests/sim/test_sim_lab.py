@@ -1,5 +1,6 @@
 """The plant lab: everything on, and the page's table of its noises against what formulas say."""
 
+import json
 import re
 
 import numpy as np
@@ -30,9 +31,8 @@ def test_the_stage_file_says_the_lag_of_the_chain_and_is_the_same_device():
 
 def test_the_pages_noises_are_those_of_the_formulas():
     """Deviations of a mode (K, m, Q) under white noise, sqrt(k T / K), D sqrt(pi f / 2): within a tenth, of 20 s."""
-    page = (ROOT / "docs" / "understand" / "plant.md").read_text(encoding="utf-8")
-    shown = {words: [float(v) for v in numbers] for words, *numbers in re.findall(
-        r"^\| ([a-z][^|]*) \| ([\d.]+) \| ([\d.]+) \| ([\d.]+) \| (?:moves|seen)", page, re.MULTILINE)}  # fmt: skip
+    kept = json.loads((ROOT / "docs" / "figures" / "plant_noise.json").read_text(encoding="utf-8"))
+    shown = {words: [float(v) for v in cells[:3]] for words, cells in kept.items()}
     p = plant(LAB).params[0]
     stiff = np.diag(rest_stiffness(p, np.zeros(3)))
     base = np.array(LAB.base_noise.density_m_per_s2_per_rt_hz) * p["mass_kg"] / stiff
