@@ -14,6 +14,7 @@ import config_tables
 import fault_codes
 import limit_table
 import mode_tables
+import wire_tables
 
 from hil.conformance.run import CHECKS
 from hil.faults.catalogue import KINDS, PARTS
@@ -158,6 +159,8 @@ BUILT = {
     "conformance": conformance,
     "paper": paper,
     "pdos": pdos,
+    "statuses": wire_tables.statuses,
+    "events": wire_tables.events,
     "objects": objects,
     "mode_diagram": mode_tables.diagram,
     "modes": mode_tables.modes,

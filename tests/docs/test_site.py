@@ -8,6 +8,7 @@ from pathlib import Path
 
 import pytest
 import reference_tables
+import wire_tables
 from fault_codes import CLEARS, EMERGENCY_CAUSES, stem
 from generated_pages import commands, field_meanings
 from mkdocs.commands.build import build
@@ -18,6 +19,7 @@ from hil.studies.faults.matrix import CASES
 from pkxyz_ctrl.can.emergency import _EXACT
 from pkxyz_ctrl.client.plain import Stage
 from pkxyz_ctrl.loop.row import ROW, columns
+from pkxyz_ctrl.safety.monitors import NodeEvent, SenseStatus
 from pkxyz_ctrl.safety.trips import Trip
 
 ROOT = Path(__file__).parents[2]
@@ -123,6 +125,11 @@ def test_every_table_of_the_code_stands_on_a_page_of_the_site(site: Path, name: 
 def test_every_check_of_an_amplifier_is_in_its_table() -> None:
     text = reference_tables.conformance()
     assert all(f"| {check.name} | {check.expected} | {check.basis} |" in text for check in CHECKS)
+
+
+def test_every_bit_that_the_wire_tells_has_its_meaning() -> None:
+    assert list(wire_tables.STATUS) == list(SenseStatus)
+    assert list(wire_tables.EVENTS) == list(NodeEvent)
 
 
 def test_the_kept_matrix_is_of_today_s_faults() -> None:

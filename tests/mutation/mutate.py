@@ -192,10 +192,8 @@ def report(jobs: list[Job], outcomes: dict[Job, str]) -> tuple[str, int]:
         f"""# Mutation testing
 
 `make mutate` changes one thing at a time in the code that stands between a mistake and 200 V, and asks whether a test
-notices: comparisons, arithmetic, `and` / `or` / `not`, conditions, `min` / `max`, numbers, what is returned, statements
-left out. Each mutant runs in a forked process, compiler off, nothing on disk changed, against the tests of its
-function. A run that was stopped goes on where it was. It ends with exit code 1 if a survivor has no reason in
-`tests/mutation/mutation_survivors.toml`; nearly all survivors are equivalent code.
+notices. It ends with exit code 1 if a survivor has no reason in `tests/mutation/mutation_survivors.toml`; nearly all
+survivors are equivalent code.
 
 Last result: **{len(outcomes)} of {len(jobs)} mutants tried, {killed} killed, {len(outcomes) - killed} survived,
 {len(unexplained)} of them without a reason.**
