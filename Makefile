@@ -9,7 +9,7 @@
 # make prove  every state that shipped controller and node can reach under any law with faults: EXPLORED="two one"
 # make coverage  branches and conditions (MC/DC) of safety, codec, driver and the node's drive path that the tests meet
 # make fuzz   hostile frames and broken documents: FRAMES=1000000 DOCUMENTS=10000
-# make kills  SIGKILL at random moments of runs: every recording opens, none is silently short. KILLS=300
+# make kills  SIGKILL at random moments of runs, KILLS=300, and in lockstep's clock, KILLS_LOCKSTEP=10000: 0 V in time, recordings open
 # make docs   draw every figure of docs/ and fill in the generated tables
 # make docs-site  build the documentation into site/: open site/index.html
 PYTHON ?= python3
@@ -58,8 +58,10 @@ fuzz: .venv/.ready
 	$(BIN)/python tests/fuzz/fuzz.py --frames $(FRAMES) --documents $(DOCUMENTS)
 
 KILLS ?= 300
+KILLS_LOCKSTEP ?= 10000
 kills: .venv/.ready
 	$(BIN)/python tests/recording/kills.py $(KILLS)
+	$(BIN)/python tests/recording/kills_lockstep.py $(KILLS_LOCKSTEP)
 
 docs: .venv/.ready
 	$(BIN)/python docs/build.py
