@@ -25,6 +25,7 @@ COMMANDS = {
     "serve": ("hil.commands.serve:serve", "Operate a stage: page and clients."),
     "ask": ("hil.commands.ask:ask", "Ask a stage in operation: move, stop, status."),
     "ioc": ("hil.commands.instrument:ioc", "A stage in operation for EPICS."),
+    "scpi": ("hil.commands.instrument:scpi", "A stage in operation over TCP, by SCPI."),
     "operate": ("hil.commands.operate:operate", "The loop that serve operates."),
     "check-amplifier": ("hil.commands.check_amplifier:check_amplifier", "May this amplifier be enabled?"),
     "export": ("hil.commands.export:export", "The controller as C for a board."),

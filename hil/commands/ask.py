@@ -50,7 +50,11 @@ def ask(
     except StageError as error:
         print(f"pkxyz: {error}", file=sys.stderr)
         raise typer.Exit(1) from None
-    print(json.dumps(vars(command)) if as_json else command.words)
+    print(
+        json.dumps({key: getattr(command, key) for key in ("id", "verb", "state", "words")})
+        if as_json
+        else command.words
+    )
 
 
 def _coordinates(given: list[str]) -> dict[str, Any]:

@@ -34,6 +34,20 @@ def ioc(
     _until_ended(partial(serve_ioc, stage, prefix, host, port, _tell))
 
 
+def scpi(
+    name: Name = "stage",
+    url: Url = None,
+    host: Host = "127.0.0.1",
+    port: Annotated[int, typer.Option(help="0: any that is free.", min=0, max=65535)] = 5025,
+) -> None:
+    """Serve a stage in operation to programs that speak SCPI over TCP, until Ctrl-C."""
+    import pkxyz_ctrl
+    from pkxyz_ctrl.instrument.scpi_server import serve_scpi
+
+    stage = pkxyz_ctrl.connect_async(url, name=name, control=False)
+    _until_ended(partial(serve_scpi, stage, host, port, _tell))
+
+
 def _tell(words: str) -> None:
     print(words, flush=True)
 

@@ -60,10 +60,10 @@ class OperatedLoop:
         self._session, self._memory, self._counted = session, memory, counted
         self._controller = session.stage.controller
         self._ticks = memory.writer("ticks")
-        self._commands = memory.reader("commands")
-        self._path = memory.reader("path")
+        self._commands = memory.reader("commands", from_start=True)  # what was asked while the amplifier started, too
+        self._path = memory.reader("path", from_start=True)
         self._head = memory.head
-        self._stops = int(self._head["stop"][0])
+        self._stops = 0
         self._tick = np.zeros(1, TICK)
         self._tick_bytes = self._tick.view(np.uint8).data
 
@@ -76,6 +76,7 @@ class OperatedLoop:
             self._take_rows()
         session.after(row, self._given())
         state = session.state
+        state["commands"] = self._commands.next - 1
         state["frames"], state["wire_ns"] = self._counted.frames, self._counted.wire_ns
         self._tick_bytes[: ROW.itemsize] = controller.row
         self._tick["session"] = state

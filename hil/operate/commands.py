@@ -129,7 +129,7 @@ SESSION = np.dtype(
         ("target_m", "<f8", (3,)),  # where the motion ends
         ("progress", "<f8"),  # 0..1 of a path
         ("path_row", "<f8"),  # where on the path, in its rows
-        ("commands", "<u8"),  # taken so far
+        ("commands", "<u8"),  # taken out of the memory so far
         ("missed", "<i8"),  # ticks, since the loop began
         ("frames", "<i8"),  # sent and received
         ("wire_ns", "<i8"),  # that these took on the wire; a frame as long as the first of its length

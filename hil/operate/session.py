@@ -65,7 +65,6 @@ class Session:
 
     def _begin(self, command: np.void) -> None:
         """Begin a command, a record of ``COMMAND``, or refuse it."""
-        self.state["commands"] += 1
         try:
             verb = Verb(int(command["verb"]))
         except ValueError:

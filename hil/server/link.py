@@ -48,7 +48,6 @@ class Link:
         self.description: dict[str, Any] = {}
         self._memory: StageMemory | None = None
         self._last_id = time.time_ns() // 1000  # above those of a server before this one
-        self._written = 0
         self._newest: np.void | None = None
         self._newest_number, self._seen_s = 0, 0.0
 
@@ -66,8 +65,6 @@ class Link:
         self._commands, self._path = memory.writer("commands"), memory.writer("path")
         self._answers, self.ticks = memory.reader("answers"), memory.reader("ticks")
         self._memory = memory
-        newest = self.newest()
-        self._written = int(newest["session"]["commands"]) if newest is not None else 0
         return True
 
     @property
@@ -98,19 +95,17 @@ class Link:
             raise BusyError("the loop is not there yet")
         newest = self._newest
         taken = int(newest["session"]["commands"]) if newest is not None else 0
-        if self._written - taken > _WAITING_MOST:
-            raise BusyError(f"{self._written - taken} commands still wait for the loop")
+        if (waiting := self._commands.written - taken) > _WAITING_MOST:
+            raise BusyError(f"{waiting} commands still wait for the loop")
         command = new_command(verb, command_id)
         for name, value in fields.items():
             command[name] = value
         self._commands.write(command.view(np.uint8).data[: COMMAND.itemsize])
-        self._written += 1
 
     def stop(self) -> None:
         """Stop, past all that waits."""
         if self._memory is not None:
             self._memory.count_up("stop")
-            self._written += 1
 
     def rows(self, path: int, first: int, motion: Array) -> None:
         """Rows (n, 9) of a path, n at most ``PATH_ROWS``."""

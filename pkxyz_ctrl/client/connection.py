@@ -30,6 +30,7 @@ class Connection:
         self._status_came = asyncio.Condition()
         self._blocks: list[asyncio.Queue[Block | None]] = []
         self._hearing: asyncio.Task[None] | None = None
+        self._is_gone = False
         self.status: Status | None = None
         self.description: dict[str, Any] = {}
 
@@ -53,30 +54,38 @@ class Connection:
         if self._socket is not None:
             await self._socket.close()
         if self._hearing is not None:
-            await self._hearing
+            await asyncio.wait([self._hearing])
 
     async def done(self, verb: str, arguments: dict[str, Any], *, wait: bool = True) -> Command:
         """Ask, and wait for the end, or else until it runs. Raises ``RefusedError`` and ``AbortedError``."""
         tag, queue = self.asked()
         given = {key: value for key, value in arguments.items() if value is not None}
         await self.say({"do": verb, "tag": tag, **given})
-        command = await self.until(queue, FINAL if wait else ("running", *FINAL), tag)
+        command = await self.until(queue, FINAL if wait else ("running", *FINAL))
+        command.answers = None if wait else queue
         return command.require_done()
+
+    async def ended(self, command: Command) -> Command:
+        """The end of one that was not waited for. Raises ``RefusedError`` and ``AbortedError``."""
+        if command.answers is None or command.state in FINAL:
+            return command.require_done()
+        return (await self.until(command.answers, FINAL)).require_done()
 
     def asked(self) -> tuple[int, asyncio.Queue[Command]]:
         """A tag for a message, and where answers to it will be."""
         tag = next(self._tags)
         self._waiting[tag] = asyncio.Queue()
+        if self._is_gone:
+            self._waiting[tag].put_nowait(Command(None, "", "gone"))
         return tag, self._waiting[tag]
 
-    async def until(self, queue: asyncio.Queue[Command], states: Sequence[str], tag: int | None = None) -> Command:
-        """The first answer in one of the states; with its tag, no further ones are waited for."""
+    async def until(self, queue: asyncio.Queue[Command], states: Sequence[str]) -> Command:
+        """The first answer in one of the states. Raises ``NoStageError``."""
         while True:
             command = await queue.get()
             if command.state == "gone":
                 raise NoStageError(_GONE)
             if command.state in states:
-                self.forget(tag)
                 return command
 
     def forget(self, tag: int | None) -> None:
@@ -94,9 +103,13 @@ class Connection:
 
     async def next_status(self) -> Status:
         """The next one that comes."""
-        async with self._status_came:
-            await asyncio.wait_for(self._status_came.wait(), 10.0)
-        if self.status is None:
+        try:
+            async with asyncio.timeout(10.0), self._status_came:
+                if not self._is_gone:
+                    await self._status_came.wait()
+        except TimeoutError:
+            raise NoStageError(f"{self._url} has said nothing for 10 s") from None
+        if self.status is None or self._is_gone:
             raise NoStageError(_GONE)
         return self.status
 
@@ -123,6 +136,9 @@ class Connection:
         except ConnectionClosed:
             pass
         finally:
+            self._is_gone = True  # whoever asks from now on is told so, whatever ended it
+            async with self._status_came:
+                self._status_came.notify_all()
             for queue in self._waiting.values():
                 queue.put_nowait(Command(None, "", "gone"))
             for blocks in self._blocks:
@@ -145,5 +161,7 @@ class Connection:
             queue = self._waiting.get(answer["tag"]) if isinstance(answer.get("tag"), int) else None
             if queue is not None:
                 queue.put_nowait(Command(answer["id"], answer["verb"], answer["state"], answer["words"]))
+                if answer["state"] in FINAL:
+                    self.forget(answer["tag"])
         elif "hello" in message:
             self.description = message["hello"]

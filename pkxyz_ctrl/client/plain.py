@@ -64,6 +64,7 @@ class Stage:
     disable = _waited(AsyncStage.disable)
     move_to = _waited(AsyncStage.move_to)
     move_by = _waited(AsyncStage.move_by)
+    ended = _waited(AsyncStage.ended)
     jog = _waited(AsyncStage.jog)
     follow = _waited(AsyncStage.follow)
     pause = _waited(AsyncStage.pause)

@@ -1,7 +1,8 @@
 """What a stage in operation says back: where it stands, what became of a command, and what went wrong."""
 
+import asyncio
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from typing import Any, Self
 
 import numpy as np
@@ -79,6 +80,8 @@ class Command:
     verb: str
     state: str
     words: str = ""
+    answers: "asyncio.Queue[Command] | None" = field(default=None, repr=False, compare=False)
+    """where further ones come, of a command whose end was not waited for"""
 
     def require_done(self) -> "Command":
         """Raise ``RefusedError`` or ``AbortedError`` unless it was done."""

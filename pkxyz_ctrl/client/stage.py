@@ -96,6 +96,10 @@ class AsyncStage:
         limits = _limits(velocity_m_per_s, acceleration_m_per_s2, jerk_m_per_s3)
         return await self._done("move", wait=wait, x_m=x, y_m=y, z_m=z, relative=True, **limits)
 
+    async def ended(self, command: Command) -> Command:
+        """Wait for the end of what was asked with ``wait=False``. Raises ``AbortedError``."""
+        return await self._connection.ended(command)
+
     async def jog(self, axis: Axis, direction: float, seconds: float, *, velocity_m_per_s: float) -> Command:
         """Go along an axis for a time, as long as this program says so again and again."""
         link, now_s = self._connection, asyncio.get_running_loop().time
@@ -108,7 +112,7 @@ class AsyncStage:
             await link.say({"do": "jog_again"})
             await asyncio.sleep(min(left_s, 0.05))
         await link.say({"do": "jog_end"})
-        return (await link.until(queue, FINAL, tag)).require_done()
+        return (await link.until(queue, FINAL)).require_done()
 
     async def follow(
         self,

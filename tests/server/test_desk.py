@@ -273,3 +273,39 @@ def test_a_client_that_reads_nothing_is_given_up(rig):
         rig.desk.tell_status()
     assert client.is_hopeless
     assert client.said.qsize() <= _SAID_MOST
+
+
+def test_what_is_asked_while_the_loop_starts_is_answered(tmp_path, monkeypatch):
+    """Before the loop reads its commands for the first time: a program that was quick waited for ever."""
+    rig = DeskRig(tmp_path, monkeypatch)
+    client = rig.desk.enter()
+    rig.desk.link.join()
+    rig.ask(client, do="take_control")
+    rig.ask(client, do="move", tag="early", x_m=1e-6)
+    memory = StageMemory(tmp_path / "memory")
+    rig.loop = OperatedLoop(rig.session, memory, _NoFrames())  # type: ignore[arg-type]
+    rig.session.after = _through(rig.loop, type(rig.session).after.__get__(rig.session))  # type: ignore[method-assign]
+
+    def script() -> Script:
+        yield
+        yield
+        answers = [a for a in rig.heard(client)["answer"] if a["tag"] == "early"]
+        assert [a["state"] for a in answers] == ["accepted", "refused"]
+
+    rig.play(script())
+
+
+def test_stops_do_not_use_up_the_room_for_commands(rig):
+    """Two stops within a tick are one, and were counted as two commands of which one was never taken."""
+    client = rig.desk.enter()
+
+    def script() -> Script:
+        yield from switched_on(rig, client)
+        for _ in range(100):
+            rig.ask(client, do="stop")
+            rig.ask(client, do="stop")
+            yield
+        answer = yield from rig.finish(client, do="move", x_m=1e-6)
+        assert answer["state"] == "done", answer
+
+    rig.play(script())
