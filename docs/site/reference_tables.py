@@ -19,6 +19,8 @@ import wire_tables
 from hil.conformance.run import CHECKS
 from hil.faults.catalogue import KINDS, PARTS
 from pkxyz_ctrl.can.wire_doc import object_table, pdo_table
+from pkxyz_ctrl.instrument.motor_record import FIELDS
+from pkxyz_ctrl.instrument.scpi import HEADERS
 from pkxyz_ctrl.mechanics.published import entries
 from pkxyz_ctrl.mechanics.reproduction import reproduction_table
 from pkxyz_ctrl.safety.modes import EVENT_MEANING, TRANSITIONS, Event, Mode
@@ -141,6 +143,16 @@ def rooms() -> str:
     return str(house["page_table"](house["House"].of(ROOT).sources))
 
 
+def motor_fields() -> str:
+    """The fields of a motor record of ``pkxyz ioc``."""
+    return table(["field", "is"], [[field, about] for field, about in FIELDS.items()])
+
+
+def scpi() -> str:
+    """What ``pkxyz scpi`` understands."""
+    return table(["header", "does"], [[f"`{header.form}`", header.about] for header in HEADERS.values()])
+
+
 def measured(name: str) -> str:
     """A table of benchmarks/results.json."""
     drawing = runpy.run_path(str(ROOT / "docs" / "figures" / "performance.py"))
@@ -162,6 +174,8 @@ BUILT = {
     "statuses": wire_tables.statuses,
     "events": wire_tables.events,
     "objects": objects,
+    "motor_fields": motor_fields,
+    "scpi": scpi,
     "mode_diagram": mode_tables.diagram,
     "modes": mode_tables.modes,
     "gate": mode_tables.gate,

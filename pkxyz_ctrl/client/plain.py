@@ -4,6 +4,7 @@ import asyncio
 import functools
 import threading
 from collections.abc import Callable, Coroutine, Iterator
+from concurrent.futures import Future
 from types import TracebackType
 from typing import Any, Concatenate, ParamSpec, Self, TypeVar
 
@@ -127,6 +128,11 @@ def connect(
     ...     stage.move_to(x=1e-6)
     """
     return Stage(connect_async(url, token, name=name, control=control))
+
+
+def begun_in(stage: Stage, of: Callable[[AsyncStage], Coroutine[Any, Any, T]]) -> "Future[T]":
+    """Begin something with the ``AsyncStage`` behind a ``Stage``, where that lives, and do not wait for its end."""
+    return asyncio.run_coroutine_threadsafe(of(stage._stage), stage._loop)
 
 
 async def _next(blocks: Any) -> Block:

@@ -1,4 +1,4 @@
-"""``pkxyz scpi`` with the programs that laboratories have, PyVISA and PyMeasure; and what lines it takes without them."""
+"""``pkxyz scpi`` with the programs that laboratories have, PyVISA and PyMeasure."""
 
 import asyncio
 import re
