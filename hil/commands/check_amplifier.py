@@ -14,7 +14,7 @@ from pkxyz_ctrl.config.files import CONFIG_DIR, load
 
 if TYPE_CHECKING:
     from hil.conformance.talker import Talker
-    from hil.conformance.verdict import Line
+    from hil.conformance.verdict import CheckResult
     from pkxyz_ctrl.config.bus import BusConfig
 
 _STYLES = {
@@ -78,7 +78,7 @@ def _talker(config: "BusConfig", eds: Path, allow_voltage: bool) -> "Iterator[Ta
         )  # fmt: skip
 
 
-def _show(line: "Line") -> None:
+def _show(line: "CheckResult") -> None:
     name = f"{line.group}: {line.name}"
     say(_STYLES[line.verdict.value](f"{line.verdict.value:14}"), f" {name:45} {line.got}")
     if line.verdict.value not in ("PASS", "NOT TESTED"):

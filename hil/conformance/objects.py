@@ -1,6 +1,6 @@
 """Identity, object dictionary and SDO: checks of what the node says about itself, in pre-operational."""
 
-from collections.abc import Iterator
+from collections.abc import Callable, Iterable, Iterator
 
 from hil.conformance.deviation import DeviationError, NotTestedError, deviate_if
 from hil.conformance.eds import Variable
@@ -91,29 +91,39 @@ def identity_of(talker: Talker) -> tuple[int | None, ...]:
     return tuple(result.unsigned if result.ok else None for result in results)
 
 
+Write = tuple[str, Variable, bytes]
+"""How it is called if it goes wrong, where to, and what."""
+
+
+def _written(talker: Talker, writes: Iterable[Write], is_right: Callable[[SdoResult], bool], words: str) -> str:
+    """Writes, one after another, each of which has to end rightly."""
+    outcomes = [(label, talker.write_bytes(v.index, v.subindex, data)) for label, v, data in writes]
+    deviate_if([f"{label}: {result.text}" for label, result in outcomes if not is_right(result)])
+    return f"{len(outcomes)} {words}"
+
+
+def _refused_with(*codes: int) -> Callable[[SdoResult], bool]:
+    return lambda result: result.abort in codes
+
+
+def _drives(talker: Talker, variable: Variable) -> bool:
+    """Whether writing it may put a voltage on the combs that nobody has allowed."""
+    return variable.index in (0x6411, 0x6444) and not talker.allow_voltage
+
+
 def _read_only(talker: Talker) -> str:
-    tried, deviations = 0, []
-    for variable, data in list(_read_values(talker)):
-        if not variable.writable:
-            tried += 1
-            result = talker.write_bytes(variable.index, variable.subindex, data)
-            if result.abort not in (_READ_ONLY, _UNSUPPORTED):
-                deviations.append(f"{variable.label}: {result.text}")
-    deviate_if(deviations)
-    return f"{tried} writes refused"
+    writes = [(variable.label, variable, data) for variable, data in _read_values(talker) if not variable.writable]
+    return _written(talker, writes, _refused_with(_READ_ONLY, _UNSUPPORTED), "writes refused")
 
 
 def _writable(talker: Talker) -> str:
-    tried, deviations = 0, []
-    for variable, data in list(_read_values(talker)):
-        drives = variable.index in (0x6411, 0x6444) and any(data) and not talker.allow_voltage
-        if variable.writable and not variable.is_pdo_parameter and not drives and 1 <= len(data) <= 4:
-            tried += 1
-            result = talker.write_bytes(variable.index, variable.subindex, data)
-            if not result.ok:
-                deviations.append(f"{variable.label}: {result.text}")
-    deviate_if(deviations)
-    return f"{tried} objects take the value that they have"
+    writes = [
+        (variable.label, variable, data)
+        for variable, data in _read_values(talker)
+        if variable.writable and not variable.is_pdo_parameter and 1 <= len(data) <= 4
+        if not (any(data) and _drives(talker, variable))
+    ]
+    return _written(talker, writes, lambda result: result.ok, "objects take the value that they have")
 
 
 def _configuration(talker: Talker) -> str:
@@ -154,7 +164,8 @@ def _mapping_in_use(talker: Talker) -> str:
     return "both refused"
 
 
-def _abort_for(talker: Talker, request: bytes, codes: tuple[int, ...]) -> str:
+def _aborted(talker: Talker, request: bytes, *codes: int) -> str:
+    """A request that has to be answered by one of these aborts."""
     reply = talker.exchange(request)
     if reply is None:
         raise DeviationError("no answer")
@@ -164,57 +175,52 @@ def _abort_for(talker: Talker, request: bytes, codes: tuple[int, ...]) -> str:
     return f"abort {abort_text(code)}"
 
 
-def _no_index(talker: Talker) -> str:
-    talker.reset()
-    return _abort_for(talker, upload_request(_ABSENT_INDEX, 0), (_NO_OBJECT,))
+def _aborts(request: bytes, code: int) -> Callable[[Talker], str]:
+    """A check: after reset, the request is answered by the abort."""
+
+    def perform(talker: Talker) -> str:
+        talker.reset()
+        return _aborted(talker, request, code)
+
+    return perform
 
 
-def _no_subindex(talker: Talker) -> str:
-    talker.reset()
-    return _abort_for(talker, upload_request(0x1018, 0xF0), (_NO_SUBINDEX,))
+def _refuses_lengths(change: int, *codes: int) -> Callable[[Talker], str]:
+    """A check: so many bytes more or less than an object has are refused."""
 
+    def perform(talker: Talker) -> str:
+        talker.reset()
+        writes = [
+            (f"{variable.label} with {variable.length + change} bytes", variable, bytes(variable.length + change))
+            for variable in talker.variables
+            if variable.writable and not variable.is_pdo_parameter and variable.length
+            if 1 <= variable.length + change <= 4
+        ]
+        return _written(talker, writes, _refused_with(*codes), "refused")
 
-def _wrong_lengths(talker: Talker, change: int, codes: tuple[int, ...]) -> str:
-    talker.reset()
-    tried, deviations = 0, []
-    for variable in talker.variables:
-        length = (variable.length or 0) + change
-        if variable.writable and not variable.is_pdo_parameter and variable.length and 1 <= length <= 4:
-            tried += 1
-            result: SdoResult = talker.write_bytes(variable.index, variable.subindex, bytes(length))
-            if result.abort not in codes:
-                deviations.append(f"{variable.label} with {length} bytes: {result.text}")
-    deviate_if(deviations)
-    return f"{tried} refused"
-
-
-def _too_long(talker: Talker) -> str:
-    return _wrong_lengths(talker, 1, (_TOO_LONG, _LENGTH))
-
-
-def _too_short(talker: Talker) -> str:
-    return _wrong_lengths(talker, -1, (_TOO_SHORT, _LENGTH))
+    return perform
 
 
 def _out_of_range(talker: Talker) -> str:
     talker.reset()
-    tried, deviations = 0, []
-    for variable in talker.variables:
-        drives = variable.index in (0x6411, 0x6444) and not talker.allow_voltage
-        if not variable.writable or variable.is_pdo_parameter or drives:
-            continue
-        lowest, highest = variable.type_range
-        beyond = [variable.high + 1] if variable.high is not None and variable.high < highest else []
-        beyond += [variable.low - 1] if variable.low is not None and variable.low > lowest else []
-        for value in beyond:
-            tried += 1
-            result = talker.write_bytes(variable.index, variable.subindex, variable.bytes_of(value))
-            if result.abort not in _RANGES:
-                deviations.append(f"{variable.label} = {value}: {result.text}")
-    if not tried:
+    writes = [
+        (f"{variable.label} = {value}", variable, variable.bytes_of(value))
+        for variable in talker.variables
+        if variable.writable and not variable.is_pdo_parameter and not _drives(talker, variable)
+        for value in _just_beyond(variable)
+    ]
+    if not writes:
         raise NotTestedError("the EDS gives no limits within the types")
-    deviate_if(deviations)
-    return f"{tried} values refused"
+    return _written(talker, writes, _refused_with(*_RANGES), "values refused")
+
+
+def _just_beyond(variable: Variable) -> Iterator[int]:
+    """One more and one less than an object may be, as far as its type has such values."""
+    lowest, highest = variable.type_range
+    if variable.high is not None and variable.high < highest:
+        yield variable.high + 1
+    if variable.low is not None and variable.low > lowest:
+        yield variable.low - 1
 
 
 def _toggle(talker: Talker) -> str:
@@ -223,13 +229,8 @@ def _toggle(talker: Talker) -> str:
         if variable.length is None and variable.readable:
             reply = talker.exchange(upload_request(variable.index, variable.subindex))
             if reply is not None and reply[0] & 0xE2 == 0x40:
-                return _abort_for(talker, bytes((0x70,)) + bytes(7), (_TOGGLE,))
+                return _aborted(talker, bytes((0x70,)) + bytes(7), _TOGGLE)
     raise NotTestedError("no object is read in segments")
-
-
-def _command(talker: Talker) -> str:
-    talker.reset()
-    return _abort_for(talker, b"\xe0" + bytes(7), (_COMMAND,))
 
 
 def _client_abort(talker: Talker) -> str:
@@ -239,6 +240,12 @@ def _client_abort(talker: Talker) -> str:
         raise DeviationError(f"answered with {reply.hex(' ')}")
     return "no answer"
 
+
+_no_index = _aborts(upload_request(_ABSENT_INDEX, 0), _NO_OBJECT)
+_no_subindex = _aborts(upload_request(0x1018, 0xF0), _NO_SUBINDEX)
+_command = _aborts(b"\xe0" + bytes(7), _COMMAND)
+_too_long = _refuses_lengths(1, _TOO_LONG, _LENGTH)
+_too_short = _refuses_lengths(-1, _TOO_SHORT, _LENGTH)
 
 _A, _B, _C = "identity", "object dictionary", "SDO"
 _SDO, _OBJECTS = "CiA 301, 7.2.4 (SDO)", "CiA 301, 7.5.2 (objects)"

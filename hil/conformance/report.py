@@ -9,14 +9,14 @@ from itertools import groupby
 from typing import Any
 
 from hil.conformance.talker import Talker
-from hil.conformance.verdict import Line, Verdict
+from hil.conformance.verdict import CheckResult, Verdict
 
 IDENTITY = ("vendor_id", "product_code", "revision", "serial")
 """Of 0x1018, sub-indices 1 to 4."""
 
 
 def as_json(
-    talker: Talker, eds: str, lines: list[Line], identity: Sequence[int | None], made: datetime
+    talker: Talker, eds: str, lines: list[CheckResult], identity: Sequence[int | None], made: datetime
 ) -> dict[str, Any]:
     """Everything, as plain data. ``ok``: nothing unsafe was seen, and nothing is left that only a voltmeter can tell;
     ``complete``: no line was left out; ``digest``: of all the rest.

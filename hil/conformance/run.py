@@ -4,17 +4,17 @@ from collections.abc import Callable, Iterator
 
 from hil.conformance import network, objects, outputs, process
 from hil.conformance.talker import Talker
-from hil.conformance.verdict import Check, Line, Verdict, judge
+from hil.conformance.verdict import Check, CheckResult, Verdict, judge
 
 CHECKS: tuple[Check, ...] = (objects.ANSWERS, *objects.CHECKS, *network.CHECKS, *process.CHECKS, *outputs.CHECKS)
 
 
-def conformance(talker: Talker, checks: tuple[Check, ...] = CHECKS) -> Iterator[Line]:
+def conformance(talker: Talker, checks: tuple[Check, ...] = CHECKS) -> Iterator[CheckResult]:
     """Line by line, as they are made. A node that does not answer at all is asked nothing more."""
     silent = False
     for check in checks:
         if silent:
-            yield Line(
+            yield CheckResult(
                 check.group, check.name, Verdict.NOT_TESTED, check.expected, check.basis, "the node does not answer SDO"
             )
             continue
@@ -23,7 +23,7 @@ def conformance(talker: Talker, checks: tuple[Check, ...] = CHECKS) -> Iterator[
         yield line
 
 
-def run_all(talker: Talker, told: Callable[[Line], None] = lambda line: None) -> list[Line]:
+def run_all(talker: Talker, told: Callable[[CheckResult], None] = lambda line: None) -> list[CheckResult]:
     """All lines; ``told`` hears of each as it comes. At the end the node is reset, its outputs at 0."""
     lines = []
     try:

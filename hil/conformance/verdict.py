@@ -44,7 +44,7 @@ class Check:
 
 
 @dataclass(frozen=True)
-class Line:
+class CheckResult:
     """The result of a check."""
 
     group: str
@@ -55,7 +55,7 @@ class Line:
     got: str
 
 
-def judge(check: Check, talker: Talker) -> Line:
+def judge(check: Check, talker: Talker) -> CheckResult:
     """Make one check. One that deviates while this very machine was late is made again, and after that not counted."""
     for _ in range(_ATTEMPTS):
         talker.late_us = 0
@@ -64,7 +64,7 @@ def judge(check: Check, talker: Talker) -> Line:
             break
     else:
         verdict, got = Verdict.NOT_TESTED, f"this machine itself was {talker.late_us / 1000:.1f} ms late: {got}"
-    return Line(check.group, check.name, verdict, check.expected, check.basis, got)
+    return CheckResult(check.group, check.name, verdict, check.expected, check.basis, got)
 
 
 def _outcome(check: Check, talker: Talker) -> tuple[Verdict, str]:

@@ -24,7 +24,7 @@ from hil.conformance.objects import identity_of
 from hil.conformance.run import CHECKS, run_all
 from hil.conformance.simulated import EDS, simulated_talker
 from hil.conformance.talker import Talker
-from hil.conformance.verdict import DEVIATIONS, OUR_CONTRACT, Check, Line, Verdict, judge
+from hil.conformance.verdict import DEVIATIONS, OUR_CONTRACT, Check, CheckResult, Verdict, judge
 from hil.node.amplifier import AmplifierNode
 from pkxyz_ctrl.can.codec import ProcessCodec
 from pkxyz_ctrl.can.frame import Frame
@@ -43,11 +43,11 @@ def talk_to(node_type: type[AmplifierNode], *, allow_voltage: bool = True, bus: 
     )
 
 
-def named(lines: list[Line], verdict: Verdict) -> list[str]:
+def named(lines: list[CheckResult], verdict: Verdict) -> list[str]:
     return [f"{line.group}: {line.name}" for line in lines if line.verdict is verdict]
 
 
-def deviating(lines: list[Line]) -> list[str]:
+def deviating(lines: list[CheckResult]) -> list[str]:
     return [f"{line.group}: {line.name}" for line in lines if line.verdict in DEVIATIONS]
 
 
@@ -215,7 +215,7 @@ def test_a_tester_that_is_late_itself_blames_nobody() -> None:
     """Made again, three times in all; a check that is about no times is believed at once, and so is one that passes."""
     talker, made = talk_to(AmplifierNode), []
 
-    def late_until(attempt: int, is_timed: bool = True) -> Line:
+    def late_until(attempt: int, is_timed: bool = True) -> CheckResult:
         made.clear()
 
         def perform(talker: Talker) -> str:
