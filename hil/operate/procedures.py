@@ -51,18 +51,14 @@ class Operated:
     """what a procedure has to tell before its end"""
 
     @property
-    def mode(self) -> Mode:
-        """Of the controller, after the last tick."""
-        return Mode(self.controller.mode)
-
-    def is_in(self, mode: Mode) -> bool:
-        """Whether the controller is in a mode, now: the next tick it may be in another."""
-        return self.mode == mode
+    def mode(self) -> int:
+        """A ``Mode``: the controller's, after the last tick."""
+        return self.controller.mode
 
     @property
     def is_driven(self) -> bool:
         """Whether the loop is closed."""
-        return bool(LOOP_CLOSED[self.controller.mode])
+        return bool(LOOP_CLOSED[self.mode])
 
     @property
     def is_homed(self) -> bool:
@@ -86,7 +82,7 @@ class Operated:
 
 def home(stage: Operated) -> Steps:
     """Average the sense offsets at rest."""
-    if not stage.is_in(Mode.IDLE):
+    if stage.mode != Mode.IDLE:
         raise RefusedError(_not_now(stage.mode, Event.HOME, "disable or park first"))
     stage.controller.request(Event.HOME)
     yield
@@ -99,7 +95,7 @@ def home(stage: Operated) -> Steps:
 
 def enable(stage: Operated) -> Steps:
     """Close the loop at rest, as soon as the combs have been at 0 V for long enough."""
-    if stage.is_in(Mode.TRACKING):
+    if stage.mode == Mode.TRACKING:
         return "the loop is closed already"
     if stage.mode not in (Mode.IDLE, Mode.ENABLED):
         raise RefusedError(_not_now(stage.mode, Event.ENABLE, "clear the fault first"))
@@ -110,12 +106,12 @@ def enable(stage: Operated) -> Steps:
             break
         stage.controller.request(Event.ENABLE)
         yield
-    if not stage.is_in(Mode.ENABLED):
+    if stage.mode != Mode.ENABLED:
         raise AbortedError(f"the loop did not close: {_mode_words(stage.mode)}")
     stage.setpoints.restart(_REST)
     stage.controller.request(Event.TRACK)
     yield
-    if not stage.is_in(Mode.TRACKING):
+    if stage.mode != Mode.TRACKING:
         raise AbortedError(f"the loop did not stay closed: {_mode_words(stage.mode)}")
     return "the loop is closed and holds the rest pose"
 
@@ -306,12 +302,12 @@ def _set_out(stage: Operated, target_m: Array, limits: Limits) -> None:
     stage.setpoints.go(motion, target_m)
 
 
-def _not_now(mode: Mode, event: Event, remedy: str) -> str:
-    return f"{refusal(mode, event) or _mode_words(mode)}; {remedy}"
+def _not_now(mode: int, event: Event, remedy: str) -> str:
+    return f"{refusal(Mode(mode), event) or _mode_words(mode)}; {remedy}"
 
 
-def _mode_words(mode: Mode) -> str:
-    return f"{mode.name} ({MODE_FACTS[mode].meaning})"
+def _mode_words(mode: int) -> str:
+    return f"{Mode(mode).name} ({MODE_FACTS[Mode(mode)].meaning})"
 
 
 def _um(position_m: Array) -> str:

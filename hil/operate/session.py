@@ -308,7 +308,7 @@ class Session:
 
     def _activity(self) -> Activity:
         stage, setpoints = self.stage, self.stage.setpoints
-        by_mode = {
+        by_mode: dict[int, Activity] = {
             Mode.BOOT: Activity.STARTING, Mode.PRE_OPERATIONAL: Activity.STARTING, Mode.IDLE: Activity.OFF,
             Mode.HOMING: Activity.HOMING, Mode.FAULT: Activity.FAULT,
         }  # fmt: skip

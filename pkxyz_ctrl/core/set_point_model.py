@@ -24,6 +24,7 @@ from pkxyz_ctrl.core.feedback import jump
 Array = NDArray[np.float64]
 
 DELAY_MAX = 2
+_ROUNDING_M = 1e-12
 
 SET_POINTS = np.dtype(
     [
@@ -92,9 +93,6 @@ def _step(set_points: np.void, short: Array) -> None:
     left = 1.0 - most / math.sqrt(square) if square > most * most else 0.0
     for i in range(3):
         short[i] *= left
-
-
-_ROUNDING_M = 1e-12
 
 
 @njit(cache=True, error_model="numpy")
