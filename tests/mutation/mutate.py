@@ -30,6 +30,7 @@ FEW = 8  # mutants, for which it does not pay to measure the tests beforehand
 
 # The modules, and the tests that are about them. Before each come numbers that are contracts: fast, and soon imported.
 PINNED = "safety/test_safety_pinned.py"
+_NODE = tuple(f"node/test_node_{part}.py" for part in ("pdo", "release", "sync", "nmt", "heartbeat", "emergency"))
 TARGETS = {
     "pkxyz_ctrl.safety.gate": ("safety/test_safety_gate.py", "safety/test_safety_gate_sweep.py"),
     "pkxyz_ctrl.safety.gate_rules": ("safety/test_safety_gate.py", "safety/test_safety_gate_sweep.py"),
@@ -51,8 +52,8 @@ TARGETS = {
     ),
     "pkxyz_ctrl.loop.controller": ("loop/test_controller.py", "loop/test_overrun.py", "loop/test_flood.py"),
     "pkxyz_ctrl.learning.store": ("learning/test_learning.py",),
-    "hil.node.drive": ("node/test_node_pdo.py", "node/test_node_nmt.py"),
-    "hil.node.amplifier": ("node/test_node_pdo.py", "node/test_node_nmt.py", "node/test_node_sdo.py"),
+    "hil.node.drive": _NODE,
+    "hil.node.amplifier": (*_NODE, "node/test_node_sdo.py"),
     "hil.recording.journal": ("recording/test_recording.py", "recording/test_wall_recorder.py"),
 }
 

@@ -1,29 +1,30 @@
-"""NMT, boot-up, heartbeats both ways and emergencies of the amplifier node."""
+"""NMT and boot-up of the amplifier node: what it does and answers in which state."""
 
 from collections.abc import Callable
-from itertools import pairwise
 
-import canopen
 import pytest
-from hypothesis import given, settings
-from hypothesis import strategies as st
-from node_rig import CONTROLLER, DRIVE, EMCY, HEARTBEAT, NODE_ID, REPLY, REQUEST, SENSE, Rig, master, protected
+from node_rig import (
+    CONTROLLER,
+    DRIVE,
+    EMCY,
+    HEARTBEAT,
+    NODE_ID,
+    PRE_OPERATIONAL,
+    REPLY,
+    REQUEST,
+    SENSE,
+    START,
+    STOP,
+    Rig,
+    in_state,
+    protected,
+)
 
 from hil.node.amplifier import BOOT_US, NmtState
 from pkxyz_ctrl.can.frame import Frame
 
-START, STOP, PRE_OPERATIONAL, RESET_NODE, RESET_COMMUNICATION = 1, 2, 128, 129, 130
+RESET_NODE, RESET_COMMUNICATION = 129, 130
 INITIALISING = NmtState.INITIALISING
-COMMAND_OF = {NmtState.STOPPED: STOP, NmtState.OPERATIONAL: START, NmtState.PRE_OPERATIONAL: PRE_OPERATIONAL}
-
-
-def in_state(state: NmtState, **options: bool) -> Rig:
-    rig = Rig(booted=state is not INITIALISING, **options)
-    if state is not INITIALISING:
-        rig.nmt(COMMAND_OF[state])
-    assert rig.node.state is state
-    rig.forget()
-    return rig
 
 
 @pytest.mark.parametrize("fd", [False, True])
@@ -182,234 +183,3 @@ def test_a_reset_during_the_turnaround_keeps_the_sense_pdo_back() -> None:
     rig.nmt(START)
     rig.run(100)
     assert rig.of(SENSE) == []
-
-
-# -- heartbeats ------------------------------------------------------------------------------------------------------
-
-
-def test_heartbeat_starts_at_once_and_keeps_its_period() -> None:
-    rig = Rig()
-    rig.write(0x1017, 0, 20, 2)
-    t_us = rig.now_us
-    rig.run(50_000)
-    rig.start()
-    rig.run(30_000)
-    assert rig.times(HEARTBEAT) == [t_us + 20_000 * k for k in range(5)]
-    assert rig.of(HEARTBEAT) == [b"\x7f"] * 3 + [b"\x05"] * 2
-    rig.write(0x1017, 0, 0, 2)
-    rig.forget()
-    rig.run(100_000)
-    assert rig.sent == []
-
-
-@given(period_us=st.integers(150, 3000), producer_ms=st.integers(1, 12))
-@settings(max_examples=40, deadline=None)
-def test_heartbeat_rides_behind_the_sense_pdo_and_is_never_late(period_us: int, producer_ms: int) -> None:
-    rig = Rig()
-    rig.start()
-    for _ in range(5):
-        rig.cycle(period_us=period_us)
-    rig.write(0x1017, 0, producer_ms, 2)
-    rig.cycle(period_us=period_us)
-    rig.forget()
-    for _ in range(2 + 40_000 // period_us):
-        rig.cycle(period_us=period_us)
-    beats = rig.times(HEARTBEAT)
-    assert all(b - a <= 1000 * producer_ms for a, b in pairwise(beats))
-    assert len(beats) >= 40 // producer_ms
-    if period_us <= 1000 * producer_ms:
-        assert set(beats) <= set(rig.times(SENSE))
-        assert min(b - a for a, b in pairwise(beats)) >= 1000 * producer_ms - period_us
-        order = [frame.can_id for t_us, frame in rig.sent if t_us == beats[0]]
-        assert order == [SENSE, HEARTBEAT]
-
-
-def test_canopen_sees_the_states() -> None:
-    rig = Rig()
-    network, node = master(rig)
-    node.sdo[0x1017].raw = 10
-    for state in ("OPERATIONAL", "STOPPED", "PRE-OPERATIONAL"):
-        node.nmt.state = state
-        node.nmt._state = 0
-        network.run(11_000)
-        assert node.nmt.state == state
-    booted: list[int] = []
-    node.nmt.add_heartbeat_callback(booted.append)
-    node.nmt.state = "RESET"
-    network.run(BOOT_US)
-    assert booted == [0]
-    assert node.nmt.state == "PRE-OPERATIONAL"
-
-
-CONSUMER_MS = 30
-
-
-def watched(behaviour: int = 0) -> Rig:
-    rig = Rig()
-    assert rig.write(0x1016, 1, 127 << 16 | CONSUMER_MS, 4) == 0
-    assert rig.write(0x1029, 1, behaviour, 1) == 0
-    assert rig.write(0x2012, 0, 65535, 2) == 0  # the time-out of the drive PDO, which would be first
-    return rig
-
-
-def test_consumer_starts_with_the_first_heartbeat() -> None:
-    rig = watched()
-    rig.energise()
-    rig.run(900_000)
-    assert rig.node.outputs == (100, 200, 300)
-
-
-def assert_only_zero_energises(rig: Rig, counts: tuple[int, int, int]) -> None:
-    """Combs that the node has released by itself get a voltage again only after a frame with 0 V."""
-    rig.cycle(counts)
-    rig.sync()
-    assert rig.node.outputs == (0, 0, 0)
-    rig.cycle((0, 0, 0))
-    rig.cycle(counts)
-    rig.sync()
-    assert rig.node.outputs == counts
-
-
-@pytest.mark.parametrize(("behaviour", "state"), [(0, PRE), (1, OPERATIONAL), (2, STOPPED)])
-def test_controller_lost(behaviour: int, state: NmtState) -> None:
-    rig = watched(behaviour)
-    rig.energise()
-    rig.give(CONTROLLER, b"\x05")
-    t_us = rig.now_us
-    rig.forget()
-    rig.run(1000 * CONSUMER_MS - 1)
-    assert (rig.sent, rig.plant.driven, rig.node.outputs) == ([], [], (100, 200, 300))
-    rig.run(1)
-    assert set(rig.plant.driven) == {(t_us + 1000 * CONSUMER_MS, (0, 0, 0))}
-    assert rig.sent == [(rig.now_us, Frame(EMCY, bytes.fromhex("3081110000000000")))]
-    assert rig.node.state is state
-    rig.start()
-    rig.cycle((1, 2, 3))
-    rig.sync()
-    assert rig.node.outputs == (0, 0, 0), "held until the controller is heard again"
-    rig.give(CONTROLLER, b"\x05")
-    rig.nmt(START)
-    rig.run(2000)  # the inhibit time
-    assert rig.of(EMCY) == [bytes.fromhex("3081110000000000"), bytes(8)]
-    assert_only_zero_energises(rig, (1, 2, 3))
-
-
-@given(gaps_us=st.lists(st.integers(1, 1000 * CONSUMER_MS - 1), min_size=1, max_size=20))
-@settings(max_examples=30, deadline=None)
-def test_consumer_counts_from_the_last_heartbeat(gaps_us: list[int]) -> None:
-    rig = watched()
-    rig.energise()
-    rig.give(CONTROLLER, b"\x05")
-    for gap_us in gaps_us:
-        rig.run(gap_us)
-        rig.give(CONTROLLER, b"\x05")
-    last_us = rig.now_us
-    rig.forget()
-    rig.run(2_000 * CONSUMER_MS)
-    assert rig.plant.driven[0] == (last_us + 1000 * CONSUMER_MS, (0, 0, 0))
-
-
-def test_restart_of_the_controller_is_a_loss() -> None:
-    rig = watched()
-    rig.give(CONTROLLER, b"\x00")
-    assert rig.node.emergency.active == ()  # not watched yet
-    rig.energise()
-    rig.give(CONTROLLER, b"\x05")
-    rig.give(CONTROLLER, b"\x00")
-    assert rig.node.state is PRE
-    assert rig.plant.driven[-1] == (rig.now_us, (0, 0, 0))
-
-
-def test_rewriting_the_consumer_time_ends_the_watch() -> None:
-    rig = watched()
-    rig.give(CONTROLLER, b"\x05")
-    assert rig.write(0x1016, 1, 127 << 16 | 10, 4) == 0
-    rig.energise()
-    rig.run(1_000_000)
-    assert rig.node.outputs == (100, 200, 300)
-    rig.give(CONTROLLER, b"\x05")
-    rig.run(10_000)
-    assert rig.node.outputs == (0, 0, 0)
-
-
-# -- emergencies -----------------------------------------------------------------------------------------------------
-
-
-def test_amplifier_fault_holds_the_combs_until_it_is_cleared() -> None:
-    rig = Rig()
-    rig.energise()
-    rig.run(37)
-    rig.node.amplifier_fault(0x2310)
-    assert rig.plant.driven[-1] == (rig.now_us, (0, 0, 0))
-    for _ in range(3):
-        rig.cycle((9, 9, 9))
-    assert rig.node.outputs == (0, 0, 0)
-    assert rig.node.state is OPERATIONAL
-    rig.node.clear_amplifier_fault(0x2310)
-    assert_only_zero_energises(rig, (9, 9, 9))
-
-
-def test_reset_communication_keeps_an_amplifier_fault_and_reset_node_does_not() -> None:
-    rig = Rig()
-    rig.node.amplifier_fault(0x4210)
-    rig.nmt(RESET_COMMUNICATION)
-    rig.run(10_000)
-    assert rig.node.emergency.active == (0x4210,)
-    assert rig.read(0x1001, 0) == 0x09
-    rig.nmt(RESET_NODE)
-    rig.run(10_000)
-    assert not rig.node.emergency.active
-    assert rig.read(0x1001, 0) == rig.read(0x1003, 0) == 0
-
-
-def test_canopen_reads_the_emergencies() -> None:
-    rig = Rig()
-    network, node = master(rig)
-    for code in (0x2310, 0x3210, 0x4210):
-        rig.node.amplifier_fault(code)
-    network.run(10_000)
-    rig.node.clear_amplifier_fault(0x3210)
-    network.run(10_000)
-    assert [(e.code, e.register) for e in node.emcy.log] == [(0x2310, 3), (0x3210, 7), (0x4210, 15), (0, 11)]
-    assert node.emcy.log[-1].data[:2] == (0x4210).to_bytes(2, "little")
-    assert node.sdo[0x1003][0].raw == 3
-    assert [node.sdo[0x1003][i].raw for i in (1, 2, 3)] == [0x4210, 0x3210, 0x2310]
-    with pytest.raises(canopen.SdoAbortedError, match="08000024"):
-        node.sdo[0x1003][4].raw  # noqa: B018
-    node.sdo[0x1003][0].raw = 0
-    assert node.sdo[0x1003][0].raw == 0
-    with pytest.raises(canopen.SdoAbortedError, match="08000024"):
-        node.sdo[0x1003][1].raw  # noqa: B018
-
-
-def test_history_keeps_the_newest_eight() -> None:
-    rig = Rig()
-    for code in range(0x2301, 0x230B):
-        rig.node.amplifier_fault(code)
-    assert [rig.node.od[0x1003, i] for i in range(9)] == [8, *range(0x230A, 0x2302, -1)]
-
-
-def test_inhibit_time_spaces_the_emergencies() -> None:
-    rig = Rig()
-    rig.write(0x1015, 0, 25, 2)
-    t_us = rig.now_us
-    for code in (0x2310, 0x3210, 0x4210):
-        rig.node.amplifier_fault(code)
-    rig.run(20_000)
-    assert rig.times(EMCY) == [t_us, t_us + 2500, t_us + 5000]
-
-
-def test_emergencies_wait_while_stopped_and_can_be_switched_off() -> None:
-    rig = in_state(STOPPED)
-    rig.node.amplifier_fault(0x2310)
-    rig.run(10_000)
-    assert rig.sent == []
-    rig.nmt(PRE_OPERATIONAL)
-    assert rig.of(EMCY) == [bytes.fromhex("1023030000000000")]
-    rig.write(0x1014, 0, 0x8000008A, 4)
-    rig.run(10_000)
-    rig.forget()
-    rig.node.amplifier_fault(0x3210)
-    rig.run(10_000)
-    assert rig.sent == []
-    assert rig.read(0x1001, 0) == 7

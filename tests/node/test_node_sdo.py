@@ -33,7 +33,7 @@ def test_every_object_reads_as_the_eds_says() -> None:
     _, node = master(rig)
     for variable in VARIABLES:
         if variable.index == 0x1003 and variable.subindex:
-            continue  # there is no error yet, so no data: see test_node_nmt.py
+            continue  # there is no error yet, so no data: see test_node_emergency.py
         raw = node.sdo.upload(variable.index, variable.subindex)
         if variable.data_type in datatypes.NUMBER_TYPES:
             assert len(raw) * 8 == len(variable)

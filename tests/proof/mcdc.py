@@ -42,9 +42,13 @@ TESTS = (
     "tests/safety/test_safety_pinned.py",
     "tests/safety/test_process_frames.py",
     "tests/can",
+    "tests/node/test_node_emergency.py",
+    "tests/node/test_node_heartbeat.py",
     "tests/node/test_node_nmt.py",
     "tests/node/test_node_pdo.py",
+    "tests/node/test_node_release.py",
     "tests/node/test_node_sdo.py",
+    "tests/node/test_node_sync.py",
     "tests/proof/test_mode_machine.py",
 )
 REASONS = Path(__file__).with_name("uncovered.json")

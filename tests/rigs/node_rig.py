@@ -7,7 +7,7 @@ import canopen
 from crccheck.crc import Crc8Base
 
 from hil.bus.clock import Lockstep
-from hil.node.amplifier import AmplifierNode
+from hil.node.amplifier import AmplifierNode, NmtState
 from pkxyz_ctrl.can.frame import Frame
 
 EDS = Path(__file__).parents[2] / "configs" / "comb_amplifier.eds"
@@ -15,6 +15,8 @@ NODE_ID = 10
 NMT, SYNC, EMCY, SENSE, DRIVE, REPLY, REQUEST, HEARTBEAT = 0x000, 0x080, 0x08A, 0x28A, 0x30A, 0x58A, 0x60A, 0x70A
 CONTROLLER = 0x77F
 TURNAROUND_US = 7
+START, STOP, PRE_OPERATIONAL = 1, 2, 128  # NMT commands
+COMMAND_OF = {NmtState.STOPPED: STOP, NmtState.OPERATIONAL: START, NmtState.PRE_OPERATIONAL: PRE_OPERATIONAL}
 
 
 class Crc8H2F(Crc8Base):  # type: ignore[misc]
@@ -154,6 +156,38 @@ class Rig:
 
     def times(self, cob_id: int) -> list[int]:
         return [t_us for t_us, frame in self.sent if frame.can_id == cob_id]
+
+
+def emergencies(rig: Rig) -> list[int]:
+    """Codes of what was sent."""
+    return [int.from_bytes(data[:2], "little") for data in rig.of(EMCY)]
+
+
+def operational(**options: bool) -> Rig:
+    rig = Rig(**options)
+    rig.start()
+    rig.forget()
+    return rig
+
+
+def in_state(state: NmtState, **options: bool) -> Rig:
+    rig = Rig(booted=state is not NmtState.INITIALISING, **options)
+    if state is not NmtState.INITIALISING:
+        rig.nmt(COMMAND_OF[state])
+    assert rig.node.state is state
+    rig.forget()
+    return rig
+
+
+def assert_only_zero_energises(rig: Rig, counts: tuple[int, int, int]) -> None:
+    """Combs that the node has released by itself get a voltage again only after a frame with 0 V."""
+    rig.cycle(counts)
+    rig.sync()
+    assert rig.node.outputs == (0, 0, 0)
+    rig.cycle((0, 0, 0))
+    rig.cycle(counts)
+    rig.sync()
+    assert rig.node.outputs == counts
 
 
 class LockstepNetwork(canopen.Network):  # type: ignore[misc]
