@@ -4,15 +4,9 @@ from datetime import UTC, datetime
 
 import can
 import pytest
-from conformance_defects import (
-    DEFECTS,
-    EverySenseLate,
-    NoHeartbeatConsumer,
-    SelfStarting,
-    Silent,
-    StillPlant,
-    WaitsOnce,
-)
+from conformance_defects import DEFECTS, EverySenseLate, SelfStarting, StillPlant, WaitsOnce
+from defective_frames import NoHeartbeatConsumer
+from defective_objects import Silent
 
 from hil.bus.clock import Lockstep
 from hil.bus.published_wires import publish

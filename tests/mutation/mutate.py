@@ -30,14 +30,15 @@ FEW = 8  # mutants, for which it does not pay to measure the tests beforehand
 
 # The modules, and the tests that are about them. Before each come numbers that are contracts: fast, and soon imported.
 PINNED = "safety/test_safety_pinned.py"
+_GATE = tuple(f"safety/test_safety_gate{part}.py" for part in ("", "_traffic", "_sweep"))
 _NODE = tuple(f"node/test_node_{part}.py" for part in ("pdo", "release", "sync", "nmt", "heartbeat", "emergency"))
 TARGETS = {
-    "pkxyz_ctrl.safety.gate": ("safety/test_safety_gate.py", "safety/test_safety_gate_sweep.py"),
-    "pkxyz_ctrl.safety.gate_rules": ("safety/test_safety_gate.py", "safety/test_safety_gate_sweep.py"),
-    "pkxyz_ctrl.safety.sdo_rules": ("safety/test_safety_gate.py", "safety/test_safety_gate_sweep.py"),
+    "pkxyz_ctrl.safety.gate": _GATE,
+    "pkxyz_ctrl.safety.gate_rules": _GATE,
+    "pkxyz_ctrl.safety.sdo_rules": _GATE,
     "pkxyz_ctrl.safety.modes": ("safety/test_safety_modes.py",),
-    "pkxyz_ctrl.safety.monitors": ("safety/test_safety_monitors.py",),
-    "pkxyz_ctrl.safety.thresholds": ("safety/test_safety_monitors.py",),
+    "pkxyz_ctrl.safety.monitors": ("safety/test_safety_monitors.py", "safety/test_safety_misfit.py"),
+    "pkxyz_ctrl.safety.thresholds": ("safety/test_safety_monitors.py", "safety/test_safety_misfit.py"),
     "pkxyz_ctrl.safety.trips": ("safety/test_safety_monitors.py", "safety/test_safety_modes.py"),
     "pkxyz_ctrl.core.voltage": ("core/test_core_voltage.py",),
     "pkxyz_ctrl.core.allocation": ("core/test_core_allocation.py",),

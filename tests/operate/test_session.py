@@ -2,42 +2,13 @@
 
 import numpy as np
 import pytest
-from operated_rig import MIDDLE_M, Feeder, OperatedRig, Script
+from operated_rig import MIDDLE_M, PERIOD_S, OperatedRig, Script, require_smooth, tracked
 
 from hil.operate.commands import Activity, State, Verb
-from hil.operate.settings import Settings
 from pkxyz_ctrl.safety.modes import Mode
 from pkxyz_ctrl.safety.monitors import SenseStatus
-from pkxyz_ctrl.trajectory import Raster, Trajectory
-from pkxyz_ctrl.trajectory.segments import Limits
 
 NAN = np.nan
-LIMITS = Limits(0.5e-3, 0.5, 300.0)
-PERIOD_S = 200e-6
-
-
-def tracked(rows: np.ndarray) -> np.ndarray:
-    return rows[rows["mode"] == Mode.TRACKING]
-
-
-def require_smooth(rows: np.ndarray) -> None:
-    """Set-points keep velocity, acceleration and jerk of every axis, whatever was asked."""
-    reference = tracked(rows)["reference_m"]
-    for order, most in zip((1, 2, 3), LIMITS, strict=True):
-        differences = np.diff(reference, order, axis=0) / PERIOD_S**order
-        assert np.abs(differences).max() <= most * 1.001, order
-
-
-def raster_rows(period_us: int = 200) -> tuple[np.ndarray, np.ndarray]:
-    """A small raster about the middle, as rows, and its first point."""
-    scan = Raster(
-        kind="raster", line_length_m=2e-6, lines=20, line_pitch_m=0.1e-6, layers=1, layer_pitch_m=0.5e-6,
-        line_rate_hz=60.0, velocity_max_m_per_s=0.5e-3, acceleration_max_m_per_s2=0.5, jerk_max_m_per_s3=300.0,
-    )  # fmt: skip
-    trajectory = Trajectory([scan])
-    rows = trajectory.sample(0, trajectory.duration_us // period_us + 2, period_us)
-    rows[:, 0:3] += MIDDLE_M
-    return rows, rows[0, 0:3]
 
 
 def test_from_off_to_a_new_target_in_flight_and_back_to_off():
@@ -170,92 +141,6 @@ def test_a_move_is_stopped_smoothly_and_the_stage_holds(verb):
         assert np.isclose(reference[-1, 1] / reference[-1, 0], 0.5, rtol=1e-6)
 
 
-def test_a_path_is_followed_paused_resumed_and_not_left():
-    rows, start = raster_rows()
-    rig = OperatedRig()
-    feeder = Feeder(rig, 7, rows)
-    after_pause: list[int] = []
-
-    def script() -> Script:
-        yield from rig.switched_on()
-        path = rig.give(Verb.PATH, path=7, rows=len(rows), start_m=start)
-        while rig.session.state["progress"][0] < 0.4:
-            yield
-        assert rig.session.state["activity"] == Activity.SCANNING
-        refused = rig.give(Verb.MOVE, target_m=(0, 0, 18e-6))
-        yield
-        yield
-        assert rig.state_of(refused) is State.REFUSED
-        assert f"PATH (command {path}) is running" in rig.words_of(refused)
-        assert (yield from rig.do(Verb.PAUSE)) is State.DONE
-        assert rig.session.state["activity"] == Activity.PAUSED
-        yield from rig.wait_s(0.05)
-        after_pause.append(len(rig.rows))
-        assert (yield from rig.do(Verb.RESUME)) is State.DONE
-        assert (yield from rig.until_final(path)) is State.DONE
-        assert not feeder.stopped
-
-    recorded = tracked(rig.play(script()))
-    reference = recorded["reference_m"]
-    still = np.flatnonzero((np.diff(reference, axis=0) == 0).all(axis=1))
-    assert len(still) > 200  # the pause
-    dense, _ = raster_rows(period_us=4)
-    turned = np.flatnonzero(np.diff(still) > 1)  # about the pause, where rows are not those of the path
-    for point in reference[still[turned[-1] + 1] - 60 : still[-1] + 60]:
-        assert np.abs(dense[:, 0:3] - point).max(axis=1).min() < 1.1e-9
-    assert np.allclose(reference[-1], rows[-1, 0:3], atol=1e-15)
-    error = recorded["position_m"] - reference
-    assert np.abs(error).max() < 12e-9
-
-
-def test_a_path_whose_rows_stop_coming_is_paused_in_time_and_goes_on_when_they_come():
-    """A feeder that was killed: the path stops on itself, with rows to spare, and nothing faults."""
-    rows, start = raster_rows()
-    rig = OperatedRig()
-    feeder = Feeder(rig, 1, rows)
-
-    def script() -> Script:
-        yield from rig.switched_on()
-        path = rig.give(Verb.PATH, path=1, rows=len(rows), start_m=start)
-        rig.session.stage.path = None
-        while rig.session.stage.path is None or rig.session.stage.path.wants < 1000:
-            yield
-        feeder.stopped = True
-        while rig.session.state["activity"] != Activity.PAUSED:
-            yield
-        assert any("have not come in time" in words for n, _, words in rig.answers if n == path)
-        refused = rig.give(Verb.RESUME)
-        yield from rig.until_final(refused)
-        assert "have not come yet" in rig.words_of(refused)
-        feeder.stopped = False
-        yield from rig.wait_s(0.05)
-        assert (yield from rig.do(Verb.RESUME)) is State.DONE
-        assert (yield from rig.until_final(path)) is State.DONE
-
-    recorded = rig.play(script())
-    assert not rig.controller.faults
-    assert np.abs(np.diff(tracked(recorded)["reference_m"], 2, axis=0)).max() / PERIOD_S**2 < 0.8
-
-
-def test_rows_that_cannot_be_followed_are_not():
-    """A server that sends what it never checked: the path stops before it."""
-    rows, start = raster_rows()
-    rows[900:, 0] += 3e-6
-    rig = OperatedRig()
-    Feeder(rig, 1, rows)
-
-    def script() -> Script:
-        yield from rig.switched_on()
-        path = rig.give(Verb.PATH, path=1, rows=len(rows), start_m=start)
-        assert (yield from rig.until_final(path)) is State.ABORTED
-        assert "jumps" in rig.words_of(path)
-        yield from rig.wait_s(0.02)
-        assert rig.session.state["activity"] == Activity.HOLDING
-
-    recorded = rig.play(script())
-    assert np.abs(np.diff(tracked(recorded)["reference_m"], axis=0)).max() < 0.2e-6
-
-
 def test_a_jog_goes_on_while_it_is_renewed_and_ends_within_300_ms_of_silence():
     rig = OperatedRig()
 
@@ -298,43 +183,6 @@ def test_a_jog_stops_at_the_end_of_what_the_combs_hold():
 
     rig.play(script())
     assert not rig.controller.faults
-
-
-@pytest.mark.parametrize("on_silence", ["hold", "park"])
-def test_a_server_that_falls_silent_stops_the_path_within_100_ms(on_silence):
-    rows, start = raster_rows()
-    rig = OperatedRig(settings=Settings(on_silence=on_silence))
-    Feeder(rig, 1, rows)
-    alive = [True]
-    count = [0]
-
-    def sign_of_life() -> None:
-        count[0] += alive[0]
-        rig.session.server_says(count[0])
-
-    rig.every_tick.append(sign_of_life)
-
-    def script() -> Script:
-        yield from rig.switched_on()
-        path = rig.give(Verb.PATH, path=1, rows=len(rows), start_m=start)
-        while rig.session.state["progress"][0] < 0.3:
-            yield
-        alive[0] = False
-        silent_at = len(rig.rows)
-        assert (yield from rig.until_final(path)) is State.ABORTED
-        while rig.session.state["activity"] in (Activity.SCANNING, Activity.STOPPING):
-            yield
-        assert (len(rig.rows) - silent_at) * PERIOD_S < 0.1
-        yield from rig.wait_s(0.2)
-        assert rig.session.state["activity"] == (Activity.HOLDING if on_silence == "hold" else Activity.OFF)
-        alive[0] = True
-        yield from rig.wait_s(0.01)
-        if on_silence == "hold":
-            assert (yield from rig.do(Verb.MOVE, target_m=MIDDLE_M)) is State.DONE
-
-    recorded = rig.play(script())
-    assert not rig.controller.faults
-    assert np.abs(np.diff(tracked(recorded)["reference_m"], 2, axis=0)).max() / PERIOD_S**2 < 0.8
 
 
 def test_released_by_hand_is_0_v_at_once_and_latched_until_cleared():

@@ -37,7 +37,9 @@ MODULES = (
 )
 TESTS = (
     "tests/safety/test_safety_gate.py",
+    "tests/safety/test_safety_gate_traffic.py",
     "tests/safety/test_safety_modes.py",
+    "tests/safety/test_safety_misfit.py",
     "tests/safety/test_safety_monitors.py",
     "tests/safety/test_safety_pinned.py",
     "tests/safety/test_process_frames.py",

@@ -15,12 +15,17 @@ from hil.operate.session import Session
 from hil.operate.settings import Settings
 from pkxyz_ctrl.loop.row import ROW, TRUTH_FIELDS
 from pkxyz_ctrl.loop.runtime import run, start
+from pkxyz_ctrl.safety.modes import Mode
 from pkxyz_ctrl.stage import Stage
+from pkxyz_ctrl.trajectory import Raster, Trajectory
 from pkxyz_ctrl.trajectory.check import DriveLimits
+from pkxyz_ctrl.trajectory.segments import Limits
 
 Script = Generator[None, None, None]
 MIDDLE_M = (0.0, 0.0, 18e-6)
 SECONDS_AT_MOST = 20.0
+PERIOD_S = 200e-6
+_LIMITS = Limits(0.5e-3, 0.5, 300.0)
 
 
 class _OverError(Exception):
@@ -132,3 +137,27 @@ class Feeder:
         if not self.stopped and self._at < len(self._rows) and self._session.wants_rows:
             self._session.take_rows(self._number, self._at, self._rows[self._at : self._at + PATH_ROWS])
             self._at += PATH_ROWS
+
+
+def tracked(rows: np.ndarray) -> np.ndarray:
+    return rows[rows["mode"] == Mode.TRACKING]
+
+
+def require_smooth(rows: np.ndarray) -> None:
+    """Set-points keep velocity, acceleration and jerk of every axis, whatever was asked."""
+    reference = tracked(rows)["reference_m"]
+    for order, most in zip((1, 2, 3), _LIMITS, strict=True):
+        differences = np.diff(reference, order, axis=0) / PERIOD_S**order
+        assert np.abs(differences).max() <= most * 1.001, order
+
+
+def raster_rows(period_us: int = 200) -> tuple[np.ndarray, np.ndarray]:
+    """A small raster about the middle, as rows, and its first point."""
+    scan = Raster(
+        kind="raster", line_length_m=2e-6, lines=20, line_pitch_m=0.1e-6, layers=1, layer_pitch_m=0.5e-6,
+        line_rate_hz=60.0, velocity_max_m_per_s=0.5e-3, acceleration_max_m_per_s2=0.5, jerk_max_m_per_s3=300.0,
+    )  # fmt: skip
+    trajectory = Trajectory([scan])
+    rows = trajectory.sample(0, trajectory.duration_us // period_us + 2, period_us)
+    rows[:, 0:3] += MIDDLE_M
+    return rows, rows[0, 0:3]
