@@ -10,7 +10,7 @@ from pathlib import Path
 
 from hil.node.alarm import Alarm, Scheduler
 from hil.node.drive import DriveReceiver, Outputs
-from hil.node.emergency import EmergencyProducer, ErrorCode, FrameErrors
+from hil.node.emergency import HOLD_US, EmergencyProducer, ErrorCode, FrameErrors
 from hil.node.heartbeat import HeartbeatConsumer, HeartbeatProducer
 from hil.node.object_dictionary import ObjectDictionary
 from hil.node.objects import NodeObjects
@@ -40,7 +40,8 @@ class AmplifierNode:
 
     ``node_id`` 1 to 127; ``turnaround_us`` from the end of the SYNC to the queueing of the sense PDO; ``fd``: send FD
     frames with bit-rate switch (both formats are accepted); ``protection``: the drive PDO must carry alive counter and
-    CRC, and nothing but that PDO can set a drive count other than 0.
+    CRC, and nothing but that PDO can set a drive count other than 0; ``error_hold_us``: how long an error in a frame
+    lasts after the last such frame.
     """
 
     def __init__(
@@ -55,6 +56,7 @@ class AmplifierNode:
         fd: bool,
         protection: bool,
         boot_us: int = BOOT_US,
+        error_hold_us: int = HOLD_US,
     ) -> None:
         if not 1 <= node_id <= 127:
             raise ValueError(f"node id {node_id}: CiA 301 allows 1 to 127")
@@ -81,8 +83,8 @@ class AmplifierNode:
         self._drive_pdo = PdoParameters(od, "receive", 2, values=0x6411, protection=0x2000, protected=protection)
         self._sense_pdo = PdoParameters(od, "transmit", 2, values=0x6401, protection=0x2001, protected=protection)
         self.emergency = EmergencyProducer(od, clock, self._transmit)
-        self._sync_errors = FrameErrors(self.emergency)
-        self._drive_errors = FrameErrors(self.emergency)
+        self._sync_errors = FrameErrors(self.emergency, error_hold_us)
+        self._drive_errors = FrameErrors(self.emergency, error_hold_us)
         self._heartbeat = HeartbeatProducer(clock, self._send_heartbeat)
         self._consumers = [
             HeartbeatConsumer(clock, self._controller_lost, self._controller_found) for _ in range(od[0x1016, 0])

@@ -9,6 +9,8 @@ from hil.node.alarm import Alarm, Scheduler
 from hil.node.object_dictionary import ObjectDictionary
 
 HISTORY_LENGTH = 8
+HOLD_US = 100_000
+"""So long an error seen in single frames lasts after the last bad one."""
 _WAITING_MAX = 16  # a queue that a flood of errors cannot grow: raise and clear of every code in use here
 
 # CiA 301, table 26 (classes of error codes) and 7.5.2.2 (bits of the error register; bit 0 is set with any error)
@@ -131,18 +133,17 @@ class FrameErrors:
     Without it a frame that is wrong every other cycle would put two EMCY frames into each cycle, ahead of the PDOs.
     """
 
-    __slots__ = ("_emergency", "_present", "_quiet_from_us", "present")
+    __slots__ = ("_emergency", "_hold_us", "_present", "_quiet_from_us", "present")
 
-    HOLD_US = 100_000
-
-    def __init__(self, emergency: EmergencyProducer) -> None:
+    def __init__(self, emergency: EmergencyProducer, hold_us: int = HOLD_US) -> None:
         self._emergency = emergency
+        self._hold_us = hold_us
         self._present: set[int] = set()
         self._quiet_from_us = 0
         self.present = False  # read in every cycle: calls `good` only if there is something to end
 
     def bad(self, code: int, t_us: int, info: bytes = b"") -> None:
-        self._quiet_from_us = t_us + self.HOLD_US
+        self._quiet_from_us = t_us + self._hold_us
         self._present.add(code)
         self.present = True
         self._emergency.begin(code, info)

@@ -54,9 +54,12 @@ class AmplifierDriver:
     are integer microseconds of the caller's one clock and never run backwards.
     """
 
-    def __init__(self, config: DriverConfig, count_step_max: int = 32767) -> None:
+    def __init__(
+        self, config: DriverConfig, count_step_max: int = 32767, start_up: StartSequence | None = None
+    ) -> None:
+        """``start_up`` in place of the one that follows from the others."""
         self.config = config
-        self._start_up = StartSequence(config, count_step_max)
+        self._start_up = start_up or StartSequence(config, count_step_max)
         self.state = DriverState.OFF
         self.failure = ""
         self.node_events = 0

@@ -3,13 +3,14 @@
 No clock, no socket: messages in, messages out, time passed in. ``AmplifierDriver`` makes frames of them.
 """
 
+from collections.abc import Callable
 from enum import Enum, auto
 
-from . import cob_id
+from . import cob_id, startup
 from .cob_id import NmtCommand, NmtState
 from .driver_config import DriverConfig
 from .sdo import SdoDialogue, SdoStep
-from .startup import Key, identity_steps, plan, survey
+from .startup import Found, Key, Plan, identity_steps
 
 Message = tuple[int, bytes]
 Messages = tuple[Message, ...]
@@ -42,7 +43,15 @@ class StartSequence:
     number and not tried again. ``lost`` tells which protections it does without.
     """
 
-    def __init__(self, config: DriverConfig, count_step_max: int) -> None:
+    def __init__(
+        self,
+        config: DriverConfig,
+        count_step_max: int,
+        survey: Callable[[DriverConfig], tuple[SdoStep, ...]] = startup.survey,
+        plan: Callable[[DriverConfig, int, Found], Plan] = startup.plan,
+    ) -> None:
+        """``survey``: what is asked first; ``plan``: what is done about the answers."""
+        self._survey, self._plan = survey, plan
         self.state = DriverState.OFF
         self.failure = ""
         self.lost: tuple[str, ...] = ()
@@ -149,7 +158,7 @@ class StartSequence:
         if self.state is DriverState.IDENTIFYING:
             self.state, self._is_planned = DriverState.CONFIGURING, False
             self._found = dict(dialogue.values)
-            return self._ask(survey(self._config), t_us)
+            return self._ask(self._survey(self._config), t_us)
         if not self._is_planned:
             return self._configure(t_us)
         overflow = dialogue.values.get((0x1019, 0), self._found.get((0x1019, 0))) or 0
@@ -165,7 +174,7 @@ class StartSequence:
         self._is_planned = True
         self._found = self._found | self._dialogue.values
         self._identity = tuple(self._found.get((0x1018, part)) for part in (1, 2, 3, 4))
-        planned = plan(self._config, self._count_step_max, self._found)
+        planned = self._plan(self._config, self._count_step_max, self._found)
         missed = (f"{self._never_booted}: that it answers, and what it holds, was seen instead",)
         self.lost = (*(missed if self._never_booted else ()), *planned.lost)
         if planned.refusal:

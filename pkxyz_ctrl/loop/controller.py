@@ -47,11 +47,12 @@ class Controller:
         send: Send,
         discard_unsent: Callable[[], object] = lambda: None,
         port_complaint: Callable[[], str] = lambda: "",
+        driver: AmplifierDriver | None = None,
     ) -> None:
         if bus.can is None:
             raise ValueError(f"bus {bus.name!r} has no [can]: nothing to control over")
         self.can: CanConfig = bus.can
-        self.driver = AmplifierDriver(bus.can.driver, gate.count_slew_max)
+        self.driver = driver or AmplifierDriver(bus.can.driver, gate.count_slew_max)
         self.gate = TransmitGate(gate)
         self.faults: list[str] = []
         self.missed_ticks = 0

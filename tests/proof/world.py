@@ -22,13 +22,13 @@ from snapshot import Attributes, Bases, Snapshot
 
 from hil.bus.clock import Lockstep
 from hil.node.amplifier import AmplifierNode, NmtState
-from hil.node.emergency import FrameErrors
-from pkxyz_ctrl.can import start_sequence, startup
+from pkxyz_ctrl.can import startup
 from pkxyz_ctrl.can.codec import Counts, ProcessCodec
+from pkxyz_ctrl.can.driver import AmplifierDriver
 from pkxyz_ctrl.can.driver_config import DriverConfig
 from pkxyz_ctrl.can.frame import Frame
 from pkxyz_ctrl.can.sdo import SdoStep
-from pkxyz_ctrl.can.start_sequence import DriverState
+from pkxyz_ctrl.can.start_sequence import DriverState, StartSequence
 from pkxyz_ctrl.config.bus import BusConfig
 from pkxyz_ctrl.config.files import load
 from pkxyz_ctrl.loop.controller import Controller, StartUpError
@@ -136,9 +136,6 @@ class World:
     """One state of the composition at a time; see the module."""
 
     def __init__(self, configuration: Configuration, attributes: Attributes | None = None) -> None:
-        FrameErrors.HOLD_US = 30_000
-        start_sequence.survey = startup.survey if configuration.whole_dialogue else _few_questions
-        start_sequence.plan = startup.plan if configuration.whole_dialogue else _few_writes
         self.configuration = configuration
         bus = _bus(configuration)
         assert bus.can is not None
@@ -154,11 +151,13 @@ class World:
         self.received: deque[Frame] = deque()  # by the controller's port, not read yet
         self.held: tuple[Held, ...] = ()
         self.plant = Plant(self)
-        self.controller = Controller(self.law, bus, gate, self._from_controller)
-        self.controller.driver.sense.record["syncs_uncountable"] = 4
+        few = {} if configuration.whole_dialogue else {"survey": _few_questions, "plan": _few_writes}
+        amplifier = AmplifierDriver(driver, STEP, StartSequence(driver, STEP, **few))
+        amplifier.sense.record["syncs_uncountable"] = 4
+        self.controller = Controller(self.law, bus, gate, self._from_controller, driver=amplifier)
         self.node = AmplifierNode(
             NODE_ID, self.clock, self.wire.append, self.plant, EDS,
-            turnaround_us=TURNAROUND_US, fd=driver.fd, protection=driver.protection,
+            turnaround_us=TURNAROUND_US, fd=driver.fd, protection=driver.protection, error_hold_us=30_000,
         )  # fmt: skip
         self._codecs = {DRIVE: ProcessCodec(DRIVE, True), SENSE: ProcessCodec(SENSE, True)}
         self.faults_left = configuration.faults
