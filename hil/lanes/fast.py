@@ -33,6 +33,22 @@ def runner_of(law: Records) -> RunBlock:
 
 
 @njit(cache=True, error_model="numpy")
+def exchange(
+    plant_params: Records,
+    plant_state: Records,
+    sample_us: int,
+    due: NDArray[np.int32],
+    row: np.void,
+    sense_count: NDArray[np.int32],
+) -> None:
+    """The plant at a sample: the truth into ``row``, drive counts ``due`` (3,) to the combs, sense counts (3,) out."""
+    kernels.advance(plant_params, plant_state, sample_us - plant_state[0]["t_us"])
+    observe(plant_params[0], plant_state[0], row)
+    kernels.drive(plant_params, plant_state, due)
+    kernels.sample(plant_params, plant_state, sense_count)
+
+
+@njit(cache=True, error_model="numpy")
 def run_block(
     law: np.void,
     memory: np.void,
@@ -52,10 +68,7 @@ def run_block(
     seen, row = memory[0]["input"], memory[0]["row"]
     due = memory[0]["tick"]["count"][law[0]["tick"]["delay_periods"] - 1]
     for i in range(count):
-        kernels.advance(plant_params, plant_state, sample_us[i] - plant_state[0]["t_us"])
-        observe(plant_params[0], plant_state[0], row)
-        kernels.drive(plant_params, plant_state, due)
-        kernels.sample(plant_params, plant_state, seen["sense_count"])
+        exchange(plant_params, plant_state, sample_us[i], due, row, seen["sense_count"])
         cycle(law, memory, reference)
         rows[i] = row
 
@@ -72,12 +85,9 @@ def run_block_in_steps(
     count: int,
 ) -> None:
     """``run_block`` with ``period`` in place of the cycle, a tick at a time."""
-    seen, row, state = memory[0]["input"], memory[0]["row"], plant_state[0]
+    seen, row = memory[0]["input"], memory[0]["row"]
     due = memory[0]["tick"]["count"][law[0]["tick"]["delay_periods"] - 1]
     for i in range(count):
-        kernels.advance(plant_params, plant_state, sample_us[i] - state["t_us"])
-        observe(plant_params[0], state, row)
-        kernels.drive(plant_params, plant_state, due)
-        kernels.sample(plant_params, plant_state, seen["sense_count"])
+        exchange(plant_params, plant_state, sample_us[i], due, row, seen["sense_count"])
         period(law, memory, reference)
         rows[i] = row

@@ -86,8 +86,7 @@ class Setup:
         """One that has seen nothing yet; None for a run that doesn't learn."""
         if self.learning is None:
             return None
-        limits, period_us = self.controller.limits, self.bus.period_us
-        drive = DriveLimits(limits.voltage_max_v, limits.slew_max_v_per_s, period_us)
+        period_us, drive = self.bus.period_us, DriveLimits.of(self.controller, self.bus)
         return Learner(
             self.learning,
             timetable(self.trajectory, period_us),

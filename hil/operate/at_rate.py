@@ -131,9 +131,7 @@ def operate(setup: Setup, settings: Settings, name: str, files: dict[str, str], 
 
 
 def _session_of(setup: Setup, settings: Settings, rig: WallRig, memory: StageMemory) -> Session:
-    limits = setup.controller.limits
-    drive = DriveLimits(limits.voltage_max_v, limits.slew_max_v_per_s, setup.bus.period_us)
-    reach = Reach(Stage(setup.stage), drive)
+    reach = Reach(Stage(setup.stage), DriveLimits.of(setup.controller, setup.bus))
     rehearse(reach, settings)
     return Session(rig.controller, reach, settings, memory.writer("answers").write)
 

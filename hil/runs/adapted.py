@@ -63,9 +63,8 @@ def begun_with(
     start = _read(path, stage)
     numbers = plain(controller.adaptation) | {"start": plain(start)}
     begun = controller.model_copy(update={"adaptation": parse(numbers, type(controller.adaptation), str(path))})
-    drive = DriveLimits(controller.limits.voltage_max_v, controller.limits.slew_max_v_per_s, bus.period_us)
     try:
-        check_against(Stage(calibrated(stage, start.values)), trajectory, drive)
+        check_against(Stage(calibrated(stage, start.values)), trajectory, DriveLimits.of(controller, bus))
     except TrajectoryError as error:
         raise ConfigError(f"{path}: the device that it describes cannot follow: {error}") from None
     return begun

@@ -114,7 +114,7 @@ class Scenario:
         here = belongs(self.trajectory, self.stage, self.controller, self.bus)
         stored = stored_for(self.config.learning, self.stored_file, here)
         if stored is not None:
-            follows = partial(within_limits, Stage(self.stage), drive=_drive_limits(self.controller, self.bus))
+            follows = partial(within_limits, Stage(self.stage), drive=DriveLimits.of(self.controller, self.bus))
             cutoff_hz, period_us = self.config.learning.cutoff_hz, self.bus.period_us
             try:
                 require_followed(stored, cutoff_hz, self.trajectory, period_us, follows)
@@ -212,7 +212,7 @@ def _resolved(
             trajectory = _held_trajectory(
                 scenario, source.parent, held.sha256
             )  # its run may have been shorter, on purpose
-        check_against(Stage(parts["stage"]), trajectory, _drive_limits(parts["controller"], parts["bus"]))
+        check_against(Stage(parts["stage"]), trajectory, DriveLimits.of(parts["controller"], parts["bus"]))
     except TrajectoryError as error:
         raise TrajectoryError(f"{source}: {error}") from None
     file = scenario.learning.file if scenario.learning is not None else None
@@ -254,10 +254,6 @@ def _held_trajectory(scenario: ScenarioConfig, folder: Path, sha256: dict[str, s
         if segment.source_sha256 != sha256.get(f"reference.{n}"):
             raise ConfigError(f"{folder}: reference.{n}: its table is not the one of the run")
     return trajectory
-
-
-def _drive_limits(controller: ControllerConfig, bus: BusConfig) -> DriveLimits:
-    return DriveLimits(controller.limits.voltage_max_v, controller.limits.slew_max_v_per_s, bus.period_us)
 
 
 def _part(kind: str, name_or_path: str, model: type[BaseModel], folder: Path) -> BaseModel:

@@ -71,10 +71,10 @@ class Planner:
 
     def __init__(self, stage: str, controller: str, bus: str) -> None:
         config = load("stages", stage, StageConfig)
-        limits = load("controllers", controller, ControllerConfig).limits
-        self.period_us = load("buses", bus, BusConfig).period_us
+        on_bus = load("buses", bus, BusConfig)
+        self.period_us = on_bus.period_us
         self.stage = Stage(config)
-        self._drive = DriveLimits(limits.voltage_max_v, limits.slew_max_v_per_s, self.period_us)
+        self._drive = DriveLimits.of(load("controllers", controller, ControllerConfig), on_bus)
         self._reach = Reach(self.stage, self._drive)
 
     def body(self, position_m: Array) -> dict[str, list[list[float]]]:

@@ -1,11 +1,13 @@
 """Can the device follow this reference? Asked before anything moves."""
 
 import math
-from typing import Final, NamedTuple
+from typing import Final, NamedTuple, Self
 
 import numpy as np
 from numpy.typing import NDArray
 
+from pkxyz_ctrl.config.bus import BusConfig
+from pkxyz_ctrl.config.controller import ControllerConfig
 from pkxyz_ctrl.stage import Stage, StageDomainError
 from pkxyz_ctrl.trajectory import TimedSegment, Trajectory, TrajectoryError
 from pkxyz_ctrl.trajectory.comb_forces import ROUNDING_M, ROUNDING_N, comb_forces
@@ -42,6 +44,11 @@ class DriveLimits(NamedTuple):
     slew_max_v_per_s: float
     """most that a commanded voltage may change, as a rate; a period gets its share"""
     period_us: int
+
+    @classmethod
+    def of(cls, controller: ControllerConfig, bus: BusConfig) -> Self:
+        """Those of a controller file, on a bus."""
+        return cls(controller.limits.voltage_max_v, controller.limits.slew_max_v_per_s, bus.period_us)
 
 
 def check_against(stage: Stage, trajectory: Trajectory, drive: DriveLimits | None = None) -> None:

@@ -40,9 +40,7 @@ class OperatedRig:
         self.lockstep = LockstepRig(self.setup)
         self.controller = self.lockstep.controller
         self.period_us = self.setup.bus.period_us
-        limits = self.setup.controller.limits
-        drive = DriveLimits(limits.voltage_max_v, limits.slew_max_v_per_s, self.period_us)
-        self.reach = Reach(Stage(self.setup.stage), drive)
+        self.reach = Reach(Stage(self.setup.stage), DriveLimits.of(self.setup.controller, self.setup.bus))
         self.answers: list[tuple[int, State, str]] = []
         self.session = Session(self.controller, self.reach, settings or Settings(), self._note)
         self.rows: list[Any] = []
