@@ -5,8 +5,8 @@ from datetime import UTC, datetime
 import can
 import pytest
 from conformance_defects import DEFECTS, EverySenseLate, SelfStarting, StillPlant, WaitsOnce
-from defective_frames import NoHeartbeatConsumer
-from defective_objects import Silent
+from defective.frames import NoHeartbeatConsumer
+from defective.objects import Silent
 
 from hil.bus.clock import Lockstep
 from hil.bus.published_wires import publish

@@ -4,7 +4,7 @@ import random
 from dataclasses import replace
 
 import pytest
-from defective_frames import IgnoresCrc, KeepsVoltageInStopped
+from defective.frames import IgnoresCrc, KeepsVoltageInStopped
 from fuzz import TARGETS, ViolationError, fuzz_frames, fuzz_gate, fuzz_node
 from fuzz_documents import fuzz_documents
 

@@ -1,15 +1,14 @@
 """All amplifiers with one defect each, and some that only look so."""
 
-import defective_frames
-import defective_objects
-from defective_objects import _OtherObjects
+from defective import frames, objects
+from defective.objects import _OtherObjects
 
 from hil.node.amplifier import AmplifierNode, NmtState
 from hil.node.object_dictionary import Abort, SdoAbortError
 
 DEFECTS: tuple[type[AmplifierNode], ...] = tuple(
     found
-    for module in (defective_objects, defective_frames)
+    for module in (objects, frames)
     for found in vars(module).values()
     if isinstance(found, type) and issubclass(found, AmplifierNode) and found is not AmplifierNode
     if not found.__name__.startswith("_")

@@ -1,0 +1,1 @@
+"""Amplifiers with one defect each."""
