@@ -1,5 +1,6 @@
 """The command ``pkxyz``. Everything heavy is loaded with the command that needs it."""
 
+import gc
 import os
 import signal
 import sys
@@ -54,6 +55,9 @@ app = typer.Typer(
 
 def main() -> NoReturn:
     """Entry point: runs the command line and turns what can go wrong into one line each and an exit code."""
+    gc.set_threshold(
+        50_000
+    )  # thousands of classes come in, and none of them goes: looking for it is a tenth of a start
     os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")  # small matrices: threads would only wait for each other
     code = 0
     try:

@@ -1,6 +1,7 @@
 """Shared by all tests: kernels from the cache that is named after their sources, and the same examples in every run."""
 
 import os
+from collections.abc import Iterator
 
 os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")  # small matrices: on a busy machine threads only wait for each other
 
@@ -8,9 +9,18 @@ import pytest
 from hypothesis import settings
 
 import pkxyz_ctrl  # noqa: F401
+from hil.pictures import aside
 
 settings.register_profile("same every time", derandomize=True)
 settings.load_profile("same every time")
+
+
+@pytest.fixture(autouse=True, scope="session")
+def pictures_in_place() -> Iterator[None]:
+    """A command that is called within a test draws within it: the cores are busy with other tests."""
+    with pytest.MonkeyPatch.context() as patched:
+        patched.setattr(aside, "cores", lambda: 1)
+        yield
 
 
 def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:

@@ -21,6 +21,7 @@ from hil.runs.scenario import ScenarioConfig
 from hil.studies.tune.search import SearchConfig
 from pkxyz_ctrl.config.bus import BusConfig
 from pkxyz_ctrl.config.controller import ControllerConfig
+from pkxyz_ctrl.config.described import meaning
 from pkxyz_ctrl.config.files import names
 from pkxyz_ctrl.config.stage import StageConfig
 from pkxyz_ctrl.design.margins.tolerances import Tolerances
@@ -146,7 +147,7 @@ def _fields(model: type[BaseModel], prefix: str) -> Any:
         key = f"{prefix}{name}"
         if len(inner) == 1:
             listed = "[]" if get_origin(_without_none(field.annotation)) is tuple else ""
-            about = field.description or (inspect.getdoc(inner[0]) if inner[0].__doc__ else "") or ""
+            about = meaning(model, name) or (inspect.getdoc(inner[0]) if inner[0].__doc__ else "") or ""
             yield f"**[{key}{listed}]**", "", "", _default(field), _escape(about)
             yield from _fields(inner[0], f"{key}{listed}.")
         elif inner:
@@ -156,12 +157,12 @@ def _fields(model: type[BaseModel], prefix: str) -> Any:
                 "",
                 "",
                 _default(field),
-                f"one of {', '.join(kinds)}. {_escape(field.description or '')}",
+                f"one of {', '.join(kinds)}. {_escape(meaning(model, name))}",
             )
             for m in inner:
                 yield from _fields(m, f"{key}[{_kind(m)}].")
         else:
-            yield f"`{key}`", _unit(name), _range(field), _default(field), _escape(field.description or "")
+            yield f"`{key}`", _unit(name), _range(field), _default(field), _escape(meaning(model, name))
 
 
 def _kind(model: type[BaseModel]) -> str:

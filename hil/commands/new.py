@@ -134,11 +134,12 @@ def _model(kind: Kind) -> "type[BaseModel]":
 
 def _meaning(model: "type[BaseModel]", table: str, kind: str | None, key: str) -> str:
     """The first sentence of a field's description; empty where the model has none."""
+    from pkxyz_ctrl.config.described import meaning
     from pkxyz_ctrl.config.files import models_at
 
     location = tuple(part for part in (*table.split("."), kind) if part)
-    found = [m.model_fields[key].description for m in models_at(location, model) if key in m.model_fields]
-    words = " ".join((found[0] or "").split()) if found else ""
+    found = [meaning(m, key) for m in models_at(location, model) if key in m.model_fields]
+    words = " ".join(found[0].split()) if found else ""
     return words.partition(". ")[0].rstrip(".")
 
 

@@ -9,6 +9,7 @@ import typer
 
 from hil.commands.run import Adapted, Apply, Learn, Refresh, ReplaceEarlier, learning_of
 from hil.lanes.lane import Lane
+from hil.pictures.aside import Aside
 from hil.screen.choices import InProcessLane, require_simulated
 from hil.screen.figures import error_lines, lacking_lines, where_to_read
 from hil.screen.first_run import say_if_compiling
@@ -17,6 +18,7 @@ from hil.screen.terminal import bad, faint, good, plain_table, say, screen
 from pkxyz_ctrl.config.files import ConfigError, find
 
 if TYPE_CHECKING:
+    from hil.runs.scenario import Scenario
     from hil.runs.summary import Summary
 
 
@@ -47,41 +49,49 @@ def sil(
     """
     lane = Lane(in_process.value)
     find("scenarios", scenario)  # a typo is said before anything is compiled
-    say_if_compiling(quiet=as_json)
-    from hil.faults.fault import parse
-    from hil.runs.scenario import load_scenario
+    with Aside() as pictures:
+        say_if_compiling(quiet=as_json)
+        from hil.faults.fault import parse
+        from hil.runs.scenario import load_scenario
 
-    faults = [parse(text) for text in fault or ()]
-    learning = learning_of(learn, apply, refresh)
-    loaded = load_scenario(
-        scenario, seed=seed, stage=stage, plant=plant, controller=controller, bus=bus, faults=faults,
-        learning=learning, adapted=adapted,
-    )  # fmt: skip
-    from hil.pictures.run import draw
+        faults = [parse(text) for text in fault or ()]
+        learning = learning_of(learn, apply, refresh)
+        loaded = load_scenario(
+            scenario, seed=seed, stage=stage, plant=plant, controller=controller, bus=bus, faults=faults,
+            learning=learning, adapted=adapted,
+        )  # fmt: skip
+        require_simulated(loaded.bus, "sil")
+        summary, folder = _ran(loaded, lane, out, replace_earlier, pictures, quiet=as_json)
+    if as_json:
+        print(json.dumps(summary.as_json() | {"folder": str(folder)}, allow_nan=False))
+    else:
+        _show(summary, folder)
+    raise typer.Exit(130 if summary.interrupted else 0 if summary.ok else 1)
+
+
+def _ran(
+    loaded: "Scenario", lane: Lane, out: Path | None, replace_earlier: bool, pictures: Aside, *, quiet: bool
+) -> "tuple[Summary, Path]":
+    """The run into its folder, with its picture."""
     from hil.recording.recording import RecordingError
     from hil.runs.run import require_bus, run_into
     from hil.runs.run_folder import RunFolder, next_free
     from pkxyz_ctrl.design.model.design_error import DesignError
     from pkxyz_ctrl.loop.controller import StartUpError
 
-    require_simulated(loaded.bus, "sil")
     require_bus(loaded, lane)
     path = out if out is not None else next_free(Path("runs"), loaded.config.name, lane)
     folder = RunFolder(path, replace=replace_earlier)
     try:
-        with progress_bar(f"{loaded.config.name}, {lane} lane", quiet=as_json) as tell:
+        with progress_bar(f"{loaded.config.name}, {lane} lane", quiet=quiet) as tell:
             summary = run_into(folder, loaded, lane, tell)
-        draw(folder, summary)
+        pictures.draw(folder, summary)
     except RecordingError as error:
         raise ConfigError(str(error)) from None
     except (StartUpError, DesignError) as error:
         print(f"pkxyz: {error}", file=sys.stderr)
         raise typer.Exit(1) from None
-    if as_json:
-        print(json.dumps(summary.as_json() | {"folder": str(folder.path)}, allow_nan=False))
-    else:
-        _show(summary, folder.path)
-    raise typer.Exit(130 if summary.interrupted else 0 if summary.ok else 1)
+    return summary, folder.path
 
 
 def _show(summary: "Summary", folder: Path) -> None:

@@ -8,7 +8,7 @@ forgives an offset and a slow drift of whole holds.
 import math
 from collections.abc import Mapping
 from dataclasses import asdict, dataclass
-from typing import Any, Protocol
+from typing import TYPE_CHECKING, Any, Protocol
 
 import numpy as np
 from numpy.typing import NDArray
@@ -16,7 +16,9 @@ from numpy.typing import NDArray
 from pkxyz_ctrl.loop.row import ROW
 from pkxyz_ctrl.loop.warnings import Warnings
 from pkxyz_ctrl.safety.modes import Mode
-from pkxyz_ctrl.trajectory import Trajectory
+
+if TYPE_CHECKING:
+    from pkxyz_ctrl.trajectory import Trajectory
 
 METRICS: dict[str, str] = {
     "rms_error_nm": "RMS error while scanning, each axis",
@@ -114,7 +116,7 @@ class _Sums:
 class Metrics:
     """Accumulates the figures of one run; holds sums, never rows."""
 
-    def __init__(self, trajectory: Trajectory, period_us: int) -> None:
+    def __init__(self, trajectory: "Trajectory", period_us: int) -> None:
         self._period_us = period_us
         self._scans = [s.scan_us for s in trajectory.segments if s.scan_us]
         self._stills = [s.still_us for s in trajectory.segments if s.still_us]

@@ -3,13 +3,15 @@
 import dataclasses
 from collections.abc import Mapping
 from dataclasses import dataclass, field
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 from hil.lanes.lane import Lane
 from hil.runs.metrics import RowFigures, Verdict, evaluate
-from hil.runs.period_errors import PeriodFigures
-from hil.runs.scenario import Scenario
 from hil.runs.versions import versions
+
+if TYPE_CHECKING:  # who draws a run loads none of it
+    from hil.runs.period_errors import PeriodFigures
+    from hil.runs.scenario import Scenario
 
 _AT_RATE = ("refused_frames", "dropped_frames", "blocked_frames", "lost_rows", "lateness_us")
 
@@ -46,7 +48,7 @@ class LoopFigures:
 class Learnt:
     """What learning has to say of a run."""
 
-    figures: PeriodFigures
+    figures: "PeriodFigures"
     mode: str
     period_ticks: int
     cutoff_hz: float
@@ -102,7 +104,7 @@ class Summary:
 
 
 def summarise(
-    scenario: Scenario, lane: Lane, digest: str, rows: RowFigures, loop: LoopFigures, learnt: Learnt | None = None,
+    scenario: "Scenario", lane: Lane, digest: str, rows: RowFigures, loop: LoopFigures, learnt: Learnt | None = None,
     *, interrupted: bool,
 ) -> Summary:  # fmt: skip
     """Figures and the verdicts on the scenario's checks."""
@@ -117,7 +119,7 @@ def summarise(
     )  # fmt: skip
 
 
-def _untold(scenario: Scenario, loop: LoopFigures) -> tuple[Verdict, ...]:
+def _untold(scenario: "Scenario", loop: LoopFigures) -> tuple[Verdict, ...]:
     """What fails a run though the scenario says nothing of it."""
     config = scenario.config
     found: dict[str, int | None] = {"lost_rows": loop.lost_rows}

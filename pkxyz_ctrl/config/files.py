@@ -32,9 +32,7 @@ class ConfigError(ValueError):
 class FrozenModel(BaseModel):
     """Base of every configuration model: immutable, no unknown keys, no NaN, no silent conversion."""
 
-    model_config = ConfigDict(
-        frozen=True, extra="forbid", allow_inf_nan=False, strict=True, use_attribute_docstrings=True
-    )
+    model_config = ConfigDict(frozen=True, extra="forbid", allow_inf_nan=False, strict=True)
 
 
 Model = TypeVar("Model", bound=BaseModel)

@@ -8,6 +8,8 @@ ALLOWED = {
     ("hil/__init__.py", "import_module"): "names of the public interface, from a table in that file",
     ("hil/screen/lazy_commands.py", "import_module"): "names of commands, from a table in hil/cli.py",
     ("hil/studies/spread/workers.py", "pickle"): "between this program's own processes and the cluster that was named",
+    ("hil/pictures/aside.py", "subprocess"): "this program: the process that draws",
+    ("hil/pictures/aside.py", "pickle"): "from this program to that process, by a pipe of their own",
     ("hil/studies/latency.py", "subprocess"): "cyclictest: from PATH, or the path that was given on the command line",
     ("hil/bench/startup.py", "subprocess"): "this program, timed",
     ("hil/server/serving.py", "subprocess"): "this program: the loop and the plant, in processes of their own",
