@@ -1,13 +1,18 @@
-"""The matrix as a picture: a row for each fault, a column for each law, the ticks until it was noticed."""
+"""Faults as pictures: the matrix, with a row for each fault and a column for each law, and a soak."""
 
 from collections.abc import Sequence
 from pathlib import Path
+from typing import TYPE_CHECKING
 
+import numpy as np
 from matplotlib.patches import Patch, Rectangle
 
-from hil.pictures.style import BAD, GOOD, SMALL_PT, TINY_PT, WASH, dress, save, sheet
+from hil.pictures.style import BAD, BLUE, FAINT, GOOD, SMALL_PT, TINY_PT, WASH, dress, legend, save, sheet
 from hil.studies.faults.matrix import Case
 from hil.studies.faults.outcome import Outcome
+
+if TYPE_CHECKING:
+    from hil.studies.soak import Soaked
 
 _SHADES = ((5, GOOD), (12, "#5aa469"), (50, "#a3c585"), (10_000, "#e4cf7b"))
 _MEANING = "number: ticks from the fault to the decision to go to 0 V"
@@ -64,3 +69,20 @@ def _colour(outcome: Outcome) -> str:
     if outcome.ticks is None:
         return WASH
     return next(colour for limit, colour in _SHADES if outcome.ticks <= limit)
+
+
+def draw_soak(soaked: "Soaked", path: Path) -> None:
+    """A soak: memory, and what was decided, minute by minute."""
+    parts = np.arange(1, len(soaked.memory_mb) + 1)
+    figure = sheet(7.2, 4.2)
+    memory, decided = figure.subplots(2, 1, sharex=True)
+    memory.plot(parts, soaked.memory_mb, color=BLUE, marker=".")
+    memory.set_ylim(0, 1.15 * max(soaked.memory_mb, default=1.0))
+    dress(memory, y_label="resident memory (MB)")
+    decided.step(parts, soaked.faults_each, where="mid", color=FAINT, label="faults that began")
+    decided.step(parts, soaked.decisions_each, where="mid", color=BAD, label="decisions")
+    decided.step(parts, soaked.returns_each, where="mid", color=BLUE, label="back to tracking")
+    decided.set_ylim(bottom=0)
+    dress(decided, f"recording, {soaked.minutes_each:g} min of stage time each", "in each recording")
+    legend(decided, "lower left", columns=3)
+    save(figure, path)

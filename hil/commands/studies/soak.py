@@ -41,7 +41,7 @@ def soak(
             with progress_bar("soak", quiet=as_json) as tell:
                 soaked = soaking.soak(60.0 * minutes, seed, law, folder, keep=keep, on_progress=tell)
             if out is not None:
-                from hil.pictures.soak import draw_soak
+                from hil.pictures.faults import draw_soak
 
                 text = json.dumps(soaking.as_json(soaked), indent=1) + "\n"
                 (out / "soak.json").write_text(text, encoding="utf-8")
