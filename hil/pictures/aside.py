@@ -11,7 +11,6 @@ import pickle
 import subprocess
 import sys
 from collections.abc import Callable
-from io import BytesIO
 from types import TracebackType
 from typing import TYPE_CHECKING, Self
 
@@ -88,7 +87,7 @@ def _loaded() -> Callable[..., None]:
     frame_duration_ns(Frame(0x080, b"\x01"), 1_000_000, 5_000_000)
     figure = sheet(1, 1, "x")
     figure.add_subplot(projection="3d")
-    figure.savefig(BytesIO())
+    figure.canvas.draw()
     return draw_report
 
 
