@@ -129,12 +129,14 @@ class Session:
         if verb in (Verb.MOVE, Verb.JOG) and running is not None and running.verb not in (Verb.MOVE, Verb.JOG):
             raise RefusedError(f"{running.verb.name} (command {running.id}) is running: abort it, or wait for its end")
         job = _Job(command_id, verb, self._steps_of(verb, command))
-        if verb in (Verb.PAUSE, Verb.RESUME):
-            self._beside = self._begun(job)
-            return
         begun = self._begun(job)  # raises where it is refused: then what runs goes on
+        taken = f"{verb.name} (command {command_id}) has taken its place"
+        self._end_beside(taken)
+        if verb in (Verb.PAUSE, Verb.RESUME):
+            self._beside = begun
+            return
         if running is not None:
-            self._end(running, f"{verb.name} (command {command_id}) has taken its place")
+            self._end(running, taken)
         self._job = begun
 
     def _steps_of(self, verb: Verb, command: np.void) -> Steps:
@@ -243,6 +245,11 @@ class Session:
         if job.verb is Verb.PATH:
             self.stage.path = None
 
+    def _end_beside(self, why: str) -> None:
+        if self._beside is not None:
+            self._end(self._beside, why)
+            self._beside = None
+
     def _forget_path(self) -> None:
         """A path that ended, or could not be followed: stand where it stands."""
         self.stage.path = None
@@ -278,7 +285,7 @@ class Session:
             return
         if self._job is not None:
             self._end(self._job, "the server has fallen silent")
-        self._beside = None
+        self._end_beside("the server has fallen silent")
         self._job = _Job(0, Verb.ABORT, self._halted_by_silence())
 
     def _halted_by_silence(self) -> Steps:

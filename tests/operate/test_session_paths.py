@@ -129,3 +129,47 @@ def test_a_server_that_falls_silent_stops_the_path_within_100_ms(on_silence):
     recorded = rig.play(script())
     assert not rig.controller.faults
     assert np.abs(np.diff(tracked(recorded)["reference_m"], 2, axis=0)).max() / PERIOD_S**2 < 0.8
+
+
+@pytest.mark.parametrize("after", [Verb.RESUME, Verb.PAUSE, Verb.STOP, Verb.ABORT])
+def test_a_pause_that_something_else_takes_the_place_of_comes_to_an_end(after):
+    rows, start = raster_rows()
+    rig = OperatedRig()
+    Feeder(rig, 1, rows)
+
+    def script() -> Script:
+        yield from rig.switched_on()
+        path = rig.give(Verb.PATH, path=1, rows=len(rows), start_m=start)
+        while rig.session.state["progress"][0] < 0.3:
+            yield
+        pause = rig.give(Verb.PAUSE)
+        yield from rig.wait_s(0.001)
+        assert rig.state_of(pause) is State.RUNNING  # it takes some 20 ms to stand
+        other = rig.give(after)
+        yield from rig.until_final(other)
+        assert rig.state_of(pause) is State.ABORTED
+        assert rig.words_of(pause) == f"{after.name} (command {other}) has taken its place"
+        if after is Verb.RESUME:
+            assert (yield from rig.until_final(path)) is State.DONE
+
+    rig.play(script())
+
+
+def test_a_pause_comes_to_an_end_when_the_server_falls_silent():
+    rows, start = raster_rows()
+    rig = OperatedRig()
+    Feeder(rig, 1, rows)
+
+    def script() -> Script:
+        yield from rig.switched_on()
+        rig.give(Verb.PATH, path=1, rows=len(rows), start_m=start)
+        while rig.session.state["progress"][0] < 0.3:
+            yield
+        rig.session.server_says(1)  # for the last time
+        yield from rig.wait_s(rig.session.settings.silence_s - 0.002)
+        pause = rig.give(Verb.PAUSE)
+        yield from rig.wait_s(0.1)
+        assert rig.state_of(pause) is State.ABORTED
+        assert rig.words_of(pause) == "the server has fallen silent"
+
+    rig.play(script())
