@@ -57,7 +57,7 @@ class Client:
 
     def show(self, block: Block) -> None:
         """Queue a block of telemetry, or leave it out and count its rows."""
-        if self._blocks >= _BLOCKS_MOST:
+        if self._blocks >= _BLOCKS_MOST or self.said.full():
             self.lost += len(block)
             return
         self._blocks += 1
@@ -82,6 +82,7 @@ class Desk:
         self.last_fault = ""
         self._planner, self._plan = planner, plan
         self._feeding: Feeding | None = None
+        self._asked_for: Feeding | None = None  # fed once the loop has begun it; another may be running
         self._jog_id = 0
         self._jog_direction = [0.0, 0.0, 0.0]
         self._numbers = 0
@@ -135,7 +136,7 @@ class Desk:
             self._command(client, what, message, tag)
         elif what == "stop":
             self.link.stop()
-            self._feeding = None
+            self._feeding = self._asked_for = None
             client.tell(_answer(tag, "stop", "done", "the loop was told to stop"))
         elif what == "subscribe":
             self._subscribe(client, message)
@@ -230,9 +231,9 @@ class Desk:
     async def _send_path(self, client: Client, message: dict[str, Any], tag: Any) -> None:
         path = await self._planned(message)
         command_id = self.link.next_id()
-        client.tags[command_id] = tag
-        self._feeding = Feeding(self.link, command_id, path)
         self.link.command(Verb.PATH, command_id, path=command_id, rows=path.rows, start_m=path.start_m)
+        client.tags[command_id] = tag
+        self._asked_for = Feeding(self.link, command_id, path)
         self._tell("path", command_id, State.ACCEPTED, f"{path.name}: {path.duration_s:.3g} s")
 
     # -- what the loop says --------------------------------------------------------------------------------------------
@@ -257,6 +258,10 @@ class Desk:
             return
         if answer.verb == "clear" and answer.state is State.DONE:
             self.last_fault = ""
+        if self._asked_for is not None and self._asked_for.number == answer.id:
+            if answer.state not in FINAL:
+                self._feeding = self._asked_for
+            self._asked_for = None
         if answer.state in FINAL:
             if self._feeding is not None and self._feeding.number == answer.id:
                 self._feeding = None

@@ -309,3 +309,49 @@ def test_stops_do_not_use_up_the_room_for_commands(rig):
         assert answer["state"] == "done", answer
 
     rig.play(script())
+
+
+def test_a_path_that_is_refused_takes_no_rows_from_the_one_that_is_followed(rig):
+    """Of one that is longer than what is sent ahead."""
+    client = rig.desk.enter()
+    limits = {"velocity_max_m_per_s": 0.5e-3, "acceleration_max_m_per_s2": 0.5, "jerk_max_m_per_s3": 300.0}
+    segments = [
+        {"kind": "move", "to_m": MIDDLE_M, **limits},
+        {"kind": "circle", "radius_m": 1e-6, "frequency_hz": 20.0, "turns": 24, "lead_s": 0.1},
+    ]
+
+    def script() -> Script:
+        yield from switched_on(rig, client)
+        rig.ask(client, do="path", tag="first", segments=segments)
+        while rig.session.state["progress"][0] < 0.02:
+            yield
+        refused = yield from rig.finish(client, do="path", segments=segments)
+        assert refused["state"] == "refused"
+        assert "PATH" in refused["words"]
+        rig.heard(client)
+        while rig.session.state["activity"] in (Activity.MOVING, Activity.SCANNING):
+            yield
+        assert rig.session.state["activity"] == Activity.HOLDING
+        yield from rig.wait_s(0.05)
+        answers = [a for a in rig.heard(client)["answer"] if a["tag"] == "first"]
+        assert [a["state"] for a in answers] == ["done"], answers
+
+    rig.play(script())
+
+
+def test_a_client_that_takes_nothing_ends_nobody_elses_telemetry(rig):
+    stalled, other = rig.desk.enter(), rig.desk.enter()
+
+    def script() -> Script:
+        yield from rig.wait_s(0.01)
+        for _ in range(_SAID_MOST + 5):
+            rig.desk.tell_status()
+            rig.heard(other)
+        for client in (stalled, other):
+            rig.ask(client, do="subscribe", fields=["tick"])
+        yield from rig.wait_s(0.01)
+        rig.desk.show_telemetry(2000)
+        assert len(rig.heard(other)["bytes"]) == 1
+        assert stalled.lost > 40
+
+    rig.play(script())
