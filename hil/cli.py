@@ -21,6 +21,7 @@ COMMANDS = {
     "faults": ("hil.commands.studies.faults:faults", "Break everything once, under each law."),
     "soak": ("hil.commands.studies.soak:soak", "Half an hour under random faults."),
     "replay": ("hil.commands.replay:replay", "A recording once more through the tick."),
+    "recording": ("hil.commands.recording:recording", "A recording as CSV, MDF, HDF5 or a map."),
     "run": ("hil.commands.run:run", "Control an amplifier at rate."),
     "plant": ("hil.commands.run:plant", "Serve amplifier and plant for run."),
     "serve": ("hil.commands.serve:serve", "Operate a stage: page and clients."),
