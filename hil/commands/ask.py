@@ -10,9 +10,9 @@ import typer
 from pkxyz_ctrl.config.files import ConfigError
 
 _PLAIN = (
-    "home", "enable", "disable", "pause", "resume", "abort", "stop", "release", "park", "clear", "auto-zero",
+    "home", "enable", "disable", "pause", "resume", "abort", "stop", "release", "park", "clear", "auto-zero", "save",
 )  # fmt: skip
-_FREE = ("stop", "release", "status")
+_FREE = ("stop", "release", "status", "save")
 
 
 def ask(

@@ -2,6 +2,7 @@
 
 import json
 import sys
+from pathlib import Path
 from typing import Annotated
 
 import typer
@@ -23,6 +24,7 @@ def serve(
         str, typer.Option(help="What becomes of a moving stage when the server falls silent: hold or park.")
     ] = "hold",
     silence_s: SilentFor = 0.06,
+    saves: Annotated[Path, typer.Option(help="Folder for what was around each fault.")] = Path("runs"),
     host: Annotated[str, typer.Option(help="Address to listen at. Others than this machine's can reach it then.")] = (
         "127.0.0.1"
     ),
@@ -51,7 +53,7 @@ def serve(
     def tell(url: str) -> None:
         print(json.dumps({"url": url}) if as_json else f"the stage is at {url}", flush=True)
 
-    served = Served(name, stage, controller, plant, bus, on_silence, silence_s, host, port, is_simulated, report)
+    served = Served(name, stage, controller, plant, bus, on_silence, silence_s, saves, host, port, is_simulated, report)
     raise typer.Exit(serve(served, tell))
 
 

@@ -19,6 +19,7 @@ from hil.operate.reach import Reach
 from hil.operate.session import Session
 from hil.operate.setpoints import Setpoints
 from hil.operate.settings import Settings
+from hil.operate.tick_frames import TickFrames
 from pkxyz_ctrl.can.frame import Frame
 from pkxyz_ctrl.client import place
 from pkxyz_ctrl.config.bus import CanConfig
@@ -33,17 +34,19 @@ _COMMANDS_A_TICK = 4
 
 
 class _Counted:
-    """``TakesTicks`` that counts frames; the rows go to the memory."""
+    """``TakesTicks`` that counts frames and keeps those of the tick; the rows go to the memory."""
 
     def __init__(self, can: CanConfig) -> None:
         self.frames = 0
         self.wire_ns = 0
+        self.of_tick = TickFrames()
         self._nominal = can.nominal_bitrate_bit_per_s
         self._data = can.data_bitrate_bit_per_s or can.nominal_bitrate_bit_per_s
         self._duration_ns: dict[int, int] = {}
 
     def frame(self, frame: Frame, t_us: int) -> None:
         self.frames += 1
+        self.of_tick.note(frame, t_us)
         length = len(frame.data)
         if length not in self._duration_ns:
             self._duration_ns[length] = frame_duration_ns(frame, self._nominal, self._data)
@@ -59,7 +62,7 @@ class OperatedLoop:
     def __init__(self, session: Session, memory: StageMemory, counted: _Counted) -> None:
         self._session, self._memory, self._counted = session, memory, counted
         self._controller = session.stage.controller
-        self._ticks = memory.writer("ticks")
+        self._ticks, self._frames = memory.writer("ticks"), memory.writer("frames")
         self._commands = memory.reader("commands", from_start=True)  # what was asked while the amplifier started, too
         self._path = memory.reader("path", from_start=True)
         self._head = memory.head
@@ -80,6 +83,7 @@ class OperatedLoop:
         state["frames"], state["wire_ns"] = self._counted.frames, self._counted.wire_ns
         self._tick_bytes[: ROW.itemsize] = controller.row
         self._tick["session"] = state
+        self._frames.write(self._counted.of_tick.taken(int(row["tick"])))
         self._ticks.write(self._tick_bytes)
 
     def _given(self) -> list[np.void]:

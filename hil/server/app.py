@@ -96,6 +96,7 @@ def app_of(desk: Desk, token: str, hosts: frozenset[str]) -> Starlette:
     @contextlib.asynccontextmanager
     async def lifespan(app: Starlette) -> AsyncIterator[None]:
         tasks = [asyncio.create_task(_every(period, each)) for period, each in _rounds(desk)]
+        tasks.append(asyncio.create_task(_keep_faults(desk)))
         try:
             yield
         finally:
@@ -127,6 +128,12 @@ async def _every(period_s: float, each: Callable[[], object]) -> None:
     while True:
         each()
         await asyncio.sleep(period_s)
+
+
+async def _keep_faults(desk: Desk) -> None:
+    while True:
+        await desk.keep_fault()
+        await asyncio.sleep(_STATUS_S)
 
 
 Plan = Callable[..., Awaitable[Any]]

@@ -7,6 +7,7 @@ import asyncio
 import contextlib
 import json
 from collections.abc import Awaitable, Callable
+from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -14,6 +15,7 @@ import numpy as np
 from hil.operate.commands import FINAL, State, Verb
 from hil.server.link import Answer, BusyError, Link
 from hil.server.paths import Feeding, Planner, StagePath
+from hil.server.saving import AFTER_S, BEFORE_S, NotSavedError, save
 from hil.server.status import status_of
 from pkxyz_ctrl.client.protocol import Block, packed
 from pkxyz_ctrl.config.files import ConfigError
@@ -23,7 +25,7 @@ _SAID_MOST, _BLOCKS_MOST = 400, 4
 _FIELDS = frozenset(name for name in ROW.names or () if ROW[name].base.kind in "fi")
 _AXES = ("x", "y", "z")
 _LIMITS = ("velocity_m_per_s", "acceleration_m_per_s2", "jerk_m_per_s3")
-_FREE = frozenset({"stop", "release", "subscribe", "take_control", "give_control", "preview", "body"})
+_FREE = frozenset({"stop", "release", "subscribe", "take_control", "give_control", "preview", "body", "save"})
 """What needs no control: nothing of it moves anything, or it stops what moves."""
 
 
@@ -75,8 +77,14 @@ class Client:
 class Desk:
     """``plan`` runs a function where it doesn't hold up the others."""
 
-    def __init__(self, link: Link, planner: Planner, plan: Callable[..., Awaitable[Any]]) -> None:
+    def __init__(
+        self, link: Link, planner: Planner, plan: Callable[..., Awaitable[Any]], saves: Path = Path("runs")
+    ) -> None:
+        """``saves``: where faults are kept."""
         self.link = link
+        self.saved = ""
+        """where the last fault is kept, or why it isn't"""
+        self._saves, self._fault_us = saves, -1
         self.clients: list[Client] = []
         self.holder: Client | None = None
         self.last_fault = ""
@@ -153,6 +161,9 @@ class Desk:
             newest = self.link.newest()
             target = np.zeros(3) if newest is None else newest["session"]["target_m"].copy()
             client.tell({"body": await self._plan(self._planner.body, target)})
+        elif what == "save":
+            seconds = _number(message, "seconds", 60.0)
+            client.tell(_answer(tag, "save", "done", await self._kept(min(max(seconds, 0.1), 60.0), "")))
         elif what == "path":
             await self._send_path(client, message, tag)
         else:
@@ -252,12 +263,12 @@ class Desk:
 
     def _heard(self, answer: Answer) -> None:
         if answer.is_fault:
-            self.last_fault = answer.words
+            self.last_fault, self._fault_us = answer.words, answer.t_us
             for client in self.clients:
                 client.tell({"event": {"kind": "fault", "words": answer.words, "t_us": answer.t_us}})
             return
         if answer.verb == "clear" and answer.state is State.DONE:
-            self.last_fault = ""
+            self.last_fault = self.saved = ""
         if self._asked_for is not None and self._asked_for.number == answer.id:
             if answer.state not in FINAL:
                 self._feeding = self._asked_for
@@ -268,6 +279,25 @@ class Desk:
             if answer.id == self._jog_id:
                 self._jog_id = 0
         self._tell(answer.verb, answer.id, answer.state, answer.words)
+
+    async def keep_fault(self) -> None:
+        """Save what was around a fault, once that is over."""
+        newest = self.link.newest()
+        if self._fault_us < 0 or newest is None:
+            return
+        since_s = (int(newest["row"]["t_us"]) - self._fault_us) * 1e-6
+        if since_s < AFTER_S and self.link.is_alive:
+            return
+        self._fault_us = -1
+        self.saved = await self._kept(BEFORE_S + since_s, self.last_fault)
+        for client in self.clients:
+            client.tell({"event": {"kind": "saved", "words": self.saved}})
+
+    async def _kept(self, seconds: float, why: str) -> str:
+        try:
+            return str(await self._plan(save, self.link.memory, self.link.description, seconds, why, self._saves))
+        except NotSavedError as error:
+            return str(error)
 
     def _tell(self, verb: str, command_id: int, state: State, words: str) -> None:
         if state in FINAL:
@@ -287,7 +317,12 @@ class Desk:
             self._look_at_load(newest)
             status = status_of(newest, self.link.description, self._load) | {"alive": self.link.is_alive}
             status["range_m"] = self._ranges_at(newest["session"]["target_m"])
-        status |= {"last_fault": self.last_fault, "held": self.holder is not None, "clients": len(self.clients)}
+        status |= {
+            "last_fault": self.last_fault,
+            "saved": self.saved,
+            "held": self.holder is not None,
+            "clients": len(self.clients),
+        }
         text = json.dumps({"status": status}, allow_nan=False)
         for client in self.clients:
             client.tell_text(text)

@@ -68,6 +68,12 @@ class Link:
         return True
 
     @property
+    def memory(self) -> StageMemory:
+        """Shared with the loop that was joined."""
+        assert self._memory is not None, "joined"
+        return self._memory
+
+    @property
     def is_joined(self) -> bool:
         """Whether there is a loop to talk to."""
         return self._memory is not None

@@ -40,6 +40,7 @@ class Served:
     bus: str
     on_silence: str
     silence_s: float
+    saves: Path
     host: str
     port: int
     is_simulated: bool
@@ -94,7 +95,7 @@ def serve(served: Served, tell: Callable[[str], object]) -> int:
             _start(children, served)
         link = Link(served.name)
         planner = Planner(served.stage, served.controller, served.bus)
-        desk = Desk(link, planner, asyncio.to_thread)
+        desk = Desk(link, planner, asyncio.to_thread, served.saves)
         hosts = frozenset(f"{_in_url(host)}:{port}" for host in {*_LOOPBACK, served.host})
         url = f"http://{_in_url(served.host)}:{port}/"
         place.write(served.name, "server", {"pid": os.getpid(), "url": url, "token": token})

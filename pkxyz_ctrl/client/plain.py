@@ -78,6 +78,7 @@ class Stage:
     auto_zero = _waited(AsyncStage.auto_zero)
     settle_window = _waited(AsyncStage.settle_window)
     limits = _waited(AsyncStage.limits)
+    save = _waited(AsyncStage.save)
     take_control = _waited(AsyncStage.take_control)
     give_control = _waited(AsyncStage.give_control)
     next_status = _waited(AsyncStage.next_status)

@@ -58,6 +58,8 @@ class Status:
     """0 to 1"""
     last_fault: str
     """what happened and what to check; empty if nothing did"""
+    saved: str
+    """the folder in which the 2 s before the last fault are kept, on the machine of the server"""
 
     @classmethod
     def of(cls, data: Mapping[str, Any]) -> Self:

@@ -176,6 +176,10 @@ class AsyncStage:
         """Of moves that name none, for each axis."""
         return await self._connection.done("limits", _limits(velocity_m_per_s, acceleration_m_per_s2, jerk_m_per_s3))
 
+    async def save(self, seconds: float = 60.0) -> Command:
+        """Keep what was in the last ``seconds``, at most 60, in a folder that the answer names. Needs no control."""
+        return await self._done("save", seconds=seconds)
+
     async def take_control(self) -> Command:
         """Be the one who may move the stage. Raises ``RefusedError`` while another is."""
         return await self._done("take_control")

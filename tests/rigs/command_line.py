@@ -38,7 +38,7 @@ class Server:
 
     def __init__(self, law: Path, bus: Path) -> None:
         words = ["serve", "--controller", str(law), "--bus", str(bus), "--port", "0", "--json"]
-        words += ["--silence-s", "0.25"]
+        words += ["--silence-s", "0.25", "--saves", str(law.parent / "runs")]
         self._command = [sys.executable, "-m", "hil", *words]
         self.process: subprocess.Popen[str]
         self.err = law.parent / "err"

@@ -13,15 +13,21 @@ from operated_rig import MIDDLE_M, OperatedRig, Script
 from hil.operate.at_rate import OperatedLoop
 from hil.operate.commands import Activity, Verb
 from hil.operate.memory import StageMemory
+from hil.operate.tick_frames import TickFrames
+from hil.recording.recording import Recording
+from hil.runs.run_folder import RECORDING
 from hil.server.desk import _SAID_MOST, Client, Desk
 from hil.server.link import Link
 from hil.server.paths import Planner
+from hil.server.saving import AFTER_S, NotSavedError, save
 from pkxyz_ctrl.client import place
 from pkxyz_ctrl.client.protocol import unpacked
+from pkxyz_ctrl.safety.modes import Mode
 
 
 class _NoFrames:
     frames = wire_ns = 0
+    of_tick = TickFrames()
 
 
 class DeskRig(OperatedRig):
@@ -32,7 +38,7 @@ class DeskRig(OperatedRig):
         monkeypatch.setenv("XDG_RUNTIME_DIR", str(folder))
         memory = StageMemory(folder / "memory", kept_ticks=5000)
         self.session._say = memory.writer("answers").write
-        place.write("stage", "loop", {"pid": 1, "memory": str(memory.path), "voltage_max_v": 200.0})
+        place.write("stage", "loop", {"pid": 1, "memory": str(memory.path), "period_us": 200, "voltage_max_v": 200.0})
         monkeypatch.setattr(place, "_is_alive", lambda pid: True)
         self.loop = OperatedLoop(self.session, memory, _NoFrames())  # type: ignore[arg-type]
         self.session.after = _through(self.loop, self.session.after)  # type: ignore[method-assign]
@@ -355,3 +361,39 @@ def test_a_client_that_takes_nothing_ends_nobody_elses_telemetry(rig):
         assert stalled.lost > 40
 
     rig.play(script())
+
+
+def test_what_was_around_a_fault_is_kept_by_itself(rig, tmp_path):
+    client = rig.desk.enter()
+    rig.desk._saves = tmp_path / "runs"
+
+    def script() -> Script:
+        yield from switched_on(rig, client)
+        yield from rig.wait_s(0.4)
+        yield from rig.finish(client, do="release")
+        yield from rig.wait_s(AFTER_S / 2)
+        asyncio.run(rig.desk.keep_fault())
+        assert not list(tmp_path.glob("runs/*"))  # not over yet
+        yield from rig.wait_s(AFTER_S / 2 + 0.005)
+        asyncio.run(rig.desk.keep_fault())
+
+    rows = rig.play(script())
+    (folder,) = tmp_path.glob("runs/fault-*")
+    told = rig.heard(client)
+    assert told["event"][-1] == {"kind": "saved", "words": str(folder)}
+    kept = Recording.open(folder / RECORDING)
+    assert kept.whole
+    at = int(np.flatnonzero(rows["mode"] == Mode.FAULT)[0])
+    expected = rows[rows["tick"] >= kept["tick"][0]][: kept.ticks]
+    assert (kept["tick"] == expected["tick"]).all()
+    assert (kept.vector("estimate_m") == expected["estimate_m"]).all()
+    after_s = (kept["t_us"][-1] - rows["t_us"][at]) * 1e-6
+    assert AFTER_S - 1e-3 < after_s < AFTER_S + 0.01
+    assert rows["t_us"][at] - kept["t_us"][0] == pytest.approx(min(2e6, rows["t_us"][at]), abs=1000)
+
+
+def test_folders_of_faults_do_not_fill_the_disk(rig, tmp_path):
+    for n in range(100):
+        (tmp_path / f"fault-{n}").mkdir()
+    with pytest.raises(NotSavedError, match=r"holds 100 folders fault-\* already: move some away"):
+        save(StageMemory(tmp_path / "memory"), {"period_us": 200}, 1.0, "why", tmp_path)

@@ -15,10 +15,12 @@ from websockets.exceptions import InvalidStatus
 from websockets.sync.client import connect as plain_connect
 from websockets.typing import Subprotocol
 
+from hil.recording.recording import Recording
 from hil.server.app import CLIENTS_MOST
 from pkxyz_ctrl.client import place
 from pkxyz_ctrl.client.protocol import SUBPROTOCOL, TOKEN_PREFIX
 from pkxyz_ctrl.client.reply import RefusedError
+from pkxyz_ctrl.safety.modes import Mode
 
 
 @pytest.fixture(scope="module")
@@ -144,6 +146,26 @@ def test_two_hundred_connections_that_read_nothing_leave_the_others_alone(server
         assert len(answers) > 0
         driven(stage)
         assert stage.move_to(x=0.5e-6).state == "done"
+
+
+def test_a_fault_leaves_its_rows_and_frames_and_is_named(server):
+    with alive() as stage:
+        driven(stage)
+        stage.release()
+        end_s = time.monotonic() + 20
+        while not stage.next_status().saved and time.monotonic() < end_s:
+            pass
+        folder = Path(stage.status.saved)
+        assert folder.parent == server.err.parent / "runs"
+        kept = Recording.open(folder / "recording.parquet")
+        assert kept["mode"][0] != Mode.FAULT == kept["mode"][-1]
+        ticks, frames = kept.ticks, (folder / "frames.log").read_text().splitlines()
+        assert len(frames) > 2 * ticks  # sense and SYNC, and drive while there were some
+        assert sum(" 080#" in line for line in frames) == pytest.approx(ticks, rel=0.05)
+        stage.clear()
+        saved = Path(stage.save(0.2).words)
+        assert Recording.open(saved / "recording.parquet").ticks == 200
+        driven(stage)
 
 
 def test_a_server_that_is_killed_in_a_scan_leaves_a_stage_that_holds(server):

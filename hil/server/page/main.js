@@ -58,7 +58,7 @@ function show(value) {
   at("facts").replaceChildren(...facts.map(([name, v]) => { const d = document.createElement("div"); const b = document.createElement("b"); b.textContent = v; d.append(b, name); return d; }));
   combs(value);
   at("fault").hidden = !value.last_fault;
-  at("fault-words").textContent = value.last_fault || "";
+  at("fault-words").textContent = (value.last_fault || "") + (value.saved ? `\nThe 2 s before it: ${value.saved}` : "");
   at("progress").hidden = !["scanning", "paused"].includes(value.activity);
   at("progress").value = value.progress || 0;
 }
