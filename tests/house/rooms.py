@@ -116,11 +116,15 @@ HOUSE: Mapping[str, Room] = MappingProxyType({
         "hil.pictures", "hil.pictures.wafer", "hil.screen", "hil.api",
     )),
     "hil.commands": Room((
-        "pkxyz_ctrl.*", "hil.recording", "hil.faults", "hil.lanes", "hil.conformance", "hil.operate", "hil.runs",
-        "hil.server", "hil.studies", "hil.pictures", "hil.screen", "hil.bench.rigs", "hil.bench",
+        "pkxyz_ctrl.*", "hil.recording", "hil.faults", "hil.lanes", "hil.conformance", "hil.runs", "hil.studies",
+        "hil.pictures", "hil.screen", "hil.bench.rigs", "hil.bench",
+    )),
+    "hil.commands.operation": Room((
+        "pkxyz_ctrl.*", "hil.lanes", "hil.conformance", "hil.operate", "hil.server", "hil.screen", "hil.commands",
     )),
     "hil": Room((
         "pkxyz_ctrl.*", "hil.lanes", "hil.runs", "hil.screen", "hil.api", "hil.commands.studies", "hil.commands",
+        "hil.commands.operation",
     )),
 })  # fmt: skip
 

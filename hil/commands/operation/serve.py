@@ -7,7 +7,7 @@ from typing import Annotated
 
 import typer
 
-from hil.commands.operate import SilentFor
+from hil.commands.operation.operate import SilentFor
 from hil.commands.run import Report
 from hil.screen.first_run import say_if_compiling
 
