@@ -12,7 +12,7 @@ COB-ID, low byte first, as data identity, then bytes 0..6. A drive PDO that is t
 from dataclasses import dataclass
 from operator import index
 
-from pkxyz_ctrl.can.process_pdo import PROTECTED_LENGTH, count_of, counter_of, encode, is_right, pdo_record
+from pkxyz_ctrl.can.process_pdo import count_of, counter_of, encode, is_right, pdo_record
 from pkxyz_ctrl.compiled.direct_call import direct
 
 Counts = tuple[int, int, int]
@@ -20,6 +20,7 @@ Counts = tuple[int, int, int]
 COUNTS_MIN = -32768
 COUNTS_MAX = 32767
 COUNTER_MAX = 255
+_WORD = (1 << 64) - 1  # a compiled word has a sign, one of Python's has none
 DRIVE_COUNTS_MAX = 32767  # 0x6411: 0..32767 is 0..200 V, a negative count is invalid
 DRIVE_VOLT_PER_COUNT = 200.0 / DRIVE_COUNTS_MAX
 
@@ -65,7 +66,7 @@ class ProcessCodec:
                 f"counts are {COUNTS_MIN}..{COUNTS_MAX}, the counter 0..255"
             )
         word = int(self._encode(self.record, first, second, third, counter))
-        return word.to_bytes(self.length, "little", signed=self.length == PROTECTED_LENGTH)
+        return (word & _WORD).to_bytes(self.length, "little")
 
     def decode(self, data: bytes) -> tuple[int, int, int, int, bool]:
         """``(counts 1, counts 2, counts 3, alive counter, CRC right)``; counter 0 and True if not protected.

@@ -38,6 +38,7 @@ MODULES = (
 TESTS = (
     "tests/safety/test_safety_gate.py",
     "tests/safety/test_safety_gate_traffic.py",
+    "tests/safety/test_safety_gate_reasons.py",
     "tests/safety/test_safety_modes.py",
     "tests/safety/test_safety_misfit.py",
     "tests/safety/test_safety_monitors.py",
@@ -51,6 +52,7 @@ TESTS = (
     "tests/node/test_node_release.py",
     "tests/node/test_node_sdo.py",
     "tests/node/test_node_sync.py",
+    "tests/node/test_node_conditions.py",
     "tests/proof/test_mode_machine.py",
 )
 REASONS = Path(__file__).with_name("uncovered.json")
@@ -67,10 +69,15 @@ class Decision:
     line: int
     text: str
     conditions: list[str]
+    is_choice: bool = False
+    """``value or default``: no decision; both are to be met"""
     rows: set[Row] = field(default_factory=set)
 
     def uncovered(self) -> list[str]:
         """Conditions that no two rows show to matter."""
+        if self.is_choice:
+            met = {seen[0] for seen, _ in self.rows}
+            return [f"{value} of the value" for value in (True, False) if value not in met]
         return [text for place, text in enumerate(self.conditions) if not self._matters(place)]
 
     def _matters(self, place: int) -> bool:
@@ -135,7 +142,7 @@ class Noting(ast.NodeTransformer):
 
     def _decision(self, node: ast.expr) -> ast.AST:
         number = len(self._notes.decisions)
-        decision = Decision(self._module, node.lineno, ast.unparse(node), [])
+        decision = Decision(self._module, node.lineno, ast.unparse(node), [], _is_choice(node))
         self._notes.decisions.append(decision)
         noted = self._conditions(node, decision)
         begin = _call("begin", ast.Constant(number))
@@ -154,6 +161,18 @@ class Noting(ast.NodeTransformer):
         place = len(decision.conditions)
         decision.conditions.append(ast.unparse(node))
         return _call("condition", ast.Constant(place), self.visit(node))
+
+
+def _is_choice(node: ast.expr) -> bool:
+    if not (isinstance(node, ast.BoolOp) and isinstance(node.op, ast.Or) and len(node.values) == 2):
+        return False
+    value, default = node.values
+    literal = ast.Constant | ast.Tuple | ast.List | ast.JoinedStr
+    if isinstance(default, literal):
+        return True
+    is_made = isinstance(default, ast.Call) and isinstance(default.func, ast.Name) and default.func.id[0].isupper()
+    held = isinstance(value, ast.Attribute) and isinstance(default, ast.Call | ast.Name | ast.Attribute)
+    return is_made or held
 
 
 def _call(name: str, *arguments: ast.expr) -> ast.Call:

@@ -40,6 +40,13 @@ def test_what_is_covered(source: str, calls: list[tuple[Any, ...]], expected: li
     assert measured(source, calls) == expected
 
 
+@pytest.mark.parametrize(("calls", "expected"), [([(0,), (1,)], []), ([(1,)], ["False of the value"])])
+def test_a_value_or_its_default_is_no_decision_but_both_are_to_be_met(
+    calls: list[tuple[Any, ...]], expected: list[str]
+) -> None:
+    assert measured("def f(a): return a or ()", calls) == [expected]
+
+
 def test_a_decision_that_an_exception_leaves_does_no_harm() -> None:
     source = "def f(a):\n  try:\n    return a and g(a)\n  except NameError:\n    return a or 2"
-    assert measured(source, [(1,), (0,)]) == [["a", "g(a)"], ["a", "2"]]
+    assert measured(source, [(1,), (0,)]) == [["a", "g(a)"], ["False of the value"]]

@@ -1,0 +1,150 @@
+"""The gate's every reason, and every condition of it by itself: each is met, and alone decides."""
+
+import pytest
+from gate_frames import CONFIG, drive, holding, nmt, sdo_write, sync
+
+from pkxyz_ctrl.can.frame import Frame
+from pkxyz_ctrl.safety import gate_rules
+from pkxyz_ctrl.safety.gate import TransmitGate
+from pkxyz_ctrl.safety.modes import Mode
+
+NO_MODE = 99
+T_US = 200
+
+
+def reason(frame: Frame, mode: int = Mode.TRACKING, gate: TransmitGate | None = None, t_us: int = T_US) -> str | None:
+    return (gate or TransmitGate(CONFIG)).check(frame, mode, t_us)
+
+
+def of(can_id: int, data: bytes) -> Frame:
+    return Frame(can_id, data, True, True)
+
+
+@pytest.mark.parametrize("mode", [NO_MODE, -1])
+@pytest.mark.parametrize(
+    ("frame", "words"),
+    [
+        (drive(0, 0, 0, 0), "DRIVE_ZERO"),
+        (drive(5, 0, 0, 0), "DRIVE"),
+        (of(0x77F, b"\5"), "HEARTBEAT"),
+        (sync(), "SYNC"),
+        (nmt(0x80), "NMT_PRE_OPERATIONAL"),
+        (of(0x60A, bytes(8)), "SDO"),
+    ],
+)
+def test_in_a_mode_that_there_is_not_nothing_may_be_sent(frame: Frame, words: str, mode: int) -> None:
+    told = reason(frame, mode)
+    assert told is not None
+    assert words in told
+
+
+@pytest.mark.parametrize("data", [b"", b"\1", b"\xf0"])
+def test_a_sync_with_or_without_counter(data: bytes) -> None:
+    assert reason(of(0x080, data)) is None
+
+
+@pytest.mark.parametrize("data", [b"\0", b"\xf1", b"\xff", b"\1\1", b"\0\1", bytes(8)])
+def test_what_is_no_sync(data: bytes) -> None:
+    assert "SYNC" in (reason(of(0x080, data)) or "")
+
+
+@pytest.mark.parametrize("data", [b"", b"\4", b"\x7f", b"\0", b"\5\0", b"\x85"])
+def test_what_is_no_heartbeat_of_ours(data: bytes) -> None:
+    assert "must be the one byte 0x05" in (reason(of(0x77F, data)) or "")
+
+
+@pytest.mark.parametrize("data", [b"\x80", b"\x80\x0a\0", b"", b"\x7f\x0a", b"\0\x0a", b"\3\x0a", b"\x83\x0a"])
+def test_what_is_no_nmt_command(data: bytes) -> None:
+    assert "not an NMT command" in (reason(of(0x000, data)) or "")
+
+
+@pytest.mark.parametrize("node", [0, 9, 11, 255])
+def test_nmt_to_somebody_else_or_all(node: int) -> None:
+    assert f"to node {node}" in (reason(nmt(0x80, node)) or "")
+
+
+@pytest.mark.parametrize("length", [0, 1, 7, 12])
+def test_an_sdo_request_has_eight_bytes(length: int) -> None:
+    assert f"{length} bytes instead of 8" in (reason(of(0x60A, bytes(length)), Mode.BOOT) or "")
+
+
+def test_a_write_under_voltage_and_a_read() -> None:
+    assert "SDO_WRITE" in (reason(sdo_write(0x1017, 0, 20, 2), Mode.TRACKING) or "")
+    assert reason(sdo_write(0x1017, 0, 20, 2), Mode.BOOT) is None
+
+
+@pytest.mark.parametrize("zero", [True, False])
+def test_a_counter_that_is_repeated(zero: bool) -> None:
+    gate = holding((5, 5, 5))
+    told = reason(drive(0, 0, 0, 255) if zero else drive(6, 5, 5, 255), gate=gate)
+    assert told is not None
+    assert "counter" in told
+
+
+@pytest.mark.parametrize("comb", [0, 1, 2])
+@pytest.mark.parametrize(("count", "passes"), [(0, True), (2000, True), (-1, False), (2001, False)])
+def test_each_comb_has_its_range(comb: int, count: int, passes: bool) -> None:
+    """From combs that stand where the step is small enough."""
+    config = CONFIG.__class__(count_max=2000, count_slew_max=32767, period_us=200)
+    counts = [1000, 1000, 1000]
+    counts[comb] = count
+    assert (
+        reason(drive(counts[0], counts[1], counts[2], 0), gate=holding((1000, 1000, 1000), config)) is None
+    ) == passes
+
+
+@pytest.mark.parametrize("comb", [0, 1, 2])
+@pytest.mark.parametrize(("step", "passes"), [(1000, True), (-1000, True), (1001, False), (-1001, False)])
+def test_each_comb_has_its_step(comb: int, step: int, passes: bool) -> None:
+    counts = [5000, 5000, 5000]
+    gate = holding((5000, 5000, 5000))
+    counts[comb] += step
+    assert (reason(drive(counts[0], counts[1], counts[2], 0), gate=gate) is None) == passes
+
+
+@pytest.mark.parametrize(
+    ("held", "passes"), [((0, 0, 0), False), ((5, 0, 0), True), ((0, 5, 0), True), ((0, 0, 5), True)]
+)
+def test_0_v_comes_at_once_unless_it_is_there_already(held: tuple[int, int, int], passes: bool) -> None:
+    assert (reason(drive(0, 0, 0, 0), gate=holding(held), t_us=1) is None) == passes
+    assert reason(drive(0, 0, 0, 0), gate=holding(held), t_us=T_US) is None
+
+
+def test_plain_frames_have_no_counter_to_repeat() -> None:
+    config = CONFIG.__class__(count_max=2000, count_slew_max=1000, period_us=200, protection=False)
+    gate = TransmitGate(config)
+    plain = of(0x30A, bytes(6))
+    assert [reason(plain, gate=gate, t_us=t_us) for t_us in (0, 200)] == [None, None]
+    assert "bytes" in (reason(drive(0, 0, 0, 0), gate=gate, t_us=400) or "")
+
+
+@pytest.mark.parametrize("command", [0x01, 0x02, 0x80, 0x81, 0x82])
+def test_every_nmt_command_has_its_time(command: int) -> None:
+    assert reason(nmt(command), Mode.BOOT) is None
+    assert (reason(nmt(command), Mode.TRACKING) is None) == (command in (0x02, 0x80))
+
+
+@pytest.mark.parametrize(
+    ("is_fd", "is_fast", "on_fd", "on_classic"),
+    [(False, False, True, True), (True, False, True, False), (True, True, True, False), (False, True, False, False)],
+)
+def test_the_format_of_the_bus(is_fd: bool, is_fast: bool, on_fd: bool, on_classic: bool) -> None:
+    frame = Frame(0x080, b"\1", is_fd, is_fast)
+    assert (reason(frame) is None) == on_fd
+    classic = CONFIG.__class__(count_max=2000, count_slew_max=1000, period_us=200, fd=False)
+    assert (reason(frame, gate=TransmitGate(classic)) is None) == on_classic
+
+
+def test_the_first_refusal_is_kept_until_it_is_cleared() -> None:
+    gate = holding((5, 5, 5))
+    first = reason(of(0x123, b""), gate=gate)
+    assert first is not None
+    reason(of(0x60A, b""), gate=gate)
+    assert gate.latched == first
+    told = reason(drive(6, 5, 5, 0), gate=gate)
+    assert told is not None
+    assert "latched" in told
+    gate_rules.clear(gate.memory)  # as the compiled loop does it
+    gate.clear()
+    assert not gate.latched
+    assert reason(drive(6, 5, 5, 0), gate=gate) is None
