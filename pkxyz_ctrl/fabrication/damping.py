@@ -37,13 +37,15 @@ _LEAVES = 8.0
 
 
 def knudsen(pressure_pa: Array, gap_m: float | Array) -> Array:
-    """Mean free path over a gap."""
-    return np.asarray(FREE_PATH_M * ATMOSPHERE_PA / (pressure_pa * gap_m))
+    """Mean free path over a gap; infinite without gas."""
+    with np.errstate(divide="ignore"):
+        return np.asarray(FREE_PATH_M * ATMOSPHERE_PA / (pressure_pa * gap_m))
 
 
 def sliding_viscosity_pa_s(kn: Array) -> Array:
     """Effective viscosity of a sheared film."""
-    return np.asarray(VISCOSITY_PA_S / (1.0 + 2.0 * kn + 0.2 * kn**0.788 * np.exp(-kn / 10.0)))
+    between = np.where(np.isinf(kn), 0.0, kn)  # without gas there is nothing of the second term
+    return np.asarray(VISCOSITY_PA_S / (1.0 + 2.0 * kn + 0.2 * between**0.788 * np.exp(-between / 10.0)))
 
 
 def squeezed_viscosity_pa_s(kn: Array) -> Array:
@@ -100,7 +102,10 @@ def quality_factor(
     impedance = np.sqrt(mass_kg * stiffness)
     total = films(pressure_pa, [s.mean(axis=1) for s in sheared_m], leaf_height_m.mean(axis=1)) + rest * tie
     w = np.sqrt(stiffness / mass_kg)
-    squeeze_number = 12.0 * VISCOSITY_PA_S * w * (leaf_height_m.mean(axis=1) / made_of.leaf_gap_m) ** 2 / pressure_pa
+    with np.errstate(divide="ignore"):
+        squeeze_number = (
+            12.0 * VISCOSITY_PA_S * w * (leaf_height_m.mean(axis=1) / made_of.leaf_gap_m) ** 2 / pressure_pa
+        )
     gap = min(c.finger_gap_m for c in combs)
     valid = (squeeze_number < SQUEEZE_MAX) & (knudsen(pressure_pa, gap) < KNUDSEN_MAX)
     return np.asarray(impedance / (total + impedance / made_of.vacuum_quality_factor)), np.asarray(valid)

@@ -98,10 +98,16 @@ def made(stage: StageConfig, process: Process, size: Mapping[str, Array]) -> Dev
     drive, sense = (_Comb(comb, process, size, f.leaf_height_m) for comb in (stage.drive_comb, stage.sense_comb))
     projection, height = _link(stage, process, size)
     _require({"leaf width": leaf, "hinge": hinge, "layer 1": leaf_h, "comb gap": drive.top_m, "mass": mass,
-              "comb gap downwards": drive.bottom_m, "sense gap": sense.top_m, "handle": height, "slider": slider,
-              "crank hinge": crank_cubed, "fingers' common height": drive.height_m})  # fmt: skip
+              "comb gap downwards": drive.bottom_m, "sense gap": sense.top_m, "sense gap downwards": sense.bottom_m,
+              "handle": height, "slider": slider, "crank hinge": crank_cubed,
+              "fingers' common height": drive.height_m, "sense fingers' common height": sense.height_m})  # fmt: skip
+    pressure = size["pressure_pa"].mean(axis=1)
+    if not (pressure >= 0.0).all():
+        raise ValueError(
+            f"the process leaves a pressure of {pressure.min():.3g} Pa for some device; its spread is too wide"
+        )
     quality, valid = quality_factor(
-        stage, process.made_of, size["pressure_pa"].mean(axis=1), mass, slider, crank, leaf_h,
+        stage, process.made_of, pressure, mass, slider, crank, leaf_h,
         (drive.shear_area_m, sense.shear_area_m),
     )  # fmt: skip
     return Devices(
@@ -174,7 +180,8 @@ def _mean_inverse(top_m: Array, widening_m: Array) -> Array:
     small = np.abs(x) < 1e-4
     safe = np.where(small, 1.0, x)
     series = 1.0 - x * (0.5 - x * (1.0 / 3.0 - x / 4.0))
-    return np.asarray(np.where(small, series, np.log1p(np.where(small, 1.0, x)) / safe) / top_m)
+    with np.errstate(invalid="ignore", divide="ignore"):  # of no gap at all, which is refused
+        return np.asarray(np.where(small, series, np.log1p(safe) / safe) / top_m)
 
 
 def side_left(offset: Array) -> Array:

@@ -47,3 +47,16 @@ def test_films_that_damp_more_than_the_drawing_says_are_refused():
     tight = process().model_copy(update={"made_of": SHIPPED.made_of.model_copy(update={"leaf_gap_m": 5e-6})})
     with pytest.raises(ValueError, match="widen made_of"):
         devices(of=tight)
+
+
+@pytest.mark.filterwarnings("error")
+def test_without_gas_that_of_the_anchors_is_left():
+    vacuum = devices(pressure_pa=[[0.0]])
+    assert vacuum.quality_factor.tolist() == [SHIPPED.made_of.vacuum_quality_factor]
+    assert vacuum.film_valid.tolist() == [False]
+
+
+@pytest.mark.filterwarnings("error")
+def test_a_spread_of_the_pressure_that_goes_below_0_is_refused():
+    with pytest.raises(ValueError, match=r"leaves a pressure of -5 Pa .* too wide"):
+        devices(pressure_pa=[[101325.0], [-5.0]])

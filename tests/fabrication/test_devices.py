@@ -235,8 +235,12 @@ def test_a_mechanism_of_three_on_a_crystal_of_four_has_two_resonances_in_the_pla
         assert least <= high[0] - low[0] <= most
 
 
+@pytest.mark.filterwarnings("error")
 def test_a_process_that_leaves_nothing_says_so():
     with pytest.raises(ValueError, match="leaves no leaf width"):
         devices(etch_bias_m=9e-6)
     with pytest.raises(ValueError, match="leaves no comb gap"):
         devices(comb_gap_m=-6e-6)
+    narrow = STAGE.model_copy(update={"sense_comb": STAGE.sense_comb.model_copy(update={"finger_gap_m": 3e-6})})
+    with pytest.raises(ValueError, match="leaves no sense gap downwards"):
+        devices(narrow, sidewall_rad=-0.02)
