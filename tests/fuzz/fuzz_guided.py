@@ -3,7 +3,8 @@
 atheris records which branches of our code an input takes and bends those inputs further that took a new one. An input
 is read as the random numbers of a session, so that every input is a session of frames and the generators stay in charge
 of what a frame looks like. ``blind`` takes the input as a seed instead: the same sessions, the same instruments, but
-unguided. What guidance is worth is the difference ("cov" in the last line printed); fuzz.md has the result.
+unguided. What guidance is worth is the difference ("cov" in the last line printed); in short runs it found one
+branch in twenty more in the node, and no defect.
 Needs ``pip install atheris`` (Linux); options that begin with "-" go to libFuzzer.
 """
 
