@@ -75,9 +75,11 @@ def _exported(loaded: "Scenario", ticks: int | None) -> "Exported":
     from hil.lanes.in_process import run
     from hil.lanes.lane import Lane
     from hil.runs.scenario import resolve
+    from pkxyz_ctrl.can.driver_config import DriverConfig
     from pkxyz_ctrl.export.folder import Exported
     from pkxyz_ctrl.loop.cycle import INPUT
     from pkxyz_ctrl.loop.reference import reference_rows
+    from pkxyz_ctrl.loop.wire import wire_record
 
     setup = loaded.setup()
     rows = (setup.ticks if ticks is None else ticks) + PREVIEW_ROWS
@@ -89,4 +91,6 @@ def _exported(loaded: "Scenario", ticks: int | None) -> "Exported":
     inputs = np.zeros(TEST_TICKS, INPUT)
     inputs["sense_count"] = np.concatenate(counts)
     names = loaded.config.name, loaded.controller.name
-    return Exported(setup.law, reference, inputs, *names, resolve(loaded)["digest"])
+    can = setup.bus.can
+    wire = wire_record(setup.gate, DriverConfig() if can is None else can.driver)
+    return Exported(setup.law, wire, reference, inputs, *names, resolve(loaded)["digest"])

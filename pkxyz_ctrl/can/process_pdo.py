@@ -63,12 +63,18 @@ def pdo_record(cob_id: int, protected: bool) -> NDArray[np.void]:
 
 @njit(cache=True, error_model="numpy")
 def encode(pdo: Records, first: int, second: int, third: int, counter: int) -> int:
-    """The payload. Counts -32768..32767, counter 0..255; of what is beyond, only the low bits go."""
+    """The payload, a number with sign. Counts -32768..32767, counter 0..255: of what is beyond, only low bits go."""
     word = first & 0xFFFF | (second & 0xFFFF) << 16 | (third & 0xFFFF) << 32
     if pdo[0]["length"] != PROTECTED_LENGTH:
         return word
     word |= (counter & 0xFF) << 48
-    return word | int(crc_of(pdo, word)) << 56
+    return word | _highest_byte(crc_of(pdo, word))
+
+
+@njit(cache=True, error_model="numpy")
+def _highest_byte(value: int) -> int:
+    """A byte in its place, with the sign that it gives the word."""
+    return int((value ^ 0x80) - 0x80) << 56
 
 
 @njit(cache=True, error_model="numpy")

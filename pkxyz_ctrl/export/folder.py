@@ -23,6 +23,7 @@ from pkxyz_ctrl.export.structs import header, struct_name
 from pkxyz_ctrl.export.targets import TARGETS, Target
 from pkxyz_ctrl.export.words import CANONICAL_NAN, FNV_OFFSET, FNV_PRIME, c_words, double_words, words_of
 from pkxyz_ctrl.loop import cycle as cycling
+from pkxyz_ctrl.loop import wire as wiring
 from pkxyz_ctrl.loop.row import ROW
 
 Records = NDArray[np.void]
@@ -36,9 +37,12 @@ BUSY_MOST = 0.8
 
 
 class Exported(NamedTuple):
-    """What is to be exported: the law (1,), the reference's rows (n,), inputs (m,) of a self-test, names for people."""
+    """What is to be exported: the law (1,), the wire's settings (1,), the reference's rows (n,), inputs (m,) of which
+    the self-test takes the sense counts, names for people.
+    """
 
     law: Records
+    wire: Records
     reference: Records
     inputs: Records
     scenario: str
@@ -79,7 +83,7 @@ def write(out: Path, target_name: str, exported: Exported) -> dict[str, Any]:
             f"the reference takes {size / 2**20:.1f} MiB, more than a board's flash; give --ticks {rows} or less, and "
             "stream the rest"
         )
-    test = self_test(exported.law, exported.reference, exported.inputs)
+    test = self_test(exported.law, exported.wire, exported.reference, exported.inputs)
     lowered = lower(kernels(), target)
     files = _files(target_name, target, exported, test, lowered)
     manifest = _manifest(target_name, target, exported, test, lowered, files)
@@ -96,9 +100,10 @@ def _files(name: str, target: Target, exported: Exported, test: SelfTest, lowere
     values = {
         "target": name, "about": target.about, "compiler": target.compiler, "flags": target.flags,
         "scenario": exported.scenario, "controller": exported.controller,
-        "period_us": str(int(exported.law["period_us"][0])), "ticks": str(len(test.inputs)), "every": str(EVERY),
+        "period_us": str(int(exported.law["period_us"][0])), "ticks": str(len(test.frames)), "every": str(EVERY),
         "last": f"{test.digests[-1]:016x}",
         "code_bytes": str(loaded_bytes(lowered.code)), "law_bytes": str(exported.law.nbytes),
+        "wire_bytes": str(exported.wire.nbytes), "wire_memory_bytes": str(wiring.WIRE_MEMORY.itemsize),
         "memory_bytes": str(cycling.MEMORY.itemsize), "row_bytes": str(ROW.itemsize),
         "reference_bytes": str(exported.reference.nbytes), "rows": str(len(exported.reference)),
         "owed": ", ".join(lowered.owed) or "nothing",
@@ -113,6 +118,7 @@ def _files(name: str, target: Target, exported: Exported, test: SelfTest, lowere
         "pkxyz.h": header(int(exported.law["period_us"][0])),
         "pkxyz.s": lowered.assembly,
         "law.c": _constant("pkxyz_law_words", exported.law, many=False),
+        "wire.c": _constant("pkxyz_wire_words", exported.wire, many=False),
         "reference.c": _constant("pkxyz_path_words", exported.reference, many=True),
         "selftest.c": _self_test_c(test),
     }
@@ -133,11 +139,11 @@ def _constant(name: str, records: Records, *, many: bool) -> str:
 
 
 def _self_test_c(test: SelfTest) -> str:
-    tables = {"row": ROW, "memory": cycling.MEMORY}
+    records = {"row": ROW, "memory": cycling.MEMORY, "frame": wiring.FRAME, "wire_memory": wiring.WIRE_MEMORY}
     flags = "".join(
         f"const uint8_t pkxyz_{name}_is_double[{len(double_words(dtype))}] = "
         f"{{{','.join(str(int(is_double)) for is_double in double_words(dtype))}}};\n"
-        for name, dtype in tables.items()
+        for name, dtype in records.items()
     )
     digests = "".join(f"    0x{value:016x},\n" for value in test.digests)
     constants = (
@@ -145,7 +151,8 @@ def _self_test_c(test: SelfTest) -> str:
         f"const uint64_t pkxyz_nan = 0x{CANONICAL_NAN:016x};\n"
     )
     return (
-        f"{_constant('pkxyz_input_words', test.inputs, many=True)}\n{constants}{flags}"
+        f"{_constant('pkxyz_frame_words', test.frames, many=True)}\n"
+        f"{_constant('pkxyz_tried_words', test.tried, many=True)}\n{constants}{flags}"
         f"const uint64_t pkxyz_digests[{len(test.digests)}] = {{\n{digests}}};\n"
     )
 
@@ -163,10 +170,11 @@ def _manifest(
             "kernels": digest_of_kernels(),
             "files": {file: hashlib.sha256(content).hexdigest() for file, content in sorted(files.items())},
         },
-        "self_test": {"ticks": len(test.inputs), "every": EVERY, "fnv1a_64": [f"{d:016x}" for d in test.digests]},
+        "self_test": {"ticks": len(test.frames), "every": EVERY, "fnv1a_64": [f"{d:016x}" for d in test.digests]},
         "bytes": {
-            "code": loaded_bytes(lowered.code), "law": exported.law.nbytes, "memory": cycling.MEMORY.itemsize,
-            "row": ROW.itemsize, "reference": exported.reference.nbytes,
+            "code": loaded_bytes(lowered.code), "law": exported.law.nbytes + exported.wire.nbytes,
+            "memory": cycling.MEMORY.itemsize + wiring.WIRE_MEMORY.itemsize, "row": ROW.itemsize,
+            "reference": exported.reference.nbytes,
         },
         "owed_symbols": list(lowered.owed),
         "versions": {

@@ -123,7 +123,7 @@ class TransmitGate:
     def clear(self) -> None:
         """Let the mode's frames pass again. What was sent last stays remembered, so the slew limit holds across it."""
         self.latched = ""
-        self.memory["latched"] = 0
+        gate_rules.clear(self.memory)
 
     def _blocked(self, frame: Frame, mode: int, reason: int, word: int, t_us: int) -> str:
         known_mode = Mode(mode).name if mode in list(Mode) else f"unknown mode {mode}"

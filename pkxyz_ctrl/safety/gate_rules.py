@@ -163,11 +163,21 @@ def crc_start(can_id: int) -> int:
 
 
 def new_gate_memory() -> NDArray[np.void]:
-    """(1,) of ``GATE_MEMORY`` of a gate that has let nothing pass: what the combs hold is unknown."""
+    """(1,) of ``GATE_MEMORY`` of a gate that has let nothing pass."""
     memory = np.zeros(1, GATE_MEMORY)
-    memory["time_us"] = _LONG_AGO_US
-    memory["counter"] = -1
+    forget(memory)
     return memory
+
+
+@njit(cache=True, error_model="numpy")
+def forget(memory_array: Records) -> None:
+    """Nothing has passed, and nothing was blocked: what the combs hold is unknown."""
+    memory = memory_array[0]
+    memory["time_us"] = _LONG_AGO_US
+    for i in range(3):
+        memory["count"][i] = 0
+    memory["counter"] = -1
+    memory["counter_next"] = memory["syncs"] = memory["known"] = memory["latched"] = memory["blocked_frames"] = 0
 
 
 @njit(cache=True, error_model="numpy")

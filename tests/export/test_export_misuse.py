@@ -9,6 +9,7 @@ from hil.runs.scenario import load_scenario
 from pkxyz_ctrl.export.folder import Exported, write
 from pkxyz_ctrl.export.kernels import ExportError
 from pkxyz_ctrl.loop.cycle import INPUT
+from pkxyz_ctrl.loop.wire import WIRE
 
 
 def refused(capsys, monkeypatch, *words):
@@ -54,7 +55,9 @@ def test_a_path_that_no_board_holds_is_refused_with_what_it_takes(tmp_path):
     from pkxyz_ctrl.loop.reference import REFERENCE
 
     law = load_scenario("raster").setup().law
-    exported = Exported(law, np.zeros(20_000, REFERENCE), np.zeros(100, INPUT), "raster", "youla", "")
+    exported = Exported(
+        law, np.zeros(1, WIRE), np.zeros(20_000, REFERENCE), np.zeros(100, INPUT), "raster", "youla", ""
+    )
     with pytest.raises(ExportError, match=r"takes 2\.4 MiB.*give --ticks 16384 or less"):
         write(tmp_path / "out", "cortex-m7", exported)
     assert not (tmp_path / "out").exists()

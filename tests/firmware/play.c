@@ -12,3 +12,12 @@ int32_t play(const pkxyz_cycle_law *law, pkxyz_cycle_memory *memory, const pkxyz
     }
     return 0;
 }
+
+/* Frames through the exported gate; a negative mode clears it. */
+int32_t judge(const pkxyz_wire *wire, pkxyz_wire_memory *memory, pkxyz_wire_frame *frames, int32_t count)
+{
+    for (int32_t n = 0; n < count; n++)
+        if ((frames[n].mode < 0 ? pkxyz_clear(memory) : pkxyz_judge(wire, memory, &frames[n])) != 0)
+            return n + 1;
+    return 0;
+}

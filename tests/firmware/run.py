@@ -21,17 +21,20 @@ from typing import NamedTuple
 import numpy as np
 from debian import fetched
 from disassembly import fused_instructions, stack_bound
+from frames import judged, missing
 from numpy.typing import NDArray
 from segments import PREVIEW, TICKS, Segment, segments
 
 from hil.lanes.setup import Setup
 from hil.runs.scenario import load_scenario
+from pkxyz_ctrl.can.driver_config import DriverConfig
 from pkxyz_ctrl.compiled.kernel_cache import choose_kernel_cache
 from pkxyz_ctrl.config.files import CONFIG_DIR, ConfigError
 from pkxyz_ctrl.core.tick import PREDICTIVE
 from pkxyz_ctrl.design.model.discrete_law import LawError
 from pkxyz_ctrl.export import kernels as exporting
 from pkxyz_ctrl.export.elf import symbols
+from pkxyz_ctrl.export.entries import ENTRIES
 from pkxyz_ctrl.export.folder import Exported, write
 from pkxyz_ctrl.export.kernels import Kernels, kernels
 from pkxyz_ctrl.export.lowering import lower
@@ -40,12 +43,14 @@ from pkxyz_ctrl.export.words import FNV_OFFSET, FNV_PRIME, canonical
 from pkxyz_ctrl.loop import cycle as cycling
 from pkxyz_ctrl.loop.reference import reference_rows
 from pkxyz_ctrl.loop.row import ROW
+from pkxyz_ctrl.loop.wire import new_wire_memory, wire_record
 from pkxyz_ctrl.safety.modes import Mode
 from pkxyz_ctrl.safety.trips import Trip
 
 Records = NDArray[np.void]
 
 TICKS_LEAST = 1_000_000
+FRAMES = 300_000
 HERE = Path(__file__).parent
 ROOT = HERE.parents[1]
 SCRATCH = ROOT / ".firmware"
@@ -76,6 +81,7 @@ def main(ticks: int) -> int:
         failures += covered(laws)
         library = shared(host / "pkxyz.o", host)
         failures += compared_here(laws, library)
+        failures += frames_compared(library)
         failures += planted(laws[0], host)
         failures += clean(board)
         failures += compared_on_board(laws, board)
@@ -91,7 +97,9 @@ def exported(target: str, work: Path) -> Path:
     reference = reference_rows(setup.trajectory.sample(0, TICKS + PREVIEW, setup.bus.period_us))
     (segment,) = segments(setup.law, setup.trajectory, setup.bus.period_us, 1, 0)
     out = work / target
-    write(out, target, Exported(setup.law, reference, segment.inputs[:1000], "raster", setup.controller.name, ""))
+    wire = wire_record(setup.gate, DriverConfig())
+    records = setup.law, wire, reference, segment.inputs[:1000]
+    write(out, target, Exported(*records, "raster", setup.controller.name, ""))
     return out
 
 
@@ -163,6 +171,26 @@ def compared_here(laws: list[Law], library: ctypes.CDLL) -> list[str]:
     failures = [difference for law in laws if (difference := first_difference(law, library))]
     print(f"host: rows and memories of all {len(laws)} laws compared, {time.monotonic() - begin_s:.0f} s")
     return failures
+
+
+def frames_compared(library: ctypes.CDLL) -> list[str]:
+    """The gate's answer to each frame, and what it remembers in the end."""
+    begin_s = time.monotonic()
+    wire = wire_record(load_scenario("raster").setup().gate, DriverConfig())
+    here = judged(wire, FRAMES, 13)
+    failures = [f"no frame was refused for {name}" for name in missing(here)]
+    frames, memory = here.frames.copy(), new_wire_memory()
+    words = [array.ctypes.data_as(ctypes.c_void_p) for array in (wire, memory, frames)]
+    status = library.judge(*words, len(frames))
+    same = frames["reason"] == here.reasons
+    if status != 0 or not same.all():
+        failures.append(f"the gate's answer to frame {int(same.argmin())}, status {status}")
+    if not np.array_equal(canonical(memory), canonical(here.memory)):
+        failures.append("the gate's memory in the end")
+    passed = here.frames[here.reasons == 0]
+    voltages = np.count_nonzero((passed["can_id"] == wire["drive"]["cob_id"][0, 0]) & (passed["data"] << 16 != 0))
+    print(f"host: {FRAMES} frames judged, {voltages} voltages passed, {time.monotonic() - begin_s:.0f} s")
+    return failures if voltages > FRAMES // 100 else [*failures, "hardly a voltage passed the gate"]
 
 
 def first_difference(law: Law, library: ctypes.CDLL) -> str:
@@ -342,7 +370,7 @@ def built(board: Path, tools: Tools) -> list[str]:
     failures = []
     for out, sources in (
         ("board.elf", ["board.c", "selftest.c", "port_cortex_m.c"]),
-        ("selftest.elf", ["main.c", "law.c", "reference.c", "selftest.c", "port_cortex_m.c"]),
+        ("selftest.elf", ["main.c", "law.c", "wire.c", "reference.c", "selftest.c", "port_cortex_m.c"]),
     ):
         done = tools.run("arm-none-eabi-gcc", *flags, "-o", out, *sources, "pkxyz.o", *link, cwd=board)
         if done.returncode != 0:
@@ -351,7 +379,7 @@ def built(board: Path, tools: Tools) -> list[str]:
     print(f"Cortex-M7: {(done.stdout + done.stderr).strip()}")
     failures += [] if done.returncode == 0 else ["the self-test on the board"]
     listing = tools.run("arm-none-eabi-objdump", "-d", "--no-show-raw-insn", "board.elf", cwd=board).stdout
-    bound, way = stack_bound(listing, "pkxyz_cycle")
+    bound, way = max(stack_bound(listing, entry.name) for entry in ENTRIES)
     code = (board / "pkxyz.o").read_bytes()
     print(f"Cortex-M7: stack at most {bound} bytes, by {' > '.join(way)}; {len(symbols(code))} symbols")
     return failures + [f"board.elf: {line}" for line in fused_instructions(listing)]
