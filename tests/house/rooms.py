@@ -42,7 +42,9 @@ HOUSE: Mapping[str, Room] = MappingProxyType({
     "pkxyz_ctrl.loop": Room(
         ("pkxyz_ctrl.can", "pkxyz_ctrl.safety", "pkxyz_ctrl.compiled", "pkxyz_ctrl.config", "pkxyz_ctrl.core")
     ),
-    "pkxyz_ctrl.export": Room(("pkxyz_ctrl.safety", "pkxyz_ctrl.compiled", "pkxyz_ctrl.core", "pkxyz_ctrl.loop")),
+    "pkxyz_ctrl.export": Room(
+        ("pkxyz_ctrl.compiled", "pkxyz_ctrl.can", "pkxyz_ctrl.safety", "pkxyz_ctrl.core", "pkxyz_ctrl.loop")
+    ),
     "pkxyz_ctrl.client": Room(),
     "pkxyz_ctrl.instrument": Room(("pkxyz_ctrl.client",)),
     # the device, and what is designed for it offline
