@@ -20,7 +20,7 @@ Counts = tuple[int, int, int]
 COUNTS_MIN = -32768
 COUNTS_MAX = 32767
 COUNTER_MAX = 255
-_WORD = (1 << 64) - 1  # a compiled word has a sign, one of Python's has none
+_WORD = (1 << 64) - 1  # a word has a sign, its bytes have none
 DRIVE_COUNTS_MAX = 32767  # 0x6411: 0..32767 is 0..200 V, a negative count is invalid
 DRIVE_VOLT_PER_COUNT = 200.0 / DRIVE_COUNTS_MAX
 
