@@ -117,7 +117,7 @@ def enable(stage: Operated) -> Steps:
 
 
 def disable(stage: Operated) -> Steps:
-    """Open the loop: 0 V."""
+    """Lead the stage down and open the loop: 0 V."""
     if stage.mode == Mode.FAULT:
         raise RefusedError("the combs are at 0 V already, by a fault: clear it")
     for _ in stage.ticks(_SETTLES_S):

@@ -117,7 +117,9 @@ class Session:
         running = self._job
         if verb is Verb.RELEASE:
             self.stage.controller.memory["input"]["trips"] |= int(Trip.OPERATOR)
-            self._answer(command_id, verb, State.DONE, "the combs go to 0 V in the next tick; clear when ready")
+            self._answer(
+                command_id, verb, State.DONE, "the stage is led down and the combs go to 0 V; clear when ready"
+            )
             return
         if verb in (Verb.SETTLE, Verb.LIMITS):
             self._answer(command_id, verb, State.DONE, self._set(verb, command))
@@ -317,7 +319,7 @@ class Session:
         stage, setpoints = self.stage, self.stage.setpoints
         by_mode: dict[int, Activity] = {
             Mode.BOOT: Activity.STARTING, Mode.PRE_OPERATIONAL: Activity.STARTING, Mode.IDLE: Activity.OFF,
-            Mode.HOMING: Activity.HOMING, Mode.FAULT: Activity.FAULT,
+            Mode.HOMING: Activity.HOMING, Mode.FAULT: Activity.FAULT, Mode.LANDING: Activity.STOPPING,
         }  # fmt: skip
         if stage.mode in by_mode:
             return by_mode[stage.mode]

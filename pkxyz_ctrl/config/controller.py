@@ -116,6 +116,8 @@ class ControllerConfig(FrozenModel):
     """How long the sense offsets are averaged at 0 V."""
     stop_s: Annotated[float, Field(gt=0, le=10)] = 0.004
     """How long the path takes to stop when it is held, and to be taken up again."""
+    landing_s: Annotated[float, Field(gt=0, le=0.05)] = 0.005
+    """How long a stop leads the stage down to rest, where combs and sensors can be trusted; then 0 V in any case."""
     learn: Literal["off", "online"] = "off"
     """online: what this device differs in from its stage file is learnt while the loop works"""
     adaptation: Adaptation = Adaptation()

@@ -69,12 +69,32 @@ def ask(law: np.void, memory: np.void, now: Array, after: Array, later: Array) -
             demand[i] += model["fed_back_n"][i]
             if online:  # the model is as drawn: what the device differs in, and what makes up for it, is not in it
                 model["fed_back_n"][i] += learnt["added_n"][i]
-    elif memory["plan_known"] != 0:
-        for i in range(3):
-            demand[i] += share * memory["plan_n"][i]
     else:
-        feedback.add_feedback(gains, origin, memory["estimate"]["ahead"], row, share, demand)
+        _follow_plan(law, memory, share)
+        for i in range(3):
+            demand[i] += model["fed_back_n"][i]
     return float(share)
+
+
+@njit(cache=True, error_model="numpy")
+def _follow_plan(law: np.void, memory: np.void, share: float) -> None:
+    """As ``_feed_back``, of a law that plans: the plan's force, or without one that of the regulator."""
+    model, planned = memory["set_point_model"], memory["set_point_model"]["fed_back_n"]
+    if memory["landing"] != 0:
+        for i in range(3):
+            planned[i] = memory["landing_share"] * model["feedback_n"][i]
+        return
+    for i in range(3):
+        planned[i] = share * memory["plan_n"][i] if memory["plan_known"] != 0 else 0.0
+    if memory["plan_known"] == 0:
+        origin, ahead, row = (
+            law["estimator"]["operating_point_m"],
+            memory["estimate"]["ahead"],
+            memory["scratch"]["row"],
+        )
+        feedback.add_feedback(law["feedback"], origin, ahead, row, share, planned)
+    for i in range(3):
+        model["feedback_n"][i] = planned[i]
 
 
 @njit(cache=True, error_model="numpy")
@@ -87,10 +107,15 @@ def feedforward(law: np.void, row: Array, out: Array) -> None:
 @njit(cache=True, error_model="numpy")
 def _feed_back(law: np.void, memory: np.void, share: float) -> None:
     """Note the force (3,) at the platform by which the feedback answers to what the stage does otherwise than the model
-    of the set-points; none in open loop.
+    of the set-points; none in open loop. While the stage is led down it is a share of the last: a device that takes
+    more force than the model says takes more all the way, and a law that went astray is out of the loop.
     """
     model, ours, origin = memory["set_point_model"], memory["scratch"]["row"], law["estimator"]["operating_point_m"]
     fed_back = model["fed_back_n"]
+    if memory["landing"] != 0:
+        for i in range(3):
+            fed_back[i] = memory["landing_share"] * model["feedback_n"][i]
+        return
     for i in range(3):
         fed_back[i] = 0.0
     if law["kind"] == STATE_FEEDBACK:
@@ -102,3 +127,5 @@ def _feed_back(law: np.void, memory: np.void, share: float) -> None:
     elif law["kind"] == LINEAR:
         seen, expected = memory["seen_m"], model["sample_m"][0]
         linear_law.add_feedback(law["linear"], memory["linear"], seen, expected, share, fed_back)
+    for i in range(3):
+        model["feedback_n"][i] = fed_back[i]

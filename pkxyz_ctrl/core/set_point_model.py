@@ -41,6 +41,7 @@ SET_POINT_MODEL = np.dtype(
         ("sample_m", "f8", (DELAY_MAX + 1, 3)),  # what the sample of this tick, and those after it, would show
         ("fed_back_n", "f8", (3,)),  # what feedback and adaptation have of this tick's force at the platform
         ("fed_back_old_n", "f8", (3,)),  # and of the last one's
+        ("feedback_n", "f8", (3,)),  # of the last tick in which the feedback was alive, without adaptation
         ("applied_n", "f8", (3,)),  # comb forces of the last tick
         ("short_m", "f8", (3,)),  # where is aimed less where the reference has jumped to
         ("short_later_m", "f8", (3,)),  # a period later
@@ -57,6 +58,7 @@ def set_out(estimator: np.void, model: np.void, position_m: Array) -> None:
     for i in range(3):
         model["fed_back_n"][i] = 0.0
         model["fed_back_old_n"][i] = 0.0
+        model["feedback_n"][i] = 0.0
         model["applied_n"][i] = 0.0
         model["short_m"][i] = 0.0
         for age in range(DELAY_MAX + 1):

@@ -112,6 +112,8 @@ MEMORY = np.dtype(
         ("held_n", "f8", (3,)),  # the same with what makes up for its being held
         ("feedforward_known", "i4"),
         ("active_set_steps", "i4"),
+        ("landing", "i4"),  # 1: the stage is led down; instead of the feedback acts ...
+        ("landing_share", "f8"),  # ... so much of its last force
         ("scratch", SCRATCH),
     ],
     align=True,
@@ -201,7 +203,7 @@ def act(law: np.void, memory: np.void, now: Array, after: Array, later: Array) -
     multiply3_transposed(j, force, applied)
     for i in range(3):
         memory["slack_n"][i] = demand[i] - applied[i]
-    if memory["active_set_steps"] > 1:
+    if memory["active_set_steps"] > 1 or memory["landing"] != 0:
         adaptation.disturb(memory["adaptation"])
     if kind != PREDICTIVE:
         _follow(law, memory)
@@ -241,6 +243,7 @@ def release(law: np.void, memory: np.void) -> None:
         memory["force_n"][i] = 0.0
     memory["active_set_steps"] = 0
     memory["feedforward_known"] = 0
+    memory["landing"] = 0
     linear_law.clear(memory["linear"])
     youla.clear(memory["youla"])
     adaptation.clear(memory["adaptation"])

@@ -62,6 +62,7 @@ def design_law(stage: Stage, controller: ControllerConfig, bus: BusConfig, *, au
     law["period_us"] = bus.period_us
     law["homing_ticks"] = max(1, round(controller.homing_s / bus.period_s))
     law["feed_hold_ticks"] = 2 * max(1, round(0.5 * controller.stop_s / bus.period_s))
+    law["landing_ticks"] = max(1, round(controller.landing_s / bus.period_s))
     law["autostart"] = autostart
     law.flags.writeable = False
     return law

@@ -5,16 +5,16 @@ loop that waits for a clock and by the lane that does not; it reads ``memory["in
 counts, mode and record in ``memory["row"]``.
 """
 
-import math
-
 import numpy as np
 from numba import njit
 from numpy.typing import NDArray
 
-from pkxyz_ctrl.core import demand, feed_hold, tick, youla
+from pkxyz_ctrl.core import demand, feed_hold, landing, tick, youla
+from pkxyz_ctrl.loop import set_points
 from pkxyz_ctrl.loop.row import ROW
 from pkxyz_ctrl.safety.modes import (
     LOOP_CLOSED,
+    MAY_ENERGISE,
     NODE_EXPECTED,
     Event,
     Mode,
@@ -25,6 +25,7 @@ from pkxyz_ctrl.safety.modes import (
     next_safe_cycles,
 )
 from pkxyz_ctrl.safety.monitors import LIMITS, MONITOR_MEMORY, OBSERVATION, SenseStatus, check, implausible_combs
+from pkxyz_ctrl.safety.trips import LANDS, Trip
 
 Array = NDArray[np.float64]
 Records = NDArray[np.void]
@@ -49,6 +50,7 @@ LAW = np.dtype(
         ("period_us", "i8"),
         ("homing_ticks", "i4"),
         ("feed_hold_ticks", "i4"),  # even: how long the path takes to stop, and to be taken up again
+        ("landing_ticks", "i4"),  # so long a stop leads down to rest
         ("autostart", "i4"),  # 1: home, enable and track by itself, as a scenario wants it
         ("quiet_holds", "i4"),  # 1: holds are quiet without being asked for
     ],
@@ -81,20 +83,25 @@ MEMORY = np.dtype(
         ("suspects", "i4"),  # combs whose stroke was not believed in this tick, one bit each
         ("feed", "i4"),  # feed_hold.SLOWING, STEADY, STARTING
         ("feed_age", "i4"),
+        ("landing_from", "f8", (9,)),  # row at which the way down began, where this tick's force begins to act
+        ("landing_age", "i4"),  # ticks of it that have passed
+        ("landed_by", "i8"),  # Trip bits for which the stage is led down; 0: it was asked for
         ("held", "i4"),  # 1: somebody asked to hold, and the automatic start leaves it at that
     ],
     align=True,
 )
 
-_ROW_LENGTH = 9
 _UNUSABLE = int(SenseStatus.MISSING | SenseStatus.CRC | SenseStatus.LENGTH | SenseStatus.DUPLICATE)
 _IMPLAUSIBLE = int(SenseStatus.IMPLAUSIBLE)
 _NONE, _HOME, _HOMED, _ENABLE, _TRACK, _TRIP, _CLEAR = (
     int(e) for e in (Event.NONE, Event.HOME, Event.HOMED, Event.ENABLE, Event.TRACK, Event.TRIP, Event.CLEAR)
 )
-_IDLE, _HOMING, _ENABLED, _TRACKING, _FAULT = (
-    int(m) for m in (Mode.IDLE, Mode.HOMING, Mode.ENABLED, Mode.TRACKING, Mode.FAULT)
+_LAND, _LANDED = int(Event.LAND), int(Event.LANDED)
+_IDLE, _HOMING, _ENABLED, _TRACKING, _FAULT, _LANDING = (
+    int(m) for m in (Mode.IDLE, Mode.HOMING, Mode.ENABLED, Mode.TRACKING, Mode.FAULT, Mode.LANDING)
 )
+_LANDS = int(LANDS)
+_LANDS_ONCE = int(Trip.OVERRUN)  # a computer that is late on the way down, too, is not waited for
 
 
 def new_memory(mode: Mode = Mode.BOOT) -> NDArray[np.void]:
@@ -122,6 +129,8 @@ def observe(law_array: Records, memory_array: Records, reference: Records) -> No
     """First part of the period: event and mode, measurement, estimate, the rows of the reference that count."""
     law, memory = law_array[0], memory_array[0]
     _handle(law, memory, _asked(law, memory))
+    if memory["mode"] == _LANDING:
+        _go_on_landing(law, memory)
     seen = memory["input"]
     usable = (seen["sense_status"] & _UNUSABLE) == 0
     if NODE_EXPECTED[memory["mode"]] == 0:  # an estimate that ran away with what broke would outlive the clear
@@ -131,7 +140,7 @@ def observe(law_array: Records, memory_array: Records, reference: Records) -> No
         if memory["mode"] == _HOMING:
             _average(law, memory)
         if memory["mode"] == _TRACKING:
-            _excite(memory, reference)
+            set_points.excite(memory, reference)
     memory["suspects"] = _suspects(law, memory) if usable else 0
     believed = usable and memory["suspects"] == 0
     tick.estimate(law["tick"], memory["tick"], believed)
@@ -139,11 +148,11 @@ def observe(law_array: Records, memory_array: Records, reference: Records) -> No
         for i in range(3):
             memory["tick"]["estimate"]["innovation_m"][i] = memory["rejected_innovation_m"][i]
     delay = law["tick"]["delay_periods"]
-    reference_row(law, memory, reference, 0, memory["here"])
-    _asked_for(memory, reference)
-    reference_row(law, memory, reference, delay, memory["now"])
-    reference_row(law, memory, reference, delay + 1, memory["after"])
-    reference_row(law, memory, reference, delay + 2, memory["later"])
+    set_points.reference_row(law, memory, reference, 0, memory["here"])
+    set_points.asked_for(memory, reference)
+    set_points.reference_row(law, memory, reference, delay, memory["now"])
+    set_points.reference_row(law, memory, reference, delay + 1, memory["after"])
+    set_points.reference_row(law, memory, reference, delay + 2, memory["later"])
     quiet = law["quiet_holds"] != 0 or memory["input"]["quiet"] != 0
     youla.ask(memory["tick"]["youla"], quiet, memory["here"], memory["later"])
 
@@ -153,7 +162,7 @@ def respond(law_array: Records, memory_array: Records) -> None:
     """Second part: law and voltages, monitors, record. A plan made between the two stands in ``memory["tick"]``."""
     law, memory = law_array[0], memory_array[0]
     state, seen, saturated = memory["tick"], memory["input"], 0
-    if LOOP_CLOSED[memory["mode"]] != 0:
+    if MAY_ENERGISE[memory["mode"]] != 0:
         now, after, later = memory["now"], memory["after"], memory["later"]
         saturated = 1 if tick.act(law["tick"], state, now, after, later) else 0
     else:
@@ -163,7 +172,7 @@ def respond(law_array: Records, memory_array: Records) -> None:
     usable = (seen["sense_status"] & _UNUSABLE) == 0
     memory["safe_cycles"] = next_safe_cycles(memory["safe_cycles"], memory["mode"], usable, tick.is_discharged(state))
     if memory["feed"] != feed_hold.STEADY:
-        _scale_time(law, memory)
+        set_points.scale_time(law, memory)
     elif memory["mode"] == _TRACKING:
         memory["reference_tick"] += 1
     memory["tick_index"] += 1
@@ -211,9 +220,13 @@ def _handle(law: np.void, memory: np.void, event: int) -> None:
     if target == mode:
         return
     memory["mode"] = target
+    if mode == _LANDING:
+        set_points.end_landing(memory)
     if LOOP_CLOSED[target] == 0:
         memory["feed"] = feed_hold.STEADY
-    if target == _HOMING:
+    if target == _LANDING:
+        set_points.begin_landing(memory)
+    elif target == _HOMING:
         memory["homing_count"] = 0
         memory["homing_sum"][:] = 0
         memory["tick"]["sense_zero_f"][:] = 0.0
@@ -226,41 +239,20 @@ def _handle(law: np.void, memory: np.void, event: int) -> None:
         memory["held"] = 0
     elif target == _ENABLED and mode == _TRACKING:
         memory["held"] = 1
-        _turn_feed(law, memory, feed_hold.SLOWING)
+        set_points.turn_feed(law, memory, feed_hold.SLOWING)
     elif target == _TRACKING:
         if memory["held"] != 0:
-            _turn_feed(law, memory, feed_hold.STARTING)
+            set_points.turn_feed(law, memory, feed_hold.STARTING)
         memory["held"] = 0
 
 
 @njit(cache=True, error_model="numpy")
-def _turn_feed(law: np.void, memory: np.void, direction: int) -> None:
-    """Begin to stop on the path, or to go on along it; in the middle of the other, from the speed that there is."""
-    at = memory["reference_tick"] + memory["phase"]
-    age = 0
-    if memory["feed"] == -direction:
-        covered, _, _ = feed_hold.advance(memory["feed"], memory["feed_age"], law["feed_hold_ticks"])
-        at = memory["feed_phase"] + covered
-        age = max(0, law["feed_hold_ticks"] - memory["feed_age"])  # where the mirrored ramp has this speed
-    covered, _, _ = feed_hold.advance(direction, age, law["feed_hold_ticks"])
-    memory["feed"] = direction
-    memory["feed_age"] = age
-    memory["feed_phase"] = at - covered
-
-
-@njit(cache=True, error_model="numpy")
-def _scale_time(law: np.void, memory: np.void) -> None:
-    """A tick of slowing down or starting has passed; at its end the path stands, or goes on at its own speed."""
-    memory["feed_age"] += 1
-    covered, _, _ = feed_hold.advance(memory["feed"], memory["feed_age"], law["feed_hold_ticks"])
-    at = memory["feed_phase"] + covered
-    if memory["feed_age"] >= law["feed_hold_ticks"]:
-        if memory["feed"] == feed_hold.SLOWING:
-            for i in range(_ROW_LENGTH):
-                memory["setpoint"][i] = memory["now"][i]  # which is ahead of this tick, and so stands already
-        memory["feed"] = feed_hold.STEADY
-    memory["reference_tick"] = np.int64(math.floor(at))
-    memory["phase"] = at - math.floor(at)
+def _go_on_landing(law: np.void, memory: np.void) -> None:
+    """A tick of the way down; once the time is over the mode is left, wherever the stage is."""
+    memory["landing_age"] += 1
+    memory["tick"]["landing_share"] = landing.share(memory["landing_age"] / law["landing_ticks"])
+    if memory["landing_age"] >= law["landing_ticks"]:
+        _handle(law, memory, _LANDED if memory["landed_by"] == 0 else _TRIP)
 
 
 @njit(cache=True, error_model="numpy")
@@ -294,50 +286,8 @@ def _average(law: np.void, memory: np.void) -> None:
 
 
 @njit(cache=True, error_model="numpy")
-def _excite(memory: np.void, reference: Records) -> None:
-    """Add the excitation of this sample to the measurement; outside the rows handed in there is none."""
-    index = memory["reference_tick"] - reference[0]["tick"]
-    if 0 <= index < len(reference):
-        added = reference[index]["added_m"]
-        for i in range(3):
-            if added[i] != 0.0:
-                memory["tick"]["measurement_m"][i] += added[i]
-
-
-@njit(cache=True, error_model="numpy")
-def reference_row(law: np.void, memory: np.void, reference: Records, ahead: int, out: Array) -> None:
-    """Write the row (9,) of the set-point ``ahead`` ticks from this one to ``out``."""
-    base = reference[0]["tick"]
-    if memory["feed"] != feed_hold.STEADY:
-        covered, speed, change = feed_hold.advance(memory["feed"], memory["feed_age"] + ahead, law["feed_hold_ticks"])
-        at = memory["feed_phase"] - base + covered
-        feed_hold.sample(reference, at, speed, change, law["period_us"] * 1e-6, out)
-    elif memory["mode"] == _TRACKING and memory["phase"] != 0.0:
-        at = memory["reference_tick"] - base + ahead + memory["phase"]
-        feed_hold.sample(reference, at, 1.0, 0.0, law["period_us"] * 1e-6, out)
-    elif memory["mode"] == _TRACKING:
-        index = memory["reference_tick"] - base + ahead
-        motion = reference[min(max(index, 0), len(reference) - 1)]["motion"]
-        for i in range(_ROW_LENGTH):
-            out[i] = motion[i]
-    else:
-        for i in range(_ROW_LENGTH):
-            out[i] = memory["setpoint"][i]
-
-
-@njit(cache=True, error_model="numpy")
-def _asked_for(memory: np.void, reference: Records) -> None:
-    """Note the position asked for at this sample, for the record; while the path stops or starts, with its shift."""
-    on_time = memory["feed"] == feed_hold.STEADY and memory["phase"] == 0.0
-    from_row = memory["mode"] == _TRACKING and on_time
-    index = min(max(memory["reference_tick"] - reference[0]["tick"], 0), len(reference) - 1)
-    for i in range(3):
-        memory["asked_m"][i] = reference[index]["asked_m"][i] if from_row else memory["here"][i]
-
-
-@njit(cache=True, error_model="numpy")
 def _monitor(law: np.void, memory: np.void, saturated: int) -> int:
-    """Let the monitors look at this tick; a trip takes the voltages of this very tick to 0."""
+    """Let the monitors look at this tick. A trip takes the voltages of this very tick to 0, or begins the way down."""
     seen, state, obs = memory["input"], memory["tick"], memory["observation"]
     obs["mode"], obs["sense_status"] = memory["mode"], seen["sense_status"]
     obs["node_events"], obs["overrun"] = seen["node_events"], seen["overrun"]
@@ -356,8 +306,17 @@ def _monitor(law: np.void, memory: np.void, saturated: int) -> int:
         )
     trips = check(law["limits"], memory["monitors"], obs) | seen["trips"]
     if trips != 0 and memory["mode"] != _FAULT:
-        _handle(law, memory, _TRIP)
-        tick.release(law["tick"], state)
+        is_landing = memory["mode"] == _LANDING
+        if trips & ~(_LANDS & ~_LANDS_ONCE if is_landing else _LANDS) != 0:
+            _handle(law, memory, _TRIP)
+        else:
+            memory["landed_by"] |= trips
+            _handle(law, memory, _LAND)
+        if memory["mode"] == _FAULT:
+            tick.release(law["tick"], state)
+    if memory["mode"] == _FAULT:  # where the reason is told
+        trips |= memory["landed_by"]
+        memory["landed_by"] = 0
     return trips
 
 

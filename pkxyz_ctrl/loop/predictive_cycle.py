@@ -20,6 +20,7 @@ from pkxyz_ctrl.core.linear3 import multiply3, multiply3_transposed
 from pkxyz_ctrl.loop import cycle as cycling
 from pkxyz_ctrl.loop.predictive_problem import FORCE_UNIT_N, STROKE_UNIT_M, Problem
 from pkxyz_ctrl.loop.reference import standing_still
+from pkxyz_ctrl.loop.set_points import reference_row
 from pkxyz_ctrl.safety.modes import LOOP_CLOSED
 
 Array = NDArray[np.float64]
@@ -128,7 +129,7 @@ def plan(law_array: Records, memory_array: Records, reference: Records, fixed: A
         return predictive.NO_PLAN
     tick, state = law["tick"], memory["tick"]
     for k in range(n + 2):
-        cycling.reference_row(law, memory, reference, tick["delay_periods"] + k, rows[k])
+        reference_row(law, memory, reference, tick["delay_periods"] + k, rows[k])
     predictive.deviation(tick, state, rows, error)
     jump, nu, e = np.empty((n, 3)), np.empty((n, 3)), np.empty((n + 1, 6))
     jumps = predictive.jumps(tick["feedback"]["period_s"], rows[: n + 1], jump)

@@ -48,6 +48,7 @@ PERMITTED: Final[dict[Mode, FrameKind]] = {
     Mode.ENABLED: ALWAYS | FrameKind.SDO_READ | FrameKind.DRIVE,
     Mode.TRACKING: ALWAYS | FrameKind.SDO_READ | FrameKind.DRIVE,
     Mode.FAULT: ALWAYS | FrameKind.SDO_READ | FrameKind.NMT_RESET,
+    Mode.LANDING: ALWAYS | FrameKind.SDO_READ | FrameKind.DRIVE,
 }
 
 

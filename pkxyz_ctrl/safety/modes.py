@@ -20,6 +20,7 @@ class Mode(IntEnum):
     ENABLED = 4
     TRACKING = 5
     FAULT = 6
+    LANDING = 7
 
 
 class Event(IntEnum):
@@ -38,6 +39,8 @@ class Event(IntEnum):
     CLEAR = 12
     ENABLE_UNSETTLED = 13
     CLEAR_UNSETTLED = 14
+    LAND = 15
+    LANDED = 16
 
 
 EVENT_MEANING: Final[dict[Event, str]] = {
@@ -51,18 +54,20 @@ EVENT_MEANING: Final[dict[Event, str]] = {
     Event.ENABLE_UNHOMED: "asked for: close the loop, with sense offsets unknown; refused in every mode",
     Event.TRACK: "asked for: follow the reference",
     Event.HOLD: "asked for: stop following, hold the set-point",
-    Event.DISABLE: "asked for: open the loop, 0 V",
-    Event.TRIP: "a monitor, the transmit gate or the operator has tripped",
+    Event.DISABLE: "asked for: lead the stage down, then open the loop, 0 V",
+    Event.TRIP: "a monitor or the transmit gate has tripped; combs or sensors can't be trusted",
     Event.CLEAR: "asked for: forget the fault and begin again, after enough cycles at 0 V",
     Event.ENABLE_UNSETTLED: "asked for: close the loop, too few safe cycles after the last; refused in every mode",
     Event.CLEAR_UNSETTLED: "asked for: forget the fault, too few cycles at 0 V after it; refused in every mode",
+    Event.LAND: "a monitor or the operator has tripped; combs and sensors can be trusted",
+    Event.LANDED: "the time to lead the stage down is over, after a wish to open the loop",
 }
 
 
 class ModeFacts(NamedTuple):
     """What holds while in a mode.
 
-    ``may_energise``: a voltage other than 0 V may go out. ``loop_closed``: the law's result is what goes out.
+    ``may_energise``: a voltage other than 0 V may go out. ``loop_closed``: what is measured has a part in it.
     ``node_expected``: the node is operational, so every tick owes us a sense frame and a heartbeat is due.
     """
 
@@ -80,32 +85,43 @@ MODE_FACTS: Final[dict[Mode, ModeFacts]] = {
     Mode.ENABLED: ModeFacts(True, True, True, "loop closed, holding the set-point"),
     Mode.TRACKING: ModeFacts(True, True, True, "loop closed, following the reference"),
     Mode.FAULT: ModeFacts(False, False, False, "0 V, latched with its reason until cleared"),
+    Mode.LANDING: ModeFacts(True, False, True, "the stage is led down to rest, for a given time; then 0 V"),
 }
 
+# LAND where nothing has to be led down is a trip. How LANDING ends depends on how it began: by TRIP, if by LAND.
 # Losing the node at 0 V is an inconvenience: begin again. Losing it under voltage is a fault that a person has to read.
 # CLEAR leads to BOOT, not to where it came from: after a fault nothing about the node is taken as known.
 TRANSITIONS: Final[dict[tuple[Mode, Event], Mode]] = {
     (Mode.BOOT, Event.NODE_FOUND): Mode.PRE_OPERATIONAL,
     (Mode.BOOT, Event.TRIP): Mode.FAULT,
+    (Mode.BOOT, Event.LAND): Mode.FAULT,
     (Mode.PRE_OPERATIONAL, Event.NODE_READY): Mode.IDLE,
     (Mode.PRE_OPERATIONAL, Event.NODE_LOST): Mode.BOOT,
     (Mode.PRE_OPERATIONAL, Event.TRIP): Mode.FAULT,
+    (Mode.PRE_OPERATIONAL, Event.LAND): Mode.FAULT,
     (Mode.IDLE, Event.HOME): Mode.HOMING,
     (Mode.IDLE, Event.ENABLE): Mode.ENABLED,
     (Mode.IDLE, Event.NODE_LOST): Mode.BOOT,
     (Mode.IDLE, Event.TRIP): Mode.FAULT,
+    (Mode.IDLE, Event.LAND): Mode.FAULT,
     (Mode.HOMING, Event.HOMED): Mode.IDLE,
     (Mode.HOMING, Event.DISABLE): Mode.IDLE,
     (Mode.HOMING, Event.NODE_LOST): Mode.BOOT,
     (Mode.HOMING, Event.TRIP): Mode.FAULT,
+    (Mode.HOMING, Event.LAND): Mode.FAULT,
     (Mode.ENABLED, Event.TRACK): Mode.TRACKING,
-    (Mode.ENABLED, Event.DISABLE): Mode.IDLE,
+    (Mode.ENABLED, Event.DISABLE): Mode.LANDING,
+    (Mode.ENABLED, Event.LAND): Mode.LANDING,
     (Mode.ENABLED, Event.NODE_LOST): Mode.FAULT,
     (Mode.ENABLED, Event.TRIP): Mode.FAULT,
     (Mode.TRACKING, Event.HOLD): Mode.ENABLED,
-    (Mode.TRACKING, Event.DISABLE): Mode.IDLE,
+    (Mode.TRACKING, Event.DISABLE): Mode.LANDING,
+    (Mode.TRACKING, Event.LAND): Mode.LANDING,
     (Mode.TRACKING, Event.NODE_LOST): Mode.FAULT,
     (Mode.TRACKING, Event.TRIP): Mode.FAULT,
+    (Mode.LANDING, Event.LANDED): Mode.IDLE,
+    (Mode.LANDING, Event.NODE_LOST): Mode.FAULT,
+    (Mode.LANDING, Event.TRIP): Mode.FAULT,
     (Mode.FAULT, Event.CLEAR): Mode.BOOT,
 }
 
@@ -126,9 +142,9 @@ def _fact_array(facts: list[bool]) -> NDArray[np.int8]:
     return array
 
 
-# (7, 15) int8: the target, or REFUSED. Compiled callers freeze this and the three arrays below as constants.
+# (8, 17) int8: the target, or REFUSED. Compiled callers freeze this and the three arrays below as constants.
 TRANSITION_TABLE: Final = _transition_table()
-# (7,) int8, 0 or 1, by mode.
+# (8,) int8, 0 or 1, by mode.
 MAY_ENERGISE: Final = _fact_array([MODE_FACTS[mode].may_energise for mode in Mode])
 LOOP_CLOSED: Final = _fact_array([MODE_FACTS[mode].loop_closed for mode in Mode])
 NODE_EXPECTED: Final = _fact_array([MODE_FACTS[mode].node_expected for mode in Mode])

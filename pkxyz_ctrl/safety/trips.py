@@ -1,4 +1,4 @@
-"""Why the combs went to 0 V: the bits of a trip, and what a person reads."""
+"""Why the combs went to 0 V, and how: the bits of a trip, and what a person reads."""
 
 from enum import IntFlag
 from typing import Final
@@ -39,6 +39,35 @@ class Trip(IntFlag):
     COMB_FORCE_2 = 1 << 28
     COMB_FORCE_3 = 1 << 29
     FOREIGN_FRAME = 1 << 30
+
+
+LANDS: Final = Trip.SATURATION | Trip.OVERRUN | Trip.SOLVER | Trip.OPERATOR
+"""After these, combs, sensors and bus do what they did before: the stage is led down. After all others 0 V at once."""
+
+STOPS: Final[dict[str, str]] = {
+    "SENSE_STALE": "who doesn't hear the node doesn't know whether it hears",
+    "SENSE_SEQUENCE": "two may be speaking, and nobody knows which is the node",
+    "SENSE_CRC": "what damages sense frames damages drive frames",
+    "SENSE_LENGTH": "the node isn't configured as was checked",
+    "SENSE_RANGE": "a sensor fails, or the stage is against a stop",
+    "SENSE_FROZEN": "a sensor fails",
+    "INNOVATION": "the stage isn't where the model has it: touched, or snapped",
+    "SATURATION": "combs and sensors obey; the reference asks too much",
+    "SLEW": "the program does what it can't: its path down is not trusted either",
+    "OVERRUN": "combs and sensors obey; only the computer is late. Once more while landing: 0 V",
+    "SOLVER": "combs and sensors obey; the path down needs no optimiser",
+    "NOT_FINITE": "nothing that is computed is trusted",
+    "HEARTBEAT_LOST": "the node may be gone",
+    "NODE_NOT_OPERATIONAL": "the node has left its outputs at 0 V already",
+    "NODE_REBOOTED": "the node's outputs are at 0 V already",
+    "NODE_EMERGENCY": "the amplifier says itself that it fails",
+    "GATE_BLOCKED": "the program sent what it must not",
+    "OPERATOR": "nothing is wrong",
+    "COMB_MISFIT": "a comb or its sensor doesn't obey",
+    "COMB_FORCE": "a comb doesn't give the force of its voltage",
+    "FOREIGN_FRAME": "somebody else may drive the combs",
+}
+"""Why the stage is led down, or not, by the name of a trip without the number of a comb or the axis."""
 
 
 # What happened, in terms of the instrument; then what to look at, most likely first.

@@ -4,47 +4,15 @@ import dataclasses
 
 import numpy as np
 import pytest
+from cycle_rig import AT_REST, HOMING_TICKS, enabled, homed, in_the_middle, noisy, tracking
 from loop_rig import MIDDLE, Cycle, bus, controller_with, counts_at, law, rows_of, setup, stage
 from numpy.typing import NDArray
 
 from hil.runs.metrics import Metrics
-from pkxyz_ctrl.core.tick import set_position
 from pkxyz_ctrl.design.law import design_law
 from pkxyz_ctrl.safety.modes import Event, Mode
 from pkxyz_ctrl.safety.monitors import NodeEvent, SenseStatus
 from pkxyz_ctrl.safety.trips import Trip
-
-HOMING_TICKS = 250  # 0.05 s at 5 kHz
-AT_REST = counts_at(np.zeros(3))
-
-
-def noisy(counts: NDArray[np.int32], tick: int) -> NDArray[np.int32]:
-    """Counts with a little noise, never the same twice in a row: 0, 3, -2 ... whose mean over 250 ticks is 0."""
-    return counts + np.array([(0, 3, -2, 1, -2)[(tick + 2 * i) % 5] for i in range(3)], np.int32)
-
-
-def homed(autostart: bool = False, reference: NDArray[np.float64] | None = None) -> Cycle:
-    """A cycle after homing at rest: IDLE, with sense offsets of zero."""
-    c = Cycle(law(autostart=autostart), reference)
-    for k in range(HOMING_TICKS):
-        c.tick(noisy(AT_REST, k), event=Event.HOME if k == 0 and not autostart else Event.NONE)
-    assert c.mode is Mode.IDLE
-    return c
-
-
-def enabled() -> Cycle:
-    c = homed()
-    c.tick(noisy(AT_REST, 0), event=Event.ENABLE)
-    assert c.mode is Mode.ENABLED
-    return c
-
-
-def tracking(reference: NDArray[np.float64] | None = None) -> Cycle:
-    c = homed(reference=reference)
-    c.tick(noisy(AT_REST, 0), event=Event.ENABLE)
-    c.tick(noisy(AT_REST, 1), event=Event.TRACK)
-    assert c.mode is Mode.TRACKING
-    return c
 
 
 def test_the_automatic_start_tick_by_tick():
@@ -180,22 +148,8 @@ def test_the_fifth_stale_frame_is_a_fault_with_0_v_in_that_tick(status):
         assert not any(row[name].any() for name in ("voltage_v", "force_n", "demand_n", "slack_n"))
 
 
-def in_the_middle() -> Cycle:
-    """Tracking a reference that stands at mid-workspace, as if the stage had got there."""
-    at = stage().forward_kinematics(MIDDLE)
-    c = tracking(np.tile(np.r_[at, np.zeros(6)], (16, 1)))
-    memory, drive = c.memory["tick"][0], c.law["tick"]["drive"][0]
-    memory["count"][:] = np.round(stage().holding_voltages(at) / drive["volt_per_count"]).astype(np.int32)
-    set_position(c.law["tick"][0], memory, at)
-    memory["set_point_model"]["applied_n"][:] = stage().holding_forces(at)
-    c.memory["monitors"]["commanded_n"][0] = stage().holding_forces(at)  # no force has changed of late
-    c.tick(noisy(counts_at(MIDDLE), 0))
-    assert c.mode is Mode.TRACKING
-    return c
-
-
 @pytest.mark.parametrize("mode", [Mode.IDLE, Mode.ENABLED, Mode.TRACKING])
-@pytest.mark.parametrize("trip", [Trip.GATE_BLOCKED, Trip.OPERATOR])
+@pytest.mark.parametrize("trip", [Trip.GATE_BLOCKED, Trip.GATE_BLOCKED | Trip.OPERATOR, Trip.COMB_FORCE_2])
 def test_a_trip_from_outside_acts_in_that_tick(mode, trip):
     c = {Mode.IDLE: homed, Mode.ENABLED: enabled, Mode.TRACKING: in_the_middle}[mode]()
     assert c.mode is mode
@@ -212,7 +166,7 @@ def test_a_trip_from_outside_acts_in_that_tick(mode, trip):
 @pytest.mark.parametrize("event", [e for e in Event if e not in (Event.CLEAR, Event.NONE)])
 def test_a_fault_stays_whatever_is_asked(event):
     c = in_the_middle()
-    c.tick(noisy(AT_REST, 0), trips=int(Trip.OPERATOR))
+    c.tick(noisy(AT_REST, 0), trips=int(Trip.GATE_BLOCKED))
     row = c.tick(noisy(AT_REST, 1), event=event)
     assert row["mode"] == Mode.FAULT
     assert not row["drive_count"].any()
@@ -220,7 +174,7 @@ def test_a_fault_stays_whatever_is_asked(event):
 
 def test_clear_begins_again_and_forgets_the_offsets():
     c = homed(autostart=True)
-    c.tick(noisy(AT_REST, 0), trips=int(Trip.OPERATOR))
+    c.tick(noisy(AT_REST, 0), trips=int(Trip.GATE_BLOCKED))
     assert c.tick(noisy(AT_REST, 1), event=Event.CLEAR)["mode"] == Mode.BOOT
     assert not c.memory["homed"][0]
     for k in range(3):  # the automatic start waits for the node
@@ -284,14 +238,14 @@ def test_a_wild_sample_of_one_comb_reaches_no_voltage_and_too_many_name_the_comb
 
 def test_a_fault_is_cleared_only_on_request_and_after_safe_cycles():
     c = in_the_middle()
-    row = c.tick(noisy(counts_at(MIDDLE), 1), trips=int(Trip.OPERATOR))
+    row = c.tick(noisy(counts_at(MIDDLE), 1), trips=int(Trip.GATE_BLOCKED))
     for k in range(60):
         row = c.tick(noisy(AT_REST, k))
         assert row["mode"] == Mode.FAULT
     row = c.tick(noisy(AT_REST, 1), event=Event.CLEAR)
     assert (row["event"], row["mode"]) == (Event.CLEAR, Mode.BOOT)
     again = in_the_middle()
-    again.tick(noisy(counts_at(MIDDLE), 1), trips=int(Trip.OPERATOR))
+    again.tick(noisy(counts_at(MIDDLE), 1), trips=int(Trip.GATE_BLOCKED))
     for k in range(9):  # the tick of the fault was the first at 0 V
         row = again.tick(noisy(AT_REST, k), event=Event.CLEAR)
         assert (row["event"], row["mode"]) == (Event.CLEAR_UNSETTLED, Mode.FAULT)
@@ -430,9 +384,12 @@ def test_the_automatic_start_leaves_a_hold_alone():
     assert c.mode is Mode.TRACKING
 
 
-def test_disable_opens_the_loop_at_once_and_enable_begins_at_rest():
+def test_disable_leads_down_and_opens_the_loop_and_enable_begins_at_rest():
     c = in_the_middle()
-    row = c.tick(noisy(counts_at(MIDDLE), 1), event=Event.DISABLE)
+    for k in range(25):  # 5 ms
+        row = c.tick(noisy(counts_at(MIDDLE), k), event=Event.DISABLE if k == 0 else Event.NONE)
+        assert c.mode is Mode.LANDING
+    row = c.tick(noisy(AT_REST, 1))
     assert c.mode is Mode.IDLE
     assert not row["drive_count"].any()
     assert row["trips"] == 0
@@ -458,7 +415,7 @@ def test_voltages_never_change_faster_than_the_slew_limit_but_for_a_release():
     slew = c.law["tick"]["drive"]["count_slew_max"][0]
     assert slew == int(20 / (200 / 32767))
     assert steps[0] == max(steps) == slew
-    assert not c.tick(noisy(counts_at(MIDDLE), 9), trips=int(Trip.OPERATOR))["drive_count"].any()
+    assert not c.tick(noisy(counts_at(MIDDLE), 9), trips=int(Trip.GATE_BLOCKED))["drive_count"].any()
     assert last.min() > 14_000
 
 
@@ -466,7 +423,7 @@ def test_an_event_and_a_trip_are_taken_once():
     c = homed()
     c.tick(noisy(AT_REST, 0), event=Event.ENABLE)
     assert c.memory["input"]["event"][0] == Event.NONE
-    c.tick(noisy(AT_REST, 1), trips=int(Trip.OPERATOR))
+    c.tick(noisy(AT_REST, 1), trips=int(Trip.GATE_BLOCKED))
     assert c.memory["input"]["trips"][0] == 0
 
 

@@ -21,6 +21,7 @@ from pkxyz_ctrl.loop.reference import reference_rows
 
 FRAME_LIMITS = {"stale_count": 2, "sequence_count": 3, "crc_count": 2, "length_count": 2, "frame_leak_ticks": 1}
 NODE_LIMITS = {"overrun_count": 2, "overrun_leak_ticks": 1, "safe_cycles": 2, "range_count": 2}
+LANDING_TICKS = 2
 OFF = ("frozen", "innovation", "residual", "unexplained_force", "saturation", "slew", "solver")
 
 
@@ -39,6 +40,7 @@ def any_law(period_us: int, homing_ticks: int) -> NDArray[np.void]:
     tick["drive"]["noise_shaping"] = 0
     tick["kind"], tick["delay_periods"] = OPEN_LOOP, 1
     record["period_us"], record["homing_ticks"], record["feed_hold_ticks"] = period_us, homing_ticks, 2
+    record["landing_ticks"] = LANDING_TICKS
     for name, value in (FRAME_LIMITS | NODE_LIMITS).items():
         record["limits"][name] = value
     for name in OFF:

@@ -17,6 +17,7 @@ from pkxyz_ctrl.safety.modes import MODE_FACTS, TRANSITIONS, Event, Mode
 
 ENOUGH = 3
 ACTIVE = {Mode.ENABLED, Mode.TRACKING}
+DRIVEN = ACTIVE | {Mode.LANDING}
 WISHES = {Event.ENABLE, Event.CLEAR}  # whatever else is one comes as it is
 
 
@@ -66,8 +67,17 @@ def holds(machine: Machine) -> tuple[int, int]:
                 assert event is Event.ENABLE, f"{event.name} energises"
                 assert state.homed, "energised without homing"
                 assert state.safe >= ENOUGH, "energised before the combs have settled"
-            if after.mode in ACTIVE:
+            if after.mode in DRIVEN:
                 assert after.homed, "energised without sense offsets"
+            if after.mode == Mode.LANDING and state.mode != Mode.LANDING:
+                assert state.mode in ACTIVE, f"a way down from {Mode(state.mode).name}"
+                assert event in (Event.LAND, Event.DISABLE), f"{event.name} leads down"
+            if state.mode == Mode.LANDING and after.mode != Mode.LANDING:
+                ends = {Event.LANDED: Mode.IDLE, Event.TRIP: Mode.FAULT, Event.NODE_LOST: Mode.FAULT}
+                assert ends.get(event) == after.mode, f"{event.name} ends the way down in {Mode(after.mode).name}"
+            if event is Event.LAND:
+                stopped = DRIVEN - ACTIVE if state.mode in DRIVEN else {Mode.FAULT}
+                assert after.mode in stopped, f"a stop in {Mode(state.mode).name} leads to {Mode(after.mode).name}"
             if event is Event.TRIP:
                 assert after.mode == Mode.FAULT, f"a trip in {Mode(state.mode).name} leads to {Mode(after.mode).name}"
             if state.mode == Mode.FAULT and after.mode != Mode.FAULT:
@@ -75,7 +85,7 @@ def holds(machine: Machine) -> tuple[int, int]:
                 assert state.safe >= ENOUGH, "a fault is cleared before the combs have settled"
                 assert not after.homed, "offsets outlive a fault"
             if event is Event.NODE_LOST:
-                assert after.mode not in ACTIVE, "the node is gone, and the loop stays closed"
+                assert after.mode not in DRIVEN, "the node is gone, and the loop stays closed"
             if event is Event.DISABLE:
                 assert after.mode not in ACTIVE
             if after.homed and not state.homed:
@@ -107,16 +117,16 @@ def test_holding_and_following_differ_in_nothing_but_the_reference() -> None:
 
 
 def test_a_voltage_passes_the_gate_in_active_modes_only() -> None:
-    assert {mode for mode, kinds in PERMITTED.items() if kinds & FrameKind.DRIVE} == ACTIVE
-    assert {mode for mode, facts in MODE_FACTS.items() if facts.may_energise} == ACTIVE
+    assert {mode for mode, kinds in PERMITTED.items() if kinds & FrameKind.DRIVE} == DRIVEN
+    assert {mode for mode, facts in MODE_FACTS.items() if facts.may_energise} == DRIVEN
 
 
-@pytest.mark.parametrize("mode", [-(1 << 31), -1, 7, 8, 127, 1 << 30])
+@pytest.mark.parametrize("mode", [-(1 << 31), -1, 8, 9, 127, 1 << 30])
 def test_a_mode_that_does_not_exist_is_a_fault(mode: int) -> None:
-    assert all(modes.next_mode(mode, int(event)) == Mode.FAULT for event in (-1, *Event, 15, 1 << 30))
+    assert all(modes.next_mode(mode, int(event)) == Mode.FAULT for event in (-1, *Event, 17, 1 << 30))
 
 
-@pytest.mark.parametrize("event", [-(1 << 31), -1, 15, 16, 1 << 30])
+@pytest.mark.parametrize("event", [-(1 << 31), -1, 17, 18, 1 << 30])
 def test_an_event_that_does_not_exist_changes_nothing(event: int) -> None:
     assert all(modes.next_mode(int(mode), event) == mode for mode in Mode)
 
@@ -135,6 +145,10 @@ PLANTED = {
     "outlive a fault": Machine(next_homed=lambda homed, *pair: homed or pair == (Mode.HOMING, Event.HOMED)),
     "stays closed": Machine(next_mode=_also((Mode.TRACKING, Event.NODE_LOST), Mode.ENABLED)),
     "from nowhere": Machine(next_homed=lambda homed, mode, event: mode == Mode.HOMING and event != Event.NODE_LOST),
+    "energised without": Machine(next_mode=_also((Mode.IDLE, Event.LAND), Mode.LANDING)),
+    "TRACK energises": Machine(next_mode=_also((Mode.LANDING, Event.TRACK), Mode.TRACKING)),
+    "a stop in ENABLED leads to IDLE": Machine(next_mode=_also((Mode.ENABLED, Event.LAND), Mode.IDLE)),
+    "HOLD leads down": Machine(next_mode=_also((Mode.TRACKING, Event.HOLD), Mode.LANDING)),
     "no way back": Machine(next_mode=_also((Mode.FAULT, Event.CLEAR), Mode.FAULT)),
 }  # fmt: skip
 

@@ -16,7 +16,8 @@ from dataclasses import dataclass, replace
 from functools import cache
 from typing import Any, Final, NamedTuple
 
-from any_law import any_law, reference_for, sense_counts_at_rest
+import numpy as np
+from any_law import LANDING_TICKS, any_law, reference_for, sense_counts_at_rest
 from node_rig import EDS
 from snapshot import Attributes, Bases, Snapshot
 
@@ -31,6 +32,7 @@ from pkxyz_ctrl.can.sdo import SdoStep
 from pkxyz_ctrl.can.start_sequence import DriverState, StartSequence
 from pkxyz_ctrl.config.bus import BusConfig
 from pkxyz_ctrl.config.files import load
+from pkxyz_ctrl.core import landing
 from pkxyz_ctrl.loop.controller import Controller, StartUpError
 from pkxyz_ctrl.safety.gate import GateConfig
 from pkxyz_ctrl.safety.modes import MAY_ENERGISE, Event, Mode
@@ -46,6 +48,7 @@ STEP = 10  # counts that may be added in a tick
 LEVELS: tuple[Counts, ...] = ((0, 0, 0), (10, 10, 0), (20, 20, 10))  # each a permitted step from its neighbour
 TOO_FAR: tuple[Counts, ...] = ((0, 20, 20), (21, 20, 10))  # a comb that drops beyond the slew limit; beyond the maximum
 MAXIMUM = 20
+SOFT, HARD = Trip.OPERATOR, Trip.COMB_FORCE_1  # led down, and at once
 SETTLED = 2  # ticks, before the loop is closed
 NODE_ID, CONTROLLER_ID = 10, 127
 LATE_TICKS = 2  # how long a frame may be held back
@@ -169,6 +172,7 @@ class World:
         self.apart = 0  # ticks since the combs hold something else than what the gate takes them to hold
         self.believed: Counts = (0, 0, 0)  # by the gate, before its last frame
         self.cut: frozenset[int] = frozenset()  # what no longer gets through
+        self.landing = 0  # ticks in a row in which the stage was led down
         self.longest = self.longest_apart = 0
         self.node.power_on()
         self.controller.start(0)
@@ -186,7 +190,7 @@ class World:
         mine = (
             tuple(self.wire), tuple(self.received), self.held, self.plant.counts, self.faults_left, self.phase,
             self.tick_us, self.skipped, self.since_decision, self.quiet,
-            self.apart, self.believed, self.cut,
+            self.apart, self.believed, self.cut, self.landing,
         )  # fmt: skip
         return mine, self._snapshot.take()
 
@@ -195,7 +199,7 @@ class World:
         (
             wire, received, self.held, self.plant.counts, self.faults_left, self.phase,
             self.tick_us, self.skipped, self.since_decision, self.quiet,
-            self.apart, self.believed, self.cut,
+            self.apart, self.believed, self.cut, self.landing,
         ) = mine  # fmt: skip
         self.wire.clear()
         self.wire.extend(wire)
@@ -210,13 +214,13 @@ class World:
     def key(self, state: tuple[Any, ...]) -> bytes:
         mine, rest = state
         bases = self.bases()
-        wire, received, held, counts, left, phase, tick_us, skipped, since, quiet, apart, believed, cut = mine
+        wire, received, held, counts, left, phase, tick_us, skipped, since, quiet, apart, believed, cut, down = mine
         more = (
             tuple(self._frame_key(f, bases) for f in wire),
             tuple(self._frame_key(f, bases) for f in received),
             tuple(sorted((self._frame_key(h.frame, bases), h.ticks_left) for h in held)),
             counts, left, phase, tick_us - bases.now_us, skipped, since, quiet,
-            apart, believed, tuple(sorted(cut)),
+            apart, believed, tuple(sorted(cut)), down,
         )  # fmt: skip
         return self._snapshot.key(rest, bases, more)
 
@@ -289,7 +293,11 @@ class World:
                 wishes = [("tick", event, LEVELS[0], 0) for event in (Event.NONE, Event.DISABLE)]
             case Mode.ENABLED | Mode.TRACKING:
                 wishes = [("tick", Event.NONE, counts, 0) for counts in (*LEVELS, *TOO_FAR)]
-                wishes += [("tick", Event.DISABLE, LEVELS[0], 0), ("tick", Event.NONE, LEVELS[0], int(Trip.OPERATOR))]
+                wishes += [("tick", Event.DISABLE, LEVELS[0], 0)]
+                wishes += [("tick", Event.NONE, LEVELS[0], int(trip)) for trip in (SOFT, HARD)]
+            case Mode.LANDING:
+                wishes = [("tick", Event.NONE, counts, 0) for counts in (*LEVELS, *TOO_FAR)]
+                wishes += [("tick", Event.NONE, LEVELS[0], int(trip)) for trip in (SOFT, HARD)]
             case Mode.FAULT:
                 wishes = [("tick", event, LEVELS[0], 0) for event in (Event.NONE, Event.CLEAR)]
             case _:
@@ -423,6 +431,8 @@ class World:
         reference = self._references[counts]
         memory: Any = controller.memory[0]
         memory["setpoint"] = reference["motion"][0]
+        if controller.mode == Mode.LANDING:
+            memory["landing_from"][6:9] = reference["motion"][0, 6:9] / _bend(int(memory["landing_age"]) + 1)
         memory["input"]["trips"] |= trips
         was, fresh = controller.mode, controller.driver.sense.fresh
         controller.compute(reference, self.skipped)
@@ -445,6 +455,9 @@ class World:
         self.tick_us += PERIOD_US
         self.clock.run_until(self.tick_us)
         self._compare_beliefs()
+        self.landing = self.landing + 1 if self.controller.mode == Mode.LANDING else 0
+        if self.landing > LANDING_TICKS + 1 + self.configuration.faults:  # a fault may be a tick that is missed
+            raise ViolationError(f"the stage has been led down for {self.landing} ticks")
         if MAY_ENERGISE[self.controller.mode] or not any(self.plant.counts):
             self.since_decision = 0
         else:
@@ -487,6 +500,14 @@ class World:
             DriverState.FAILED,
             DriverState.OFF,
         )
+
+
+def _bend(age: int) -> float:
+    """What is left of the acceleration with which a way down began, at a tick of it; its law asks for that alone."""
+    begin, row = np.zeros(9), np.empty(9)
+    begin[6] = 1.0
+    landing.sample(begin, min(age, LANDING_TICKS - 1) / LANDING_TICKS, 1.0, row)
+    return float(row[6])
 
 
 def damaged(frame: Frame) -> list[Frame]:
@@ -538,7 +559,7 @@ def _few_writes(config: DriverConfig, count_step_max: int, found: startup.Found)
 def learnt(configuration: Configuration) -> Attributes:
     """What may change, learnt from a world that has been through what goes well."""
     model = World(configuration)
-    wishes = [Event.HOME, *[Event.NONE] * 4, Event.ENABLE, Event.NONE, Event.DISABLE]
+    wishes = [Event.HOME, *[Event.NONE] * 4, Event.ENABLE, Event.NONE, Event.DISABLE, *[Event.NONE] * 3]
     while wishes:
         if model.phase == "compute":
             model.take(("tick", wishes.pop(0), LEVELS[0], 0))

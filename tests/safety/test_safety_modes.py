@@ -19,22 +19,24 @@ from pkxyz_ctrl.safety.modes import (
 
 # Columns: mode now. Rows: event. Cell: mode then; "-" is refused, the mode stays.
 EXPECTED = """
-                BOOT            PRE_OPERATIONAL  IDLE     HOMING  ENABLED   TRACKING  FAULT
-NONE            -               -                -        -       -         -         -
-NODE_FOUND      PRE_OPERATIONAL -                -        -       -         -         -
-NODE_READY      -               IDLE             -        -       -         -         -
-NODE_LOST       -               BOOT             BOOT     BOOT    FAULT     FAULT     -
-HOME            -               -                HOMING   -       -         -         -
-HOMED           -               -                -        IDLE    -         -         -
-ENABLE          -               -                ENABLED  -       -         -         -
-ENABLE_UNHOMED  -               -                -        -       -         -         -
-TRACK           -               -                -        -       TRACKING  -         -
-HOLD            -               -                -        -       -         ENABLED   -
-DISABLE         -               -                -        IDLE    IDLE      IDLE      -
-TRIP            FAULT           FAULT            FAULT    FAULT   FAULT     FAULT     -
-CLEAR           -               -                -        -       -         -         BOOT
-ENABLE_UNSETTLED -              -                -        -       -         -         -
-CLEAR_UNSETTLED -               -                -        -       -         -         -
+                BOOT            PRE_OPERATIONAL  IDLE     HOMING  ENABLED   TRACKING  FAULT     LANDING
+NONE            -               -                -        -       -         -         -         -
+NODE_FOUND      PRE_OPERATIONAL -                -        -       -         -         -         -
+NODE_READY      -               IDLE             -        -       -         -         -         -
+NODE_LOST       -               BOOT             BOOT     BOOT    FAULT     FAULT     -         FAULT
+HOME            -               -                HOMING   -       -         -         -         -
+HOMED           -               -                -        IDLE    -         -         -         -
+ENABLE          -               -                ENABLED  -       -         -         -         -
+ENABLE_UNHOMED  -               -                -        -       -         -         -         -
+TRACK           -               -                -        -       TRACKING  -         -         -
+HOLD            -               -                -        -       -         ENABLED   -         -
+DISABLE         -               -                -        IDLE    LANDING   LANDING   -         -
+TRIP            FAULT           FAULT            FAULT    FAULT   FAULT     FAULT     -         FAULT
+CLEAR           -               -                -        -       -         -         BOOT         -
+ENABLE_UNSETTLED -              -                -        -       -         -         -         -
+CLEAR_UNSETTLED -               -                -        -       -         -         -         -
+LAND            FAULT           FAULT            FAULT    FAULT   LANDING   LANDING   -         -
+LANDED          -               -                -        -       -         -         -         IDLE
 """
 
 
@@ -66,6 +68,7 @@ def test_every_mode_and_event(mode_name: str, event_name: str, cell: str) -> Non
         (Mode.ENABLED, 1, 1, 1),
         (Mode.TRACKING, 1, 1, 1),
         (Mode.FAULT, 0, 0, 0),
+        (Mode.LANDING, 1, 0, 1),
     ],
 )
 def test_facts_by_mode(mode: Mode, may_energise: int, loop_closed: int, node_expected: int) -> None:
@@ -74,16 +77,16 @@ def test_facts_by_mode(mode: Mode, may_energise: int, loop_closed: int, node_exp
 
 
 def test_numbers_are_a_contract_of_recordings() -> None:
-    assert [mode.value for mode in Mode] == list(range(7))
-    assert [event.value for event in Event] == list(range(15))
+    assert [mode.value for mode in Mode] == list(range(8))
+    assert [event.value for event in Event] == list(range(17))
 
 
-@pytest.mark.parametrize("mode", [-1, 7, 127])
+@pytest.mark.parametrize("mode", [-1, 8, 127])
 def test_unknown_mode_is_a_fault(mode: int) -> None:
     assert all(next_mode(mode, int(event)) == Mode.FAULT for event in Event)
 
 
-@pytest.mark.parametrize("event", [-1, 15, 1 << 20])
+@pytest.mark.parametrize("event", [-1, 17, 1 << 20])
 def test_unknown_event_is_refused(event: int) -> None:
     assert all(next_mode(int(mode), event) == mode for mode in Mode)
 
@@ -121,7 +124,7 @@ def test_a_wish_is_an_event_that_says_what_is_missing() -> None:
     assert [Event(clear_event(settled)) for settled in (False, True)] == [Event.CLEAR_UNSETTLED, Event.CLEAR]
 
 
-@pytest.mark.parametrize("mode", [-1, *Mode, 7])
+@pytest.mark.parametrize("mode", [-1, *Mode, 8])
 def test_safe_cycles_by_mode(mode: int) -> None:
     """A voltage always ends the count, a bad frame where one is owed; an unknown mode owes everything."""
     is_owed = mode not in list(Mode) or modes.MODE_FACTS[Mode(mode)].node_expected

@@ -89,8 +89,7 @@ def run_case(law: str, setup: Setup, case: Case) -> Outcome:
 def _judge(law: str, case: Case, setup: Setup, rig: LockstepRig, rows: NDArray[np.void]) -> Outcome:
     period_us = setup.bus.period_us
     onset = case.fault.at_us // period_us
-    decided = np.flatnonzero(rows["mode"] == Mode.FAULT)
-    decision = int(decided[0]) if len(decided) else None
+    decision = _decision(rows)
     trips = Trip(int(rows["trips"][decision])) if decision is not None else Trip(0)
     assert rig.injection is not None
     voltage = np.array(rig.injection.watched)  # at the end of each tick
@@ -124,6 +123,15 @@ def _judge(law: str, case: Case, setup: Setup, rig: LockstepRig, rows: NDArray[n
     )
 
 
+def _decision(rows: NDArray[np.void]) -> int | None:
+    """The tick of the first fault decision, which is that of FAULT or of the way down that ends there."""
+    latched = np.flatnonzero(rows["mode"] == Mode.FAULT)
+    if not len(latched):
+        return None
+    before = np.flatnonzero(rows["mode"][: latched[0]] != Mode.LANDING)
+    return int(before[-1]) + 1 if len(before) else 0
+
+
 def _problems(
     case: Case, setup: Setup, rows: NDArray[np.void], outcome: Outcome, onset: int, decision: int | None, released: bool
 ) -> list[str]:
@@ -152,6 +160,8 @@ def _problems(
     if outcome.rise_max_v > RISE_V + case.forged_v:
         problems.append(f"a comb rose by {outcome.rise_max_v:.1f} V after the decision")
     allowed_ms = _allowed_ms(case, setup)
+    if decision is not None and rows["mode"][decision] == Mode.LANDING:
+        allowed_ms += float(setup.law["landing_ticks"][0]) * setup.bus.period_us * 1e-3
     if released and (outcome.zero_ms is None or outcome.zero_ms > allowed_ms + 1e-9):
         after = "never" if outcome.zero_ms is None else f"{outcome.zero_ms:g} ms"
         problems.append(f"0 V after {after}, not within {allowed_ms:g} ms")
@@ -162,6 +172,7 @@ def _problems(
 
 def _problems_after(rows: NDArray[np.void], decision: int) -> list[str]:
     """Whether it stayed latched, at 0 V commanded, until the clear."""
+    decision += int(np.argmax(rows["mode"][decision:] == Mode.FAULT))
     cleared = np.flatnonzero(rows["mode"][decision:] != Mode.FAULT)
     until = decision + (int(cleared[0]) if len(cleared) else len(rows) - decision)
     problems = []

@@ -1,0 +1,190 @@
+"""A stop where combs and sensors can be trusted: led down in a given time, then 0 V. Everything else is 0 V at once."""
+
+import dataclasses
+from functools import cache
+
+import numpy as np
+import pytest
+from cycle_rig import AT_REST, in_the_middle, noisy
+from loop_rig import MIDDLE, Cycle, counts_at
+
+from hil.lanes.fast import runner_of
+from hil.lanes.in_process import _sample_us
+from hil.runs.scenario import load_scenario
+from hil.studies.montecarlo import Study
+from pkxyz_ctrl.config.files import load
+from pkxyz_ctrl.design.margins.tolerances import Tolerances
+from pkxyz_ctrl.loop.cycle import new_memory
+from pkxyz_ctrl.loop.reference import reference_rows
+from pkxyz_ctrl.loop.row import ROW
+from pkxyz_ctrl.safety.modes import Event, Mode
+from pkxyz_ctrl.safety.monitors import NodeEvent, SenseStatus
+from pkxyz_ctrl.safety.trips import EXPLANATIONS, LANDS, STOPS, Trip
+
+TICKS = 25  # 5 ms
+
+
+def down(c: Cycle, most: int = 60) -> list[np.void]:
+    """Rows until the way down is over."""
+    rows = []
+    while c.mode is Mode.LANDING and len(rows) < most:
+        rows.append(c.tick(noisy(counts_at(MIDDLE), len(rows))))
+    return rows
+
+
+@pytest.mark.parametrize("trip", [t for t in Trip if t in LANDS])
+def test_a_soft_stop_goes_down_smoothly_for_its_time_and_then_says_why(trip):
+    c = in_the_middle()
+    first = c.tick(noisy(counts_at(MIDDLE), 1), trips=int(trip))
+    assert (first["mode"], first["event"], first["trips"]) == (Mode.LANDING, Event.LAND, trip)
+    rows = down(c)
+    assert len(rows) == TICKS + 1
+    assert [r["mode"] for r in rows] == [Mode.LANDING] * TICKS + [Mode.FAULT]
+    assert rows[-1]["trips"] == trip
+    counts = np.array([first["drive_count"], *(r["drive_count"] for r in rows)]).astype(int)
+    assert counts[0].min() > 20_000
+    assert counts[1].min() > 0.98 * counts[0].min()
+    assert not counts[-1].any()
+    assert counts[-2].max() < 0.12 * counts[0].max(), "the last step to 0 V is small"
+    assert np.abs(np.diff(counts, axis=0)).max() <= c.law["tick"]["drive"]["count_slew_max"][0]
+    assert (np.diff(counts[3:].mean(axis=1)) <= 0).all()
+    again = c.tick(noisy(AT_REST, 1))
+    assert (again["mode"], again["trips"]) == (Mode.FAULT, 0)
+
+
+@pytest.mark.parametrize("trip", [t for t in Trip if t not in LANDS])
+def test_every_other_stop_is_0_v_at_once_on_the_way_down_too(trip):
+    c = in_the_middle()
+    row = c.tick(noisy(counts_at(MIDDLE), 1), trips=int(trip | Trip.OPERATOR))
+    assert (row["mode"], row["drive_count"].any()) == (Mode.FAULT, False)
+    c = in_the_middle()
+    c.tick(noisy(counts_at(MIDDLE), 1), trips=int(Trip.OPERATOR))
+    for k in range(5):
+        assert c.tick(noisy(counts_at(MIDDLE), k))["drive_count"].all()
+    row = c.tick(noisy(counts_at(MIDDLE), 9), trips=int(trip))
+    assert (row["mode"], row["drive_count"].any()) == (Mode.FAULT, False)
+    assert row["trips"] == trip | Trip.OPERATOR, "both are told"
+
+
+@pytest.mark.parametrize("trip", [t for t in Trip if t in LANDS])
+def test_a_second_soft_stop_changes_nothing_but_a_computer_that_stays_late_is_not_waited_for(trip):
+    c = in_the_middle()
+    c.tick(noisy(counts_at(MIDDLE), 1), trips=int(Trip.SATURATION))
+    c.tick(noisy(counts_at(MIDDLE), 2))
+    row = c.tick(noisy(counts_at(MIDDLE), 3), trips=int(trip))
+    at_once = trip is Trip.OVERRUN
+    assert (row["mode"] == Mode.FAULT, not row["drive_count"].any()) == (at_once, at_once)
+    if not at_once:
+        assert down(c)[-1]["trips"] == trip | Trip.SATURATION
+
+
+@pytest.mark.parametrize("mode", [Mode.BOOT, Mode.PRE_OPERATIONAL, Mode.IDLE])
+def test_where_nothing_is_driven_a_soft_stop_is_a_fault(mode):
+    c = Cycle(in_the_middle().law, mode=mode)
+    row = c.tick(noisy(AT_REST, 0), trips=int(Trip.OPERATOR))
+    assert (row["mode"], row["trips"]) == (Mode.FAULT, Trip.OPERATOR)
+
+
+@pytest.mark.parametrize("event", [e for e in Event if e not in (Event.LANDED, Event.TRIP, Event.NODE_LOST)])
+def test_nothing_that_is_asked_for_stops_or_prolongs_the_way_down(event):
+    c, asked = in_the_middle(), in_the_middle()
+    for one in (c, asked):
+        one.tick(noisy(counts_at(MIDDLE), 1), event=Event.DISABLE)
+    for k in range(TICKS + 1):
+        row, other = c.tick(noisy(counts_at(MIDDLE), k)), asked.tick(noisy(counts_at(MIDDLE), k), event=event)
+        if c.mode is Mode.LANDING:
+            assert np.array_equal(row["drive_count"], other["drive_count"])
+            assert asked.mode is Mode.LANDING
+    assert c.mode is Mode.IDLE
+    assert c.memory["homed"][0] == 1
+
+
+def test_what_is_measured_on_the_way_down_reaches_no_voltage():
+    c, wild = in_the_middle(), in_the_middle()
+    for one in (c, wild):
+        one.tick(noisy(counts_at(MIDDLE), 1), trips=int(Trip.OPERATOR))
+    for k in range(TICKS):
+        row = c.tick(noisy(counts_at(MIDDLE), k))
+        status = SenseStatus.MISSING if k % 7 == 3 else 0
+        other = wild.tick(counts_at(MIDDLE * (0.2 if k % 3 else 1.0)), status=int(status))
+        assert np.array_equal(row["drive_count"], other["drive_count"])
+        assert wild.mode is Mode.LANDING
+
+
+def test_node_and_bus_are_watched_on_the_way_down():
+    for tick in ({"status": int(SenseStatus.MISSING)}, {"node_events": int(NodeEvent.EMERGENCY)}):
+        c = in_the_middle()
+        c.tick(noisy(counts_at(MIDDLE), 1), trips=int(Trip.OPERATOR))
+        for k in range(5):
+            row = c.tick(noisy(counts_at(MIDDLE), k), **tick)
+        assert (row["mode"], row["drive_count"].any()) == (Mode.FAULT, False)
+
+
+def test_every_trip_says_how_it_stops_and_why():
+    stems = {(t.name or "").removesuffix(s) for t in Trip for s in ("_1", "_2", "_3", "_X", "_Y", "_Z", "")}
+    assert set(STOPS) <= stems
+    for trip in EXPLANATIONS:
+        name = trip.name or ""
+        assert (name in STOPS) != (name.rpartition("_")[0] in STOPS)
+
+
+# -- devices -----------------------------------------------------------------------------------------------------
+
+
+@cache
+def study(scenario, law):
+    return Study(load_scenario(scenario, controller=law), load("tolerances", "wide", Tolerances))
+
+
+@cache
+def designed(scenario, law):
+    return study(scenario, law).scenario.setup()
+
+
+def stopped(scenario, law, seed, trip, instants=4):
+    """Stops of a sampled device, spread over the fast part of a scan: (stop hits, lowest stroke in m) of each."""
+    base = designed(scenario, law)
+    period_us = base.bus.period_us
+    setup = dataclasses.replace(base, plant=study(scenario, law).sampled(seed).plant, seed=seed)
+    segment = next(s for s in base.trajectory.segments if s.scan_us or s.jumps_us)
+    begin = (segment.t_start_us + 40_000) // period_us
+    at = np.linspace(begin, begin + 15_000 // period_us, instants).astype(int)
+    rows = np.zeros(4096, ROW)
+    reference = reference_rows(base.trajectory.sample(0, int(at[-1]) + 400, period_us))
+    plant, memory = setup.new_plant(), new_memory(Mode.IDLE)
+    done, found = 0, []
+
+    def go(state, memory, count):
+        sample_us = _sample_us(setup, done, count)
+        runner_of(base.law)(base.law, memory, reference, plant.params, state, sample_us, rows, count)
+
+    for target in at:
+        while (ahead := int(target) - int(memory["reference_tick"][0])) > 0:
+            count = ahead if memory["mode"][0] == Mode.TRACKING else 20
+            go(plant.state, memory, count)
+            done += count
+            assert memory["mode"][0] != Mode.FAULT
+        state, left = plant.state.copy(), memory.copy()
+        left["input"]["trips"] = int(trip)
+        before, count = int(state["event_count"][0]), 100
+        go(state, left, count)
+        assert left["mode"][0] == Mode.FAULT
+        found.append((int(state["event_count"][0]) - before, float(rows["stroke_m"][:count].min())))
+    return found
+
+
+@pytest.mark.parametrize("law", ["youla", "open_loop", "lqg", "robust", "mpc"])
+@pytest.mark.parametrize("scenario", ["circle", "steps"])
+def test_no_sampled_device_meets_its_stops_when_it_is_led_down(scenario, law):
+    """`docs/tables/stops.py` has 500 of them, at eight instants each."""
+    lowest = [
+        low for seed in range(3 if law == "mpc" else 12) for hits, low in stopped(scenario, law, seed, Trip.OPERATOR)
+    ]
+    hits = [hits for seed in range(3) for hits, _ in stopped(scenario, law, seed, Trip.OPERATOR)]
+    assert max(hits) == 0
+    assert -0.6e-6 < min(lowest) < 0.0
+
+
+def test_at_once_they_do():
+    """What it is for: 13 to 64 hits each."""
+    assert all(hits > 10 for hits, _ in stopped("circle", "youla", 1, Trip.GATE_BLOCKED))
