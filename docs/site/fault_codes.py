@@ -1,7 +1,7 @@
 """The tables of fault and emergency codes for the troubleshooting page: text, what to check, what clears it."""
 
 from pkxyz_ctrl.can import emergency
-from pkxyz_ctrl.safety.trips import EXPLANATIONS, Trip
+from pkxyz_ctrl.safety.trips import EXPLANATIONS, LANDS, STOPS, Trip
 
 _FRAMES = "good sense frames again; then clear"
 _SENSOR = "a plausible, living reading of that comb at 0 V; then clear"
@@ -66,6 +66,15 @@ def trips_table() -> str:
     for trip, (happened, check) in EXPLANATIONS.items():
         name = trip.name or ""
         lines.append(f'| <a id="{name.lower()}"></a>{name} | {happened} | {check} | {CLEARS[stem(trip)]} |')
+    return "\n".join(lines)
+
+
+def stops_table() -> str:
+    """How each fault stops, and why; faults with one reason in a line."""
+    lines = ["| fault | combs | why |", "| --- | --- | --- |"]
+    lands = {stem(trip) for trip in Trip if trip & LANDS}
+    for name, why in sorted(STOPS.items(), key=lambda item: item[0] not in lands):
+        lines.append(f"| {name} | {'led down, then 0 V' if name in lands else '0 V at once'} | {why} |")
     return "\n".join(lines)
 
 

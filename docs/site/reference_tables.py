@@ -164,6 +164,7 @@ BUILT = {
     "rooms": rooms,
     **{name: partial(measured, name) for name in ("quality", "beside", "speed", "share", "parts", "floor")},
     "trips": fault_codes.trips_table,
+    "stops": fault_codes.stops_table,
     "emergencies": fault_codes.emergencies_table,
     "transitions": transitions,
     "writes": writes,

@@ -29,6 +29,8 @@ KINDS = {"open_loop": OPEN_LOOP, "lqg": STATE_FEEDBACK, "youla": STATE_FEEDBACK,
 """What the tick calls the laws that are not linear ones."""
 RECORDED = ("lqg", "mpc")
 """Laws that keep the bits of their recordings: a filter with K_0 alone, and the ripple of the smooth feed-forward."""
+LANDING_TICKS_LEAST = 10
+"""A way down in fewer steps would shake the stage."""
 
 
 def design_law(stage: Stage, controller: ControllerConfig, bus: BusConfig, *, autostart: bool) -> NDArray[np.void]:
@@ -62,7 +64,7 @@ def design_law(stage: Stage, controller: ControllerConfig, bus: BusConfig, *, au
     law["period_us"] = bus.period_us
     law["homing_ticks"] = max(1, round(controller.homing_s / bus.period_s))
     law["feed_hold_ticks"] = 2 * max(1, round(0.5 * controller.stop_s / bus.period_s))
-    law["landing_ticks"] = max(1, round(controller.landing_s / bus.period_s))
+    law["landing_ticks"] = max(LANDING_TICKS_LEAST, round(controller.landing_s / bus.period_s))
     law["autostart"] = autostart
     law.flags.writeable = False
     return law

@@ -1,22 +1,11 @@
 """A stop where combs and sensors can be trusted: led down in a given time, then 0 V. Everything else is 0 V at once."""
 
-import dataclasses
-from functools import cache
-
 import numpy as np
 import pytest
 from cycle_rig import AT_REST, in_the_middle, noisy
 from loop_rig import MIDDLE, Cycle, counts_at
+from stopped import stopped
 
-from hil.lanes.fast import runner_of
-from hil.lanes.in_process import _sample_us
-from hil.runs.scenario import load_scenario
-from hil.studies.montecarlo import Study
-from pkxyz_ctrl.config.files import load
-from pkxyz_ctrl.design.margins.tolerances import Tolerances
-from pkxyz_ctrl.loop.cycle import new_memory
-from pkxyz_ctrl.loop.reference import reference_rows
-from pkxyz_ctrl.loop.row import ROW
 from pkxyz_ctrl.safety.modes import Event, Mode
 from pkxyz_ctrl.safety.monitors import NodeEvent, SenseStatus
 from pkxyz_ctrl.safety.trips import EXPLANATIONS, LANDS, STOPS, Trip
@@ -131,52 +120,10 @@ def test_every_trip_says_how_it_stops_and_why():
 # -- devices -----------------------------------------------------------------------------------------------------
 
 
-@cache
-def study(scenario, law):
-    return Study(load_scenario(scenario, controller=law), load("tolerances", "wide", Tolerances))
-
-
-@cache
-def designed(scenario, law):
-    return study(scenario, law).scenario.setup()
-
-
-def stopped(scenario, law, seed, trip, instants=4):
-    """Stops of a sampled device, spread over the fast part of a scan: (stop hits, lowest stroke in m) of each."""
-    base = designed(scenario, law)
-    period_us = base.bus.period_us
-    setup = dataclasses.replace(base, plant=study(scenario, law).sampled(seed).plant, seed=seed)
-    segment = next(s for s in base.trajectory.segments if s.scan_us or s.jumps_us)
-    begin = (segment.t_start_us + 40_000) // period_us
-    at = np.linspace(begin, begin + 15_000 // period_us, instants).astype(int)
-    rows = np.zeros(4096, ROW)
-    reference = reference_rows(base.trajectory.sample(0, int(at[-1]) + 400, period_us))
-    plant, memory = setup.new_plant(), new_memory(Mode.IDLE)
-    done, found = 0, []
-
-    def go(state, memory, count):
-        sample_us = _sample_us(setup, done, count)
-        runner_of(base.law)(base.law, memory, reference, plant.params, state, sample_us, rows, count)
-
-    for target in at:
-        while (ahead := int(target) - int(memory["reference_tick"][0])) > 0:
-            count = ahead if memory["mode"][0] == Mode.TRACKING else 20
-            go(plant.state, memory, count)
-            done += count
-            assert memory["mode"][0] != Mode.FAULT
-        state, left = plant.state.copy(), memory.copy()
-        left["input"]["trips"] = int(trip)
-        before, count = int(state["event_count"][0]), 100
-        go(state, left, count)
-        assert left["mode"][0] == Mode.FAULT
-        found.append((int(state["event_count"][0]) - before, float(rows["stroke_m"][:count].min())))
-    return found
-
-
 @pytest.mark.parametrize("law", ["youla", "open_loop", "lqg", "robust", "mpc"])
 @pytest.mark.parametrize("scenario", ["circle", "steps"])
 def test_no_sampled_device_meets_its_stops_when_it_is_led_down(scenario, law):
-    """`docs/tables/stops.py` has 500 of them, at eight instants each."""
+    """`python tests/rigs/stopped.py` has 500 of them, at eight instants each."""
     lowest = [
         low for seed in range(3 if law == "mpc" else 12) for hits, low in stopped(scenario, law, seed, Trip.OPERATOR)
     ]

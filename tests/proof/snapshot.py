@@ -388,7 +388,7 @@ def _mask_of(dtype: np.dtype[Any]) -> np.ndarray[Any, Any]:
     for name in mask.dtype["monitors"].names or ():
         if name not in _MONITORS_UNREAD:
             _fill(whole, dtype, ("monitors", name))
-    for path in (("mode",), ("homed",), ("input", "trips")):
+    for path in (("mode",), ("homed",), ("landing_age",), ("landed_by",), ("input", "trips")):
         _fill(whole, dtype, path)
     first_count = _offset(dtype, ("tick", "count"))
     whole[first_count : first_count + 12] = 0xFF

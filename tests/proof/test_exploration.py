@@ -191,7 +191,7 @@ PLANTED: dict[str, tuple[Plant, str]] = {
     "node without a step limit": (_no_step_limit, "a step from"),
     "start-up that has to be seen": (_old_start_up, "a start-up can go on for ever"),
     "node without a CRC": (_no_crc, "a step from"),
-    "node without time-outs, not tried": (_started_untried, "ticks after the decision"),
+    "node without time-outs, not tried": (_started_untried, "ticks after the decision|gate takes combs"),
     "voltage in every mode": (_unhomed, "a voltage is sent"),
     "nobody can clear": (_no_way_back, "no way leads back"),
     "no gate": (_no_gate, "a step from|beyond 0"),
