@@ -9,8 +9,8 @@ import numpy as np
 from numba import njit
 from numpy.typing import NDArray
 
-from pkxyz_ctrl.core import demand, feed_hold, landing, tick, youla
-from pkxyz_ctrl.loop import set_points
+from pkxyz_ctrl.core import demand, feed_hold, tick, youla
+from pkxyz_ctrl.loop import landing, set_points
 from pkxyz_ctrl.loop.row import ROW
 from pkxyz_ctrl.safety.modes import (
     LOOP_CLOSED,

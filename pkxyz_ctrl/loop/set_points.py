@@ -6,7 +6,8 @@ import numpy as np
 from numba import njit
 from numpy.typing import NDArray
 
-from pkxyz_ctrl.core import feed_hold, landing
+from pkxyz_ctrl.core import feed_hold
+from pkxyz_ctrl.loop import landing
 from pkxyz_ctrl.safety.modes import Mode
 
 Array = NDArray[np.float64]

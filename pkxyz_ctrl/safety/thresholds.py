@@ -12,12 +12,12 @@ RESIDUAL_MAX_M: Final = 0.7e-6
 """Most that a stroke may be from where it was expected; beyond it the measurement is not used. Up to 0.54 um where a
 fast circle begins on ``harsh``; 2 nm of noise are nothing beside it."""
 
-INNOVATION_SHARE_M_PER_N: Final = 5e-4
+INNOVATION_SHARE_M_PER_N: Final = 1e-3
 """What innovation and residual may be besides, for each newton by which the commanded comb forces have changed of late.
-A force of which a share s is unknown moves the stage by s T^2 / 2 m in the period in which it comes, and by some times
-that until the filter has followed: 6 mm for each newton, so this is 8 % of all changes unknown at once. Sampled devices
-of ``wide`` need up to 0.3 mm/N in circles of 4 um at 100 Hz, ``mild`` 0.15 at jumps of 31 um. In the scan in which
-faults are broken it is 40 nm, beside 500."""
+A force that the filter doesn't know makes 14 mm of innovation for each newton within three ticks, until it is followed;
+a device may differ by 38 % of all changes (``FORCE_CHANGE_SHARE``), so 6 mm/N if all changed one way. In a scan they
+come and go: sampled devices of ``wide`` need up to 0.6 mm/N in circles of 4 um at 100 Hz (under ``lqg``), ``mild`` 0.15
+at jumps of 31 um. In the scan in which faults are broken it is 80 nm, beside 500."""
 
 INNOVATION_MEMORY_S: Final = 2e-3
 """How long a change of force is remembered for that: as long as the filter takes to follow."""

@@ -172,7 +172,9 @@ def test_the_cycle_knows_core_and_safety_and_nothing_of_frames():
     ours = AS_IT_IS.ours["pkxyz_ctrl.loop.cycle"]
     assert ours
     assert {name for name in ours if not is_in_any(name, ("pkxyz_ctrl.core", "pkxyz_ctrl.safety"))} <= {
-        "pkxyz_ctrl.loop.row"
+        "pkxyz_ctrl.loop.row",
+        "pkxyz_ctrl.loop.set_points",
+        "pkxyz_ctrl.loop.landing",
     }
 
 

@@ -123,7 +123,7 @@ def test_every_trip_says_how_it_stops_and_why():
 @pytest.mark.parametrize("law", ["youla", "open_loop", "lqg", "robust", "mpc"])
 @pytest.mark.parametrize("scenario", ["circle", "steps"])
 def test_no_sampled_device_meets_its_stops_when_it_is_led_down(scenario, law):
-    """`python tests/rigs/stopped.py` has 500 of them, at eight instants each."""
+    """`python tests/loop/stopped.py` has 500 of them, at eight instants each."""
     lowest = [
         low for seed in range(3 if law == "mpc" else 12) for hits, low in stopped(scenario, law, seed, Trip.OPERATOR)
     ]

@@ -32,7 +32,7 @@ from pkxyz_ctrl.can.sdo import SdoStep
 from pkxyz_ctrl.can.start_sequence import DriverState, StartSequence
 from pkxyz_ctrl.config.bus import BusConfig
 from pkxyz_ctrl.config.files import load
-from pkxyz_ctrl.core import landing
+from pkxyz_ctrl.loop import landing
 from pkxyz_ctrl.loop.controller import Controller, StartUpError
 from pkxyz_ctrl.safety.gate import GateConfig
 from pkxyz_ctrl.safety.modes import MAY_ENERGISE, Event, Mode

@@ -314,5 +314,5 @@ def test_reason_names_frame_mode_and_rule() -> None:
     reason = TransmitGate(CONFIG).check(drive(1, 2, 3, 4), Mode.IDLE, T)
     assert str(reason).startswith("frame 0x30A [01 00 02 00 03 00 04 ")
     assert str(reason).endswith("blocked in IDLE: DRIVE is not permitted now")
-    assert "SYNC is not permitted" in str(TransmitGate(CONFIG).check(sync(), 7, T))
+    assert "SYNC is not permitted" in str(TransmitGate(CONFIG).check(sync(), 8, T))
     assert "1..240" in str(TransmitGate(CONFIG).check(sync(0), Mode.IDLE, T))

@@ -258,6 +258,11 @@ class TestFault(GateSweep):
     permitted = ALWAYS | READ | RESET
 
 
+class TestLanding(GateSweep):
+    mode = Mode.LANDING
+    permitted = ALWAYS | READ | DRIVE
+
+
 class TestLatched(GateSweep):
     mode = Mode.TRACKING
     permitted = ALWAYS
@@ -272,7 +277,7 @@ class TestLatched(GateSweep):
 
 
 class TestUnknownMode(GateSweep):
-    mode = 7
+    mode = 8
     permitted = frozenset[tuple[int, str]]()
 
 
@@ -282,4 +287,4 @@ class TestNegativeMode(GateSweep):
 
 
 def test_every_mode_is_swept() -> None:
-    assert {sweep.mode for sweep in GateSweep.__subclasses__()} == {*map(int, Mode), 7, -1}
+    assert {sweep.mode for sweep in GateSweep.__subclasses__()} == {*map(int, Mode), 8, -1}

@@ -232,7 +232,7 @@ def test_memory_is_cleared_where_nothing_is_expected() -> None:
     assert bench.memory.tobytes() == clean.tobytes()
 
 
-@pytest.mark.parametrize("mode", [-1, -2, 7, 99])
+@pytest.mark.parametrize("mode", [-1, -2, 8, 99])
 def test_unknown_mode_owes_nothing(mode: int) -> None:
     """The mode table makes FAULT of it; here it must only not read beyond a table."""
     bench = Bench()

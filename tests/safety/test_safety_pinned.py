@@ -203,6 +203,7 @@ MODE_KINDS = {
     Mode.ENABLED: {"SDO_READ", "DRIVE"},
     Mode.TRACKING: {"SDO_READ", "DRIVE"},
     Mode.FAULT: {"SDO_READ", "NMT_RESET"},
+    Mode.LANDING: {"SDO_READ", "DRIVE"},
 }
 
 

@@ -1,6 +1,6 @@
 """Sampled devices that are stopped in the middle of a scan: how often they meet their stops.
 
-python tests/rigs/stopped.py circle youla 500
+python tests/loop/stopped.py circle youla 500
 """
 
 import dataclasses

@@ -7,7 +7,7 @@ from hypothesis import strategies as st
 from scipy.integrate import quad
 from scipy.interpolate import BPoly
 
-from pkxyz_ctrl.core import landing
+from pkxyz_ctrl.loop import landing
 
 numbers = st.floats(-1.0, 1.0)
 
