@@ -2,6 +2,7 @@
 # make live   operate the simulated stage: a page and clients, until Ctrl-C
 # make test   run every test, the linter and the type checker
 # make test-socketcan  controller and plant in two processes over the kernel's CAN sockets, in a guest that has them
+# make test-peers  other makers' CANopen stacks and tools over the kernel's CAN sockets, in such a guest
 # make test-firmware  a million ticks of the exported controller, here and on an emulated Cortex-M7: the bits of Python?
 # make test-page  a headless Chromium, fetched if there is none, drives the page of pkxyz serve
 # make bench  measure what the docs promise and print it
@@ -15,7 +16,7 @@
 PYTHON ?= python3
 BIN := .venv/bin
 
-.PHONY: sil live test test-socketcan test-firmware test-page bench docs docs-site wheel clean mutate fuzz kills prove coverage
+.PHONY: sil live test test-socketcan test-peers test-firmware test-page bench docs docs-site wheel clean mutate fuzz kills prove coverage
 
 sil: .venv/.ready
 	$(BIN)/pkxyz sil
@@ -31,6 +32,9 @@ test: .venv/.ready
 
 test-socketcan: .venv/.ready
 	$(BIN)/python tests/socketcan/run.py
+
+test-peers: .venv/.ready
+	$(BIN)/python tests/socketcan/run.py tests/socketcan/on_vcan_peers.py
 
 TICKS ?= 1000000
 test-firmware: .venv/.ready

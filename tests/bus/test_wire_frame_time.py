@@ -22,6 +22,8 @@ from hil.bus.frame_time import (
     worst_case_frame_us,
 )
 from pkxyz_ctrl.can.frame import BIT_RATE_SWITCH, Frame
+from pkxyz_ctrl.config.bus import BusConfig
+from pkxyz_ctrl.config.files import load
 
 TAIL = "1" + "0" + "1" + "1" * 7 + "1" * 3  # CRC delimiter, ACK, ACK delimiter, EOF, interframe space
 
@@ -210,3 +212,27 @@ def test_impossible_frames_are_named(frame: Frame, what: str) -> None:
 def test_fd_lengths_are_the_sixteen_and_no_others() -> None:
     possible = [n for n in range(80) if duration_ns_kernel(1_000_000, 1_000_000, 1, bytes(n), 1) > 0]
     assert possible == list(FD_LENGTHS)
+
+
+@pytest.mark.parametrize(
+    ("bus", "period_us", "with_sdo_us", "with_signature_us"),
+    [("fd_5k", 200, 244, 191), ("classic_2k", 500, 558, 431)],
+)
+def test_beside_a_ticks_frames_eight_bytes_fit_and_a_read_back_does_not(
+    bus: str, period_us: int, with_sdo_us: int, with_signature_us: int
+) -> None:
+    """The wire's page draws on it."""
+    config = load("buses", bus, BusConfig)
+    assert config.can is not None
+    nominal, fd = config.can.nominal_bitrate_bit_per_s, config.can.driver.fd
+    data = config.can.data_bitrate_bit_per_s or nominal
+
+    def together_us(*frames: tuple[int, bytes]) -> float:
+        return (
+            sum(frame_duration_ns(Frame(can_id, payload, fd, fd), nominal, data) for can_id, payload in frames) / 1000
+        )
+
+    tick = ((0x080, b"\x11"), (0x28A, bytes(8)), (0x30A, bytes(8)))
+    assert config.period_us == period_us
+    assert round(together_us(*tick, (0x60A, bytes(8)), (0x60A, bytes(8)))) == with_sdo_us > period_us
+    assert round(together_us(*tick, (0x18A, bytes(8)))) == with_signature_us < period_us

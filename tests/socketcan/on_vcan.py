@@ -83,18 +83,28 @@ jerk_max_m_per_s3 = 0.05
 def bench(request):
     """A folder with the scenario, the shipped bus at a slow rate and the shipped law, patient with lateness."""
     folder = Path(tempfile.mkdtemp(prefix=request.param))
+    slow_law(folder)
+    (folder / "bus.toml").write_text(slow_bus(request.param), encoding="utf-8")
+    (folder / "slow_scan.toml").write_text(SCENARIO, encoding="utf-8")
+    return folder
+
+
+def slow_law(folder):
+    """The shipped law, patient with lateness, as ``patient.toml`` in the folder."""
     law = patient_law(folder)
     slow = replaced(r"^slew_max_v_per_s = \S+", "slew_max_v_per_s = 15.0e3", law.read_text(encoding="utf-8"))
     law.write_text(slow, encoding="utf-8")
-    bus = (CONFIG_DIR / "buses" / f"{request.param}.toml").read_text(encoding="utf-8")
+
+
+def slow_bus(name):
+    """A shipped bus at a slow rate, its [can.driver] last."""
+    bus = (CONFIG_DIR / "buses" / f"{name}.toml").read_text(encoding="utf-8")
     for key, value in (("period", PERIOD_US), ("sense_deadline", 8000), ("heartbeat_deadline", 9900)):
         bus = replaced(rf"^{key}_us = \d+", f"{key}_us = {value}", bus)
     timeouts = f"controller_heartbeat_timeout_ms = {TIMEOUT_US // 1000}\nnode_heartbeat_timeout_ms = 2500\n"
     timeouts += f"drive_timeout_ms = {DRIVE_TIMEOUT_US // 1000}\n"
     timeouts += "boot_timeout_us = 20_000_000\nstart_timeout_us = 5_000_000\nsdo_timeout_us = 5_000_000\n"
-    (folder / "bus.toml").write_text(bus + timeouts)
-    (folder / "slow_scan.toml").write_text(SCENARIO)
-    return folder
+    return bus + timeouts
 
 
 def is_fd(bench):
@@ -135,7 +145,8 @@ class Command:
         main()
 
     def signal(self, number):
-        os.kill(self.pid, number)
+        with suppress(ProcessLookupError):  # it has ended by itself
+            os.kill(self.pid, number)
 
     def wait(self):
         """Its exit code, and what it wrote to both streams."""
@@ -154,6 +165,13 @@ class Command:
 def plant(bench):
     """Serves node and plant; has ``seen``, which waits for a state and returns all changes so far."""
     load_scenario(bench / "slow_scan.toml").setup().law  # noqa: B018  imports the rest, once
+    with served(bench) as command:
+        yield command
+
+
+@contextmanager
+def served(bench):
+    """``pkxyz plant`` in its process, with ``seen``."""
     command = Command(bench, "plant", "slow_scan.toml", "--truth", "truth.bin", "--bus", "bus.toml", "--json")
 
     def seen(state, driven):
@@ -213,7 +231,7 @@ def drive_frames(looking, run, driven, frames=20):
 
 
 @contextmanager
-def driving(bench, plant, *words):
+def driving(bench, plant, *words, bus="bus.toml"):
     """A controller that drives the combs, a socket that looks on, and the frames seen so far. A guest that stands still
     for a second puts it in fault at 0 V instead, so it may begin three times.
     """
@@ -221,7 +239,7 @@ def driving(bench, plant, *words):
     for _ in range(3):
         plant.seen("pre-operational", False)
         with (
-            Command(bench, "run", "slow_scan.toml", "--bus", "bus.toml", *words) as run,
+            Command(bench, "run", "slow_scan.toml", "--bus", bus, *words) as run,
             observer(bench) as looking,
         ):
             if seen := drive_frames(looking, run, driven=True):

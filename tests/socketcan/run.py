@@ -1,4 +1,4 @@
-"""Boots user-mode-linux with CAN in its kernel and runs ``on_vcan.py`` there: ``make test-socketcan``.
+"""Boots user-mode-linux with CAN in its kernel and runs ``on_vcan.py`` there, or other files: ``make test-socketcan``.
 
 The host's files are the guest's root, read-only, so it runs this very checkout and its environment, and it has the
 host's cache with the kernels that were compiled there. It has one processor, and its clock is not the world's: what is
@@ -7,7 +7,7 @@ tested is what happens, not when. Arguments are handed on to pytest.
 A guest that does nothing for long, or does not end, is booted once more, and that is said: what stands still there is
 the guest's kernel and not what is tested. A test that fails is never tried again.
 
-Exit code 0 if all tests pass, or if the two packages cannot be had, which is then said loudly; 1 if not.
+Exit code 0 if all tests pass, or if the packages cannot be had, which is then said loudly; 1 if not.
 """
 
 import dataclasses
@@ -29,8 +29,9 @@ from hil.runs.scenario import load_scenario
 
 ROOT = Path(__file__).parent.parent.parent
 SCRATCH = ROOT / ".uml"
-PACKAGES = {"user-mode-linux": "usr/bin/linux.uml", "busybox-static": "bin/busybox"}
-MODULES = ("drivers/net/can/dev/can-dev", "drivers/net/can/vcan", "net/can/can", "net/can/can-raw")
+PACKAGES = {"user-mode-linux": "usr/bin/linux.uml", "busybox-static": "bin/busybox", "can-utils": "usr/bin/candump"}
+TESTS = ("tests/socketcan/on_vcan.py",)
+MODULES = ("drivers/net/can/dev/can-dev", "drivers/net/can/vcan", "net/can/can", "net/can/can-raw", "net/can/can-bcm")
 BOOTS = 2
 LONGEST_S = 420
 STILL_S, STILL_CLOCK_TICKS = 75, 20
@@ -53,7 +54,7 @@ $b ip link set lo up
 export HOME=/run TMPDIR=/run PATH={path} XDG_CACHE_HOME={cache} PYTHONDONTWRITEBYTECODE=1
 cd {root}
 exec > {scratch}/report 2>&1
-{python} -m pytest -q -n 0 -p no:cacheprovider -x --durations=0 tests/socketcan/on_vcan.py {chosen}
+{python} -m pytest -q -n 0 -p no:cacheprovider -x --durations=0 {tests} {chosen}
 echo $? > {scratch}/status
 $b poweroff -f
 """
@@ -159,12 +160,13 @@ def _boot(short: Path, chosen: list[str]) -> subprocess.Popen[bytes]:
         "modules": " ".join(shlex.quote(f"{kernel / module}.ko") for module in MODULES),
         "scratch": scratch,
         "cache": os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache",
-        "path": os.environ["PATH"],
+        "path": f"{os.environ['PATH']}:{SCRATCH / 'root/usr/bin'}",
+        "tests": shlex.join(test for test in TESTS if not any(word.startswith("tests/") for word in chosen)),
         "python": sys.executable,
         "root": ROOT,
         "chosen": shlex.join(chosen),
     }
-    ready = ("modules", "chosen")
+    ready = ("modules", "chosen", "tests")
     quoted = {key: value if key in ready else shlex.quote(str(value)) for key, value in values.items()}
     init.write_text(INIT.format(**quoted), encoding="utf-8")
     init.chmod(0o755)

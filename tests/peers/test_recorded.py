@@ -1,0 +1,74 @@
+"""What CANopenNode and lely-core said to us and heard from us, played again (CONTRIBUTING.md says how to record it)."""
+
+import pytest
+from node_rig import EDS, RecordingPlant
+from recording import NMT, REPLY, REQUEST, RecordedNode, frames_of
+
+from hil.bus.clock import Lockstep
+from hil.node.amplifier import AmplifierNode
+from pkxyz_ctrl.can.driver import AmplifierDriver
+from pkxyz_ctrl.can.driver_config import DriverConfig
+from pkxyz_ctrl.can.frame import Frame
+from pkxyz_ctrl.can.start_sequence import DriverState
+
+SLOW = DriverConfig(  # as in the guest
+    fd=False,
+    protection=False,
+    controller_heartbeat_timeout_ms=1000,
+    node_heartbeat_timeout_ms=2500,
+    drive_timeout_ms=600,
+    boot_timeout_us=20_000_000,
+    start_timeout_us=5_000_000,
+    sdo_timeout_us=5_000_000,
+)
+FROM_THE_NODE = frozenset({0x08A, 0x28A, 0x70A})
+
+
+@pytest.mark.parametrize("name", ["canopennode_amplifier.log"])
+def test_an_amplifier_by_our_eds_is_started_and_tried(name):
+    driver, node, t_us = AmplifierDriver(SLOW), RecordedNode(name, FROM_THE_NODE), 0
+    waiting = list(driver.start(t_us))
+    states = []
+    while driver.state not in (DriverState.OPERATIONAL, DriverState.FAILED) and t_us < 20_000_000:
+        for frame in waiting:
+            node.receive(frame, t_us)
+        t_us += 1000
+        waiting = [reply for frame in node.due(t_us) for reply in driver.receive(frame, t_us)]
+        waiting += driver.poll(t_us)
+        if driver.state not in states:
+            states.append(driver.state)
+    assert (driver.state, driver.failure) == (DriverState.OPERATIONAL, "")
+    assert DriverState.TRYING in states
+    assert driver.node_events == 0
+    assert any(line.startswith("no 0x1029") or line.startswith("protection = false") for line in driver.lost)
+
+
+@pytest.mark.parametrize("name", ["canopenlinux_master.log", "lely_master.log"])
+def test_a_master_hears_from_our_node_what_it_heard_when_it_was_recorded(name):
+    """Every SDO answer, byte for byte, and every state; but for sense counts, which are the plant's."""
+    clock, heard = Lockstep(), []
+    node = AmplifierNode(10, clock, heard.append, RecordingPlant(), EDS, turnaround_us=2, fd=False, protection=True)
+    node.power_on()
+    clock.run_until(5000)
+    heard.clear()
+    expected = []
+    for t_us, frame in frames_of(name):
+        if frame.can_id in (NMT, REQUEST):
+            clock.run_until(max(clock.now_us, 5000 + t_us))
+            node.on_frame(frame, clock.now_us)
+        elif frame.can_id == REPLY:
+            expected.append(frame.data)
+    clock.run_until(clock.now_us + 100_000)
+    answers = [frame.data for frame in heard if frame.can_id == REPLY]
+    assert [data for data in answers if data[1:3] != b"\x01\x64"] == [
+        data for data in expected if data[1:3] != b"\x01\x64"
+    ]
+    assert len(answers) == len(expected) > 8
+    aborts = {int.from_bytes(data[4:], "little") for data in answers if data[0] == 0x80}
+    assert {0x06020000, 0x06010002} <= aborts
+
+
+def test_frames_are_read_as_candump_writes_them():
+    first_us, first = frames_of("canopenlinux_master.log")[0]
+    assert first_us == 0
+    assert isinstance(first, Frame)
