@@ -24,7 +24,7 @@ SLOW = DriverConfig(  # as in the guest
 FROM_THE_NODE = frozenset({0x08A, 0x28A, 0x70A})
 
 
-@pytest.mark.parametrize("name", ["canopennode_amplifier.log"])
+@pytest.mark.parametrize("name", ["canopennode_amplifier.log", "lely_amplifier.log"])
 def test_an_amplifier_by_our_eds_is_started_and_tried(name):
     driver, node, t_us = AmplifierDriver(SLOW), RecordedNode(name, FROM_THE_NODE), 0
     waiting = list(driver.start(t_us))
