@@ -153,7 +153,7 @@ class Browser:
     def press(self, key: str, hold_s: float = 0.0) -> None:
         """Press a key, and let it go."""
         for kind in ("keyDown", "keyUp"):
-            self.call("Input.dispatchKeyEvent", type=kind, key=key, code=key)
+            self.call("Input.dispatchKeyEvent", type=kind, key=key, code="Space" if key == " " else key)
             time.sleep(hold_s if kind == "keyDown" else 0.0)
 
     def picture(self, file: Path) -> None:

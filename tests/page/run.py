@@ -15,6 +15,9 @@ from pathlib import Path
 
 from chromium import Browser
 
+sys.path.append(str(Path(__file__).parents[1] / "rigs"))
+from patience import patient_bus, patient_law
+
 import pkxyz_ctrl
 from pkxyz_ctrl.client.reply import RefusedError
 
@@ -61,6 +64,7 @@ def operate(browser: Browser, url: str, pictures: Path) -> None:
     logged(browser, "x = 50 um is asked for, limits")
     fill(browser, "#scan [name=lines]", "200")
     fill(browser, "#scan [name=pitch]", "0.02")
+    fill(browser, "#scan [name=rate]", "8")  # 25 s: a browser without a graphics card takes seconds for a picture
     browser.click("#scan button:not([name])")
     activity(browser, "scanning")
     fill(browser, "#shown", "position")
@@ -72,7 +76,6 @@ def operate(browser: Browser, url: str, pictures: Path) -> None:
     browser.click("[data-do=resume]")
     activity(browser, "scanning")
     browser.press(" ")  # Space: stop
-    browser.run("dispatchEvent(new KeyboardEvent('keydown', {code: 'Space'}))")
     activity(browser, "holding")
     logged(browser, "path aborted")
     browser.click("#theme")
@@ -82,6 +85,7 @@ def operate(browser: Browser, url: str, pictures: Path) -> None:
     browser.click("[data-do=release]")
     activity(browser, "fault")
     browser.until("!document.querySelector('#fault').hidden && document.body.innerText.includes('Stopped by hand')")
+    browser.until("document.querySelector('#fault-words').innerText.includes('The 2 s before it: ')")
     browser.picture(pictures / "fault.png")
     browser.click("#fault [data-do=clear]")
     activity(browser, "off")
@@ -96,8 +100,11 @@ def main() -> None:
     pictures.mkdir(parents=True, exist_ok=True)
     begin_s = time.monotonic()
     faulthandler.dump_traceback_later(_STUCK_S, exit=False)
+    folder = Path(tempfile.mkdtemp(prefix="pkxyz-served-"))
+    law, bus = patient_law(folder, "youla"), patient_bus(folder / "bus.toml", "unix_2k")
+    words = ["--controller", str(law), "--bus", str(bus), "--silence-s", "0.25", "--saves", str(folder / "runs")]
     serving = subprocess.Popen(
-        [sys.executable, "-m", "hil", "serve", "--name", "page", "--port", "0", "--json"],
+        [sys.executable, "-m", "hil", "serve", "--name", "page", "--port", "0", "--json", *words],
         stdout=subprocess.PIPE, text=True,
     )  # fmt: skip
     try:

@@ -159,7 +159,7 @@ for (const button of document.querySelectorAll("[data-jog]")) {
 }
 const KEYS = { ArrowLeft: ["x", -1], ArrowRight: ["x", 1], ArrowDown: ["y", -1], ArrowUp: ["y", 1], PageDown: ["z", -1], PageUp: ["z", 1] };
 addEventListener("keydown", (event) => {
-  if (event.target.matches("input, select")) return;
+  if (event.target.matches?.("input, select")) return;
   if (event.code === "Space") { event.preventDefault(); stop(); }
   const key = KEYS[event.key];
   if (key && mine) { event.preventDefault(); if (!event.repeat) jog(...key); }
