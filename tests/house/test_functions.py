@@ -10,7 +10,6 @@ LONGEST = 60
 LONGER = {
     "hil.commands.mechanics.design": "thirteen options of a command, each with its help",
     "hil.commands.run.run": "options of a command, each with its help",
-    "hil.commands.sil.sil": "options of a command, each with its help",
     "hil.commands.studies.identify.identify": "options of a command, each with its help",
     "hil.commands.studies.margins.margins": "options of a command, each with its help",
     "pkxyz_ctrl.design.identification.modal_fit.fit_modes": "one fit: start, three rounds of refinement, covariance",
