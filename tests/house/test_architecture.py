@@ -199,6 +199,13 @@ def test_files_are_of_one_idea(module):
     assert module.rpartition(".")[2] not in NAMES_FOR_NOTHING
 
 
+def test_files_of_tests_and_scripts_are_of_one_idea_too():
+    files = [path for top in ("tests", "docs", "benchmarks", "examples") for path in (ROOT / top).rglob("*.py")]
+    assert len(files) > 200
+    long = {str(path.relative_to(ROOT)): n for path in files if (n := len(path.read_text("utf-8").splitlines())) > 400}
+    assert long == {}
+
+
 def test_no_folder_has_more_modules_than_one_can_overlook():
     """Sixteen, also of tests, examples and scripts."""
     tops = (*PACKAGES, "tests", "docs", "benchmarks", "examples")

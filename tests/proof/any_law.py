@@ -17,6 +17,7 @@ from numpy.typing import NDArray
 from pkxyz_ctrl.can.codec import Counts
 from pkxyz_ctrl.core import kinematics
 from pkxyz_ctrl.core.demand import OPEN_LOOP
+from pkxyz_ctrl.loop import landing
 from pkxyz_ctrl.loop.reference import reference_rows
 
 FRAME_LIMITS = {"stale_count": 2, "sequence_count": 3, "crc_count": 2, "length_count": 2, "frame_leak_ticks": 1}
@@ -65,3 +66,11 @@ def sense_counts_at_rest() -> Counts:
     """What the converters show of the stage at rest."""
     a, b, c = counts_at(np.zeros(3))
     return int(a), int(b), int(c)
+
+
+def bend(age: int) -> float:
+    """What is left of the acceleration with which a way down began, at a tick of it; its law asks for that alone."""
+    begin, row = np.zeros(9), np.empty(9)
+    begin[6] = 1.0
+    landing.sample(begin, min(age, LANDING_TICKS - 1) / LANDING_TICKS, 1.0, row)
+    return float(row[6])

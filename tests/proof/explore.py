@@ -15,10 +15,12 @@ from typing import Any
 sys.path[:0] = [str(Path(__file__).parents[2]), str(Path(__file__).parents[1] / "rigs"), str(Path(__file__).parent)]
 
 import numpy as np  # noqa: E402
+from configurations import CONFIGURATIONS, Configuration  # noqa: E402
+from fates import Option, ViolationError  # noqa: E402
 from scipy.sparse import csr_matrix  # noqa: E402
 from scipy.sparse.csgraph import breadth_first_order, connected_components  # noqa: E402
 from story import as_text, from_text, tell  # noqa: E402
-from world import CONFIGURATIONS, Configuration, Option, ViolationError, World, learnt  # noqa: E402
+from world import World, learnt  # noqa: E402
 
 IN_CI = ("two", "slow drive time-out", "one", "whole dialogue", "well")
 RUNNING, STARTING, ENDED = 1, 2, 4

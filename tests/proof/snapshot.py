@@ -84,48 +84,16 @@ DICTIONARY_UNREAD = {0x1001, 0x1003, 0x2000, 0x2001, 0x6401, 0x6411}
 
 # Of the controller's record, what the law computes with and writes down is left out: any law is explored.
 _MONITORS_UNREAD = (
-    "unexplained_trend_n",
-    "commanded_trend_n",
-    "commanded_n",
-    "moved_n",
-    "frozen",
-    "frozen_sense_count",
-)
+    "unexplained_trend_n", "commanded_trend_n", "commanded_n", "moved_n", "frozen", "frozen_sense_count",
+)  # fmt: skip
 
 CONSTANT_KINDS = {"OtherTraffic", "PdoParameters", "ProcessCodec", "NodeObjects", "ObjectDictionary"}
 CONSTANT = {
-    "_w0",
-    "_w1",
-    "_w2",
-    "_heartbeat_frame",
-    "_sense_id",
-    "_drive_id",
-    "_sdo_request_id",
-    "_sdo_response_id",
-    "_emergency_id",
-    "_node_heartbeat_id",
-    "_flags_sent",
-    "period_us",
-    "_heartbeat_period_us",
-    "_node_timeout_us",
-    "_node_period_us",
-    "_drive_timeout_syncs",
-    "node_id",
-    "_protection",
-    "_boot_us",
-    "_turnaround_us",
-    "_length",
-    "_protected",
-    "_limit",
-    "config",
-    "_config",
-    "_heartbeat",
-    "can",
-    "law",
-    "row",
-    "_consumers",
-    "_plant",
-}
+    "_w0", "_w1", "_w2", "_heartbeat_frame", "_sense_id", "_drive_id", "_sdo_request_id", "_sdo_response_id",
+    "_emergency_id", "_node_heartbeat_id", "_flags_sent", "period_us", "_heartbeat_period_us", "_node_timeout_us",
+    "_node_period_us", "_drive_timeout_syncs", "node_id", "_protection", "_boot_us", "_turnaround_us", "_length",
+    "_protected", "_limit", "config", "_config", "_heartbeat", "can", "law", "row", "_consumers", "_plant",
+}  # fmt: skip
 
 RECORDS = {"TransmitGate", "SenseInput"}
 """Whose ``memory`` is a record of integers: each field is an attribute, ``memory.counter``."""

@@ -2,21 +2,9 @@
 
 import json
 
-from world import (
-    DRIVE,
-    LEVELS,
-    NAMES,
-    NODE_BEAT,
-    OUR_BEAT,
-    PERIOD_US,
-    SENSE,
-    SYNC,
-    Configuration,
-    Option,
-    ViolationError,
-    World,
-    learnt,
-)
+from configurations import DRIVE, LEVELS, NAMES, NODE_BEAT, OUR_BEAT, PERIOD_US, SENSE, SYNC, Configuration
+from fates import Option, ViolationError
+from world import World, learnt
 
 from pkxyz_ctrl.can.frame import Frame
 from pkxyz_ctrl.safety.modes import Event, Mode

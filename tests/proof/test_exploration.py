@@ -10,9 +10,10 @@ from collections.abc import Callable
 from typing import Any
 
 import pytest
+from configurations import CONFIGURATIONS, LEVELS, Configuration
 from explore import Explored, explore, settle
 from story import as_text, from_text, tell
-from world import CONFIGURATIONS, LEVELS, Configuration, World, learnt
+from world import World, learnt
 
 from hil.node.amplifier import AmplifierNode
 from hil.node.drive import DriveReceiver

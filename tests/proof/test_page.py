@@ -8,8 +8,8 @@ import reference_tables
 import test_exploration
 import test_mode_machine
 import test_smt_gate
+from configurations import CONFIGURATIONS
 from explore import IN_CI
-from world import CONFIGURATIONS
 
 ROOT = Path(__file__).parents[2]
 PAGE = (ROOT / "docs" / "understand" / "how-it-is-tested.md").read_text(encoding="utf-8")

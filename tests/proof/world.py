@@ -12,127 +12,47 @@ matter of the sizes in `CONFIGURATIONS`.
 """
 
 from collections import deque
-from dataclasses import dataclass, replace
 from functools import cache
-from typing import Any, Final, NamedTuple
+from typing import Any
 
-import numpy as np
-from any_law import LANDING_TICKS, any_law, reference_for, sense_counts_at_rest
+from any_law import LANDING_TICKS, any_law, bend, reference_for
+from configurations import (
+    CONTROLLER_ID,
+    CUTS,
+    DRIVE,
+    EMCY,
+    FROM_US,
+    LATE_TICKS,
+    LEVELS,
+    MAXIMUM,
+    NODE_ID,
+    PERIOD_US,
+    POLL_US,
+    REQUEST,
+    SENSE,
+    SETTLED,
+    STEP,
+    SYNC,
+    TOO_FAR,
+    TURNAROUND_US,
+    Configuration,
+    bus_of,
+    few_questions,
+    few_writes,
+)
+from fates import Held, Option, Plant, ViolationError, damaged, fates_of, wishes_of
 from node_rig import EDS
 from snapshot import Attributes, Bases, Snapshot
 
 from hil.bus.clock import Lockstep
-from hil.node.amplifier import AmplifierNode, NmtState
-from pkxyz_ctrl.can import startup
+from hil.node.amplifier import AmplifierNode
 from pkxyz_ctrl.can.codec import Counts, ProcessCodec
 from pkxyz_ctrl.can.driver import AmplifierDriver
-from pkxyz_ctrl.can.driver_config import DriverConfig
 from pkxyz_ctrl.can.frame import Frame
-from pkxyz_ctrl.can.sdo import SdoStep
 from pkxyz_ctrl.can.start_sequence import DriverState, StartSequence
-from pkxyz_ctrl.config.bus import BusConfig
-from pkxyz_ctrl.config.files import load
-from pkxyz_ctrl.loop import landing
 from pkxyz_ctrl.loop.controller import Controller, StartUpError
 from pkxyz_ctrl.safety.gate import GateConfig
 from pkxyz_ctrl.safety.modes import MAY_ENERGISE, Event, Mode
-from pkxyz_ctrl.safety.trips import Trip
-
-Option = tuple[Any, ...]
-
-PERIOD_US = 20_000
-TURNAROUND_US = 0
-POLL_US = 5_000
-HEARTBEAT_TIMEOUT_MS = 55  # two lost ones, as with the shipped 20 and 50 ms, and the half tick that the first may take
-STEP = 10  # counts that may be added in a tick
-LEVELS: tuple[Counts, ...] = ((0, 0, 0), (10, 10, 0), (20, 20, 10))  # each a permitted step from its neighbour
-TOO_FAR: tuple[Counts, ...] = ((0, 20, 20), (21, 20, 10))  # a comb that drops beyond the slew limit; beyond the maximum
-MAXIMUM = 20
-SOFT, HARD = Trip.OPERATOR, Trip.COMB_FORCE_1  # led down, and at once
-SETTLED = 2  # ticks, before the loop is closed
-NODE_ID, CONTROLLER_ID = 10, 127
-LATE_TICKS = 2  # how long a frame may be held back
-
-NMT, SYNC, EMCY, SENSE, DRIVE, REPLY, REQUEST = 0x000, 0x080, 0x08A, 0x28A, 0x30A, 0x58A, 0x60A
-NODE_BEAT, OUR_BEAT = 0x70A, 0x77F
-NAMES = {
-    NMT: "NMT", SYNC: "SYNC", EMCY: "emergency", SENSE: "sense", DRIVE: "drive", REPLY: "SDO answer",
-    REQUEST: "SDO request", NODE_BEAT: "heartbeat of the node", OUR_BEAT: "heartbeat of the controller",
-}  # fmt: skip
-FROM_US = frozenset({NMT, SYNC, DRIVE, REQUEST, OUR_BEAT})
-CUTS = {
-    "SYNC": frozenset({SYNC}),
-    "drive": frozenset({DRIVE}),
-    "controller": FROM_US,
-    "node": frozenset({EMCY, SENSE, REPLY, NODE_BEAT}),
-}
-"""What may stop to get through until somebody mends it: one fault, however long it lasts."""
-
-
-class ViolationError(Exception):
-    """An invariant does not hold."""
-
-
-@dataclass(frozen=True)
-class Configuration:
-    """What is explored: sizes, and how much may go wrong."""
-
-    name: str
-    faults: int
-    drive_timeout_syncs: int = 3
-    drive_timeout_ms: int = 50
-    whole_dialogue: bool = False  # all SDO steps of the start-up, not one of each sort
-    kinds: frozenset[str] = frozenset({"late", "repeat", "damage", "skip", "cut"})
-    settle_ticks: int = 4  # within so many ticks of a decision all combs are at 0 V
-    agree_ticks: int = 4  # so long may combs hold something else than the gate believes, before it stops to believe
-
-
-ANY: Final = frozenset({"late", "repeat", "damage", "skip"})
-CONFIGURATIONS: Final = {
-    c.name: c
-    for c in (
-        Configuration("well", 0, kinds=frozenset()),
-        Configuration("one", 1),
-        Configuration("two", 2, kinds=ANY),
-        Configuration("three", 3, kinds=ANY),
-        Configuration("three losses", 3, kinds=frozenset({"lose"})),
-        Configuration("a cut and a loss", 2, kinds=frozenset({"lose", "cut"})),
-        Configuration(
-            "slow drive time-out", 1, drive_timeout_syncs=5, drive_timeout_ms=90, settle_ticks=6, agree_ticks=6
-        ),
-        Configuration("whole dialogue", 1, kinds=ANY, whole_dialogue=True),
-    )
-}
-"""Every kind of fault; what it costs decides how many at a time. ``late`` covers
-loss: what is held back may never be let go."""
-
-
-class Held(NamedTuple):
-    frame: Frame
-    ticks_left: int
-
-
-class Plant:
-    """What the amplifier drives: holds counts, shows the stage at rest, and says what must never happen to combs."""
-
-    def __init__(self, world: "World") -> None:
-        self._world = world
-        self.counts: Counts = (0, 0, 0)
-        self._sample = sense_counts_at_rest()
-
-    def exchange(self, t_us: int, counts: Counts | None, *, sample: bool) -> Counts:
-        if counts is not None:
-            self._drive(counts)
-        return self._sample
-
-    def _drive(self, counts: Counts) -> None:
-        before, self.counts = self.counts, (int(counts[0]), int(counts[1]), int(counts[2]))
-        if not all(0 <= count <= MAXIMUM for count in counts):
-            raise ViolationError(f"comb counts {counts} beyond 0..{MAXIMUM}")
-        if any(counts) and any(abs(new - old) > STEP for new, old in zip(counts, before, strict=True)):
-            raise ViolationError(f"a step from {before} to {counts}, beyond {STEP} in a tick")
-        if any(counts) and self._world.node.state is not NmtState.OPERATIONAL:
-            raise ViolationError(f"{counts} driven while the node is {self._world.node.state.name}")
 
 
 class World:
@@ -140,7 +60,7 @@ class World:
 
     def __init__(self, configuration: Configuration, attributes: Attributes | None = None) -> None:
         self.configuration = configuration
-        bus = _bus(configuration)
+        bus = bus_of(configuration)
         assert bus.can is not None
         driver = bus.can.driver
         self.law = any_law(PERIOD_US, homing_ticks=2)
@@ -153,8 +73,8 @@ class World:
         self.wire: deque[Frame] = deque()
         self.received: deque[Frame] = deque()  # by the controller's port, not read yet
         self.held: tuple[Held, ...] = ()
-        self.plant = Plant(self)
-        few = {} if configuration.whole_dialogue else {"survey": _few_questions, "plan": _few_writes}
+        self.plant = Plant(lambda: self.node.state)
+        few = {} if configuration.whole_dialogue else {"survey": few_questions, "plan": few_writes}
         amplifier = AmplifierDriver(driver, STEP, StartSequence(driver, STEP, **few))
         amplifier.sense.record["syncs_uncountable"] = 4
         self.controller = Controller(self.law, bus, gate, self._from_controller, driver=amplifier)
@@ -249,7 +169,7 @@ class World:
         if self.phase == "ended":
             return []
         if self.wire:
-            return self._fates(self.wire[0])
+            return fates_of(self.wire[0], self.configuration.kinds if self.faults_left else frozenset(), self.cut)
         if self.phase in ("before", "after"):
             options: list[Option] = [("go",)]
             if self.phase == "before" and self.faults_left and "skip" in self.configuration.kinds:
@@ -261,50 +181,8 @@ class World:
             options += [("release", place) for place in range(len(self.held))]
             return options
         if self.phase == "compute":
-            return self._wishes()
+            return wishes_of(self.controller)
         return [("go",)]
-
-    def _fates(self, frame: Frame) -> list[Option]:
-        if frame.can_id in self.cut:
-            return [("vanish",)]
-        options: list[Option] = [("deliver",)]
-        if self.faults_left:
-            kinds = self.configuration.kinds
-            if "late" in kinds:
-                options.append(("late",))
-            if "repeat" in kinds:
-                options.append(("repeat",))
-            if "damage" in kinds:
-                options += [("damage", place) for place in range(len(damaged(frame)))]
-            if "lose" in kinds:
-                options.append(("lose",))
-        return options
-
-    def _wishes(self) -> list[Option]:
-        """What an operator, a monitor and a law may want in this tick."""
-        mode = Mode(self.controller.mode)
-        driver = self.controller.driver
-        match mode:
-            case Mode.IDLE:
-                wishes: list[Option] = [
-                    ("tick", event, LEVELS[0], 0) for event in (Event.NONE, Event.HOME, Event.ENABLE)
-                ]
-            case Mode.HOMING:
-                wishes = [("tick", event, LEVELS[0], 0) for event in (Event.NONE, Event.DISABLE)]
-            case Mode.ENABLED | Mode.TRACKING:
-                wishes = [("tick", Event.NONE, counts, 0) for counts in (*LEVELS, *TOO_FAR)]
-                wishes += [("tick", Event.DISABLE, LEVELS[0], 0)]
-                wishes += [("tick", Event.NONE, LEVELS[0], int(trip)) for trip in (SOFT, HARD)]
-            case Mode.LANDING:
-                wishes = [("tick", Event.NONE, counts, 0) for counts in (*LEVELS, *TOO_FAR)]
-                wishes += [("tick", Event.NONE, LEVELS[0], int(trip)) for trip in (SOFT, HARD)]
-            case Mode.FAULT:
-                wishes = [("tick", event, LEVELS[0], 0) for event in (Event.NONE, Event.CLEAR)]
-            case _:
-                wishes = [("tick", Event.NONE, LEVELS[0], 0)]
-                if driver.state is DriverState.FAILED:
-                    wishes.append(("tick", Event.CLEAR, LEVELS[0], 0))
-        return wishes
 
     # -- what happens --------------------------------------------------------------------------------------------
 
@@ -432,7 +310,7 @@ class World:
         memory: Any = controller.memory[0]
         memory["setpoint"] = reference["motion"][0]
         if controller.mode == Mode.LANDING:
-            memory["landing_from"][6:9] = reference["motion"][0, 6:9] / _bend(int(memory["landing_age"]) + 1)
+            memory["landing_from"][6:9] = reference["motion"][0, 6:9] / bend(int(memory["landing_age"]) + 1)
         memory["input"]["trips"] |= trips
         was, fresh = controller.mode, controller.driver.sense.fresh
         controller.compute(reference, self.skipped)
@@ -502,59 +380,6 @@ class World:
         )
 
 
-def _bend(age: int) -> float:
-    """What is left of the acceleration with which a way down began, at a tick of it; its law asks for that alone."""
-    begin, row = np.zeros(9), np.empty(9)
-    begin[6] = 1.0
-    landing.sample(begin, min(age, LANDING_TICKS - 1) / LANDING_TICKS, 1.0, row)
-    return float(row[6])
-
-
-def damaged(frame: Frame) -> list[Frame]:
-    """What a frame may have become that still is one."""
-    can_id, data, flags = frame
-    made: list[bytes] = []
-    match can_id:
-        case 0x080:
-            made = [bytes(((data[0] + 6) % 240 + 1,)), b""] if data else []
-        case 0x30A | 0x28A:
-            made = [bytes((data[0] ^ 1, *data[1:])), data[:-1]] if data else []
-        case 0x77F:
-            made = [b"\x00"]
-        case 0x70A:
-            made = [bytes((state,)) for state in (0, 4) if data != bytes((state,))]
-        case 0x08A:
-            made = [bytes((0, 0x10 if data[:2] == b"\0\0" else 0)) + data[2:]]
-        case 0x000:
-            made = [bytes((command, *data[1:])) for command in (1, 2, 0x80, 0x81) if command != data[0]]
-        case 0x60A:
-            made = [data[:4] + bytes((data[4] ^ 1,)) + data[5:], data[:1] + b"\xff\x5f" + data[3:]]
-        case 0x58A:
-            made = [data[:4] + bytes((data[4] ^ 1,)) + data[5:], b"\x80" + data[1:4] + b"\0\0\0\x08"]
-    return [Frame._make((can_id, payload, flags)) for payload in made]
-
-
-OF_EACH_SORT = {0x2010: (0,), 0x2011: (0,), 0x2012: (0,), 0x1016: (1,), 0x1017: (0,), 0x1019: (0,)}
-
-
-def _of_each_sort(steps: tuple[SdoStep, ...]) -> tuple[SdoStep, ...]:
-    """Of the shipped steps, in their order, those that change what the node does from then on; what the others ask for
-    is the default of the EDS, so nothing of it is written. The dialogue treats all alike, and remembers nothing of one
-    but its answer.
-    """
-    return tuple(step for step in steps if step.index == 0x1018 or step.subindex in OF_EACH_SORT.get(step.index, ()))
-
-
-def _few_questions(config: DriverConfig) -> tuple[SdoStep, ...]:
-    return _of_each_sort(startup.survey(config))
-
-
-def _few_writes(config: DriverConfig, count_step_max: int, found: startup.Found) -> startup.Plan:
-    answered = {setting.key: setting.value for setting in startup.settings(config, count_step_max)}
-    planned = startup.plan(config, count_step_max, answered | dict(found))
-    return replace(planned, steps=_of_each_sort(planned.steps))
-
-
 @cache
 def learnt(configuration: Configuration) -> Attributes:
     """What may change, learnt from a world that has been through what goes well."""
@@ -566,20 +391,3 @@ def learnt(configuration: Configuration) -> Attributes:
         else:
             model.take(model.options()[0])
     return Attributes(model.parts())
-
-
-def _bus(configuration: Configuration) -> BusConfig:
-    shipped = load("buses", "fd_5k", BusConfig)
-    assert shipped.can is not None
-    driver = DriverConfig(
-        controller_heartbeat_timeout_ms=HEARTBEAT_TIMEOUT_MS,
-        node_heartbeat_timeout_ms=HEARTBEAT_TIMEOUT_MS,
-        drive_timeout_syncs=configuration.drive_timeout_syncs,
-        drive_timeout_ms=configuration.drive_timeout_ms,
-        boot_timeout_us=50_000,
-        start_timeout_us=50_000,
-        sdo_timeout_us=30_000,
-        retries=1,
-    )
-    can = shipped.can.model_copy(update={"driver": driver})
-    return shipped.model_copy(update={"period_us": PERIOD_US, "can": can})

@@ -1,0 +1,112 @@
+"""What is explored: sizes, identifiers, how much may go wrong, and the start-up as short as it may be."""
+
+from dataclasses import dataclass, replace
+from typing import Final
+
+from pkxyz_ctrl.can import startup
+from pkxyz_ctrl.can.codec import Counts
+from pkxyz_ctrl.can.driver_config import DriverConfig
+from pkxyz_ctrl.can.sdo import SdoStep
+from pkxyz_ctrl.config.bus import BusConfig
+from pkxyz_ctrl.config.files import load
+from pkxyz_ctrl.safety.trips import Trip
+
+PERIOD_US = 20_000
+TURNAROUND_US = 0
+POLL_US = 5_000
+HEARTBEAT_TIMEOUT_MS = 55  # two lost ones, as with the shipped 20 and 50 ms, and the half tick that the first may take
+STEP = 10  # counts that may be added in a tick
+LEVELS: tuple[Counts, ...] = ((0, 0, 0), (10, 10, 0), (20, 20, 10))  # each a permitted step from its neighbour
+TOO_FAR: tuple[Counts, ...] = ((0, 20, 20), (21, 20, 10))  # a comb that drops beyond the slew limit; beyond the maximum
+MAXIMUM = 20
+SOFT, HARD = Trip.OPERATOR, Trip.COMB_FORCE_1  # led down, and at once
+SETTLED = 2  # ticks, before the loop is closed
+NODE_ID, CONTROLLER_ID = 10, 127
+LATE_TICKS = 2  # how long a frame may be held back
+
+NMT, SYNC, EMCY, SENSE, DRIVE, REPLY, REQUEST = 0x000, 0x080, 0x08A, 0x28A, 0x30A, 0x58A, 0x60A
+NODE_BEAT, OUR_BEAT = 0x70A, 0x77F
+NAMES = {
+    NMT: "NMT", SYNC: "SYNC", EMCY: "emergency", SENSE: "sense", DRIVE: "drive", REPLY: "SDO answer",
+    REQUEST: "SDO request", NODE_BEAT: "heartbeat of the node", OUR_BEAT: "heartbeat of the controller",
+}  # fmt: skip
+FROM_US = frozenset({NMT, SYNC, DRIVE, REQUEST, OUR_BEAT})
+CUTS = {
+    "SYNC": frozenset({SYNC}),
+    "drive": frozenset({DRIVE}),
+    "controller": FROM_US,
+    "node": frozenset({EMCY, SENSE, REPLY, NODE_BEAT}),
+}
+"""What may stop to get through until somebody mends it: one fault, however long it lasts."""
+
+
+@dataclass(frozen=True)
+class Configuration:
+    """What is explored: sizes, and how much may go wrong."""
+
+    name: str
+    faults: int
+    drive_timeout_syncs: int = 3
+    drive_timeout_ms: int = 50
+    whole_dialogue: bool = False  # all SDO steps of the start-up, not one of each sort
+    kinds: frozenset[str] = frozenset({"late", "repeat", "damage", "skip", "cut"})
+    settle_ticks: int = 4  # within so many ticks of a decision all combs are at 0 V
+    agree_ticks: int = 4  # so long may combs hold something else than the gate believes, before it stops to believe
+
+
+ANY: Final = frozenset({"late", "repeat", "damage", "skip"})
+CONFIGURATIONS: Final = {
+    c.name: c
+    for c in (
+        Configuration("well", 0, kinds=frozenset()),
+        Configuration("one", 1),
+        Configuration("two", 2, kinds=ANY),
+        Configuration("three", 3, kinds=ANY),
+        Configuration("three losses", 3, kinds=frozenset({"lose"})),
+        Configuration("a cut and a loss", 2, kinds=frozenset({"lose", "cut"})),
+        Configuration(
+            "slow drive time-out", 1, drive_timeout_syncs=5, drive_timeout_ms=90, settle_ticks=6, agree_ticks=6
+        ),
+        Configuration("whole dialogue", 1, kinds=ANY, whole_dialogue=True),
+    )
+}
+"""Every kind of fault; what it costs decides how many at a time. ``late`` covers
+loss: what is held back may never be let go."""
+
+
+OF_EACH_SORT = {0x2010: (0,), 0x2011: (0,), 0x2012: (0,), 0x1016: (1,), 0x1017: (0,), 0x1019: (0,)}
+
+
+def _of_each_sort(steps: tuple[SdoStep, ...]) -> tuple[SdoStep, ...]:
+    """Of the shipped steps, in their order, those that change what the node does from then on; what the others ask for
+    is the default of the EDS, so nothing of it is written. The dialogue treats all alike, and remembers nothing of one
+    but its answer.
+    """
+    return tuple(step for step in steps if step.index == 0x1018 or step.subindex in OF_EACH_SORT.get(step.index, ()))
+
+
+def few_questions(config: DriverConfig) -> tuple[SdoStep, ...]:
+    return _of_each_sort(startup.survey(config))
+
+
+def few_writes(config: DriverConfig, count_step_max: int, found: startup.Found) -> startup.Plan:
+    answered = {setting.key: setting.value for setting in startup.settings(config, count_step_max)}
+    planned = startup.plan(config, count_step_max, answered | dict(found))
+    return replace(planned, steps=_of_each_sort(planned.steps))
+
+
+def bus_of(configuration: Configuration) -> BusConfig:
+    shipped = load("buses", "fd_5k", BusConfig)
+    assert shipped.can is not None
+    driver = DriverConfig(
+        controller_heartbeat_timeout_ms=HEARTBEAT_TIMEOUT_MS,
+        node_heartbeat_timeout_ms=HEARTBEAT_TIMEOUT_MS,
+        drive_timeout_syncs=configuration.drive_timeout_syncs,
+        drive_timeout_ms=configuration.drive_timeout_ms,
+        boot_timeout_us=50_000,
+        start_timeout_us=50_000,
+        sdo_timeout_us=30_000,
+        retries=1,
+    )
+    can = shipped.can.model_copy(update={"driver": driver})
+    return shipped.model_copy(update={"period_us": PERIOD_US, "can": can})
