@@ -9,9 +9,9 @@ import pytest
 from conformance_defects import StillPlant, WithoutConsumer
 
 import hil.lanes.lockstep as lockstep_lane
-from hil.commands import operate as operate_cli
 from hil.commands import run as run_cli
-from hil.commands import serve as serve_cli
+from hil.commands.operation import operate as operate_cli
+from hil.commands.operation import serve as serve_cli
 from hil.conformance import report as reports
 from hil.conformance.objects import identity_of
 from hil.conformance.proven import with_report
