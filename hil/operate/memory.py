@@ -9,6 +9,7 @@ import mmap
 import os
 from pathlib import Path
 from typing import Any, Self
+from zlib import crc32
 
 import numpy as np
 
@@ -55,9 +56,12 @@ class StageMemory:
 
     @classmethod
     def made(cls, name: str, kept_ticks: int) -> Self:
-        """New memory for a stage of that name."""
-        base = _IN_MEMORY if os.access(_IN_MEMORY, os.W_OK) else place.folder()
-        return cls(base / f"pkxyz-{os.getuid()}-{name}", kept_ticks)
+        """New memory for a stage of that name. Stages are alike in name where their folders differ, so those tell them
+        apart; one of before, of a loop that was killed, gives way.
+        """
+        folder = place.folder()
+        base = _IN_MEMORY if os.access(_IN_MEMORY, os.W_OK) else folder
+        return cls(base / f"pkxyz-{os.getuid()}-{crc32(os.fsencode(folder)):08x}-{name}", kept_ticks)
 
     def writer(self, ring: str) -> Writer:
         """To write to a ring: "ticks", "frames" and "answers" are the loop's, "commands" and "path" the server's."""
