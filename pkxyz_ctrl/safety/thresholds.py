@@ -12,12 +12,13 @@ RESIDUAL_MAX_M: Final = 0.7e-6
 """Most that a stroke may be from where it was expected; beyond it the measurement is not used. Up to 0.54 um where a
 fast circle begins on ``harsh``; 2 nm of noise are nothing beside it."""
 
-INNOVATION_SHARE_M_PER_N: Final = 1e-3
+INNOVATION_SHARE_M_PER_N: Final = 1.5e-3
 """What innovation and residual may be besides, for each newton by which the commanded comb forces have changed of late.
 A force that the filter doesn't know makes 14 mm of innovation for each newton within three ticks, until it is followed;
 a device may differ by 38 % of all changes (``FORCE_CHANGE_SHARE``), so 6 mm/N if all changed one way. In a scan they
-come and go: sampled devices of ``wide`` need up to 0.6 mm/N in circles of 4 um at 100 Hz (under ``lqg``), ``mild`` 0.15
-at jumps of 31 um. In the scan in which faults are broken it is 80 nm, beside 500."""
+come and go: of 500 sampled devices of ``wide`` one needs more than 1 mm/N in moves at 2 mm/s and nine more than 0.5 in
+circles of 4 um at 100 Hz (under ``lqg``), ``mild`` 0.15 at jumps of 31 um. In the scan in which faults are broken it is
+120 nm, beside 500."""
 
 INNOVATION_MEMORY_S: Final = 2e-3
 """How long a change of force is remembered for that: as long as the filter takes to follow."""
