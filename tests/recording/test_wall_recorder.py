@@ -12,7 +12,7 @@ from pathlib import Path
 import can
 import numpy as np
 import pytest
-from patience import PUNCTUALITY, patient_bus
+from patience import PUNCTUALITY, patient_bus, patient_law
 
 from hil.bus.frame_log import FrameLog
 from hil.lanes.ending import Ending
@@ -172,7 +172,7 @@ def test_after_warm_up_nothing_grows(tmp_path, folder):
     8 bytes of each, 20 kB.
     """
     bus = patient_bus(tmp_path / "bus.toml")
-    scenario = load_scenario("raster", bus=str(bus))
+    scenario = load_scenario("raster", bus=str(bus), controller=str(patient_law(tmp_path, "youla")))
     scenario.config.__dict__["duration_s"] = 3.0
     setup = scenario.setup()
     words = [sys.executable, "-m", "hil.cli", "plant", "--bus", str(bus)]

@@ -5,7 +5,9 @@ from pathlib import Path
 
 from pkxyz_ctrl.config.files import find
 
-PUNCTUALITY = ("stale", "sequence", "innovation", "saturation", "overrun", "slew")
+PUNCTUALITY = (
+    "stale", "sequence", "innovation", "residual", "unexplained_force", "saturation", "overrun", "slew",
+)  # fmt: skip
 """Monitors that a controller which is late, or a plant which is, sets off."""
 _TIME_OUTS = "node_heartbeat_timeout_ms = 900\nboot_timeout_us = 20_000_000\n"
 _TIME_OUTS += "start_timeout_us = 5_000_000\nsdo_timeout_us = 5_000_000\n"
@@ -22,8 +24,9 @@ def replaced(pattern: str, by: str, text: str) -> str:
 def patient_law(folder: Path, name: str = "lqg") -> Path:
     """A shipped law's file that forgives missed ticks, ``patient.toml`` in the folder."""
     law = find("controllers", name).read_text(encoding="utf-8")
-    for monitor in PUNCTUALITY:
-        law = replaced(rf"^{monitor}_count = \d+", f"{monitor}_count = -1", law)
+    law = re.sub(rf"^({'|'.join(PUNCTUALITY)})_count = .*\n", "", law, flags=re.MULTILINE)
+    off = "".join(f"{monitor}_count = -1\n" for monitor in PUNCTUALITY)
+    law = replaced(r"^(frozen_count = )", rf"{off}\1", law)
     path = folder / "patient.toml"
     path.write_text(law, encoding="utf-8")
     return path

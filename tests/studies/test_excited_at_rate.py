@@ -142,10 +142,12 @@ def served(bus):
 
 
 def test_sensitivity_is_measured_over_a_bus_to_another_process(tmp_path):
-    """At 100 Hz, where even a busy machine misses no tick: S as computed for that loop, and the combs at 0 V after."""
+    """At 250 Hz, where even a busy machine misses few ticks: S as computed for that loop; without feedback it would be
+    1.2 away.
+    """
     bus = patient_bus(tmp_path / "bus.toml")
     text = bus.read_text(encoding="utf-8")
-    for key, value in (("period", 10_000), ("sense_deadline", 8000), ("heartbeat_deadline", 9900)):
+    for key, value in (("period", 4000), ("sense_deadline", 3200), ("heartbeat_deadline", 3960)):
         text = replaced(rf"^{key}_us = \d+", f"{key}_us = {value}", text)
     bus.write_text(text, encoding="utf-8")
     words = ["margins", "--measured", "--bus", bus, "--controller", patient_law(tmp_path), "--periods", "3", "--json"]
@@ -159,4 +161,4 @@ def test_sensitivity_is_measured_over_a_bus_to_another_process(tmp_path):
     assert measured["lane"] == "wall"
     assert PERIODS_LEAST <= measured["periods"] <= 12
     assert measured["tones"] >= 8
-    assert measured["agreement"]["largest_difference"] < 0.1
+    assert measured["agreement"]["largest_difference"] < 0.2
