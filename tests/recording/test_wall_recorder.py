@@ -169,7 +169,7 @@ class Watched(WallRecorder):
 
 def test_after_warm_up_nothing_grows(tmp_path, folder):
     """Controller, port, bus, clock and recorder, for 3000 ticks under tracemalloc: a reference kept per tick would be
-    8 bytes of each, 20 kB.
+    8 bytes of each, 2 kB in 250 ticks.
     """
     bus = patient_bus(tmp_path / "bus.toml")
     scenario = load_scenario("raster", bus=str(bus), controller=str(patient_law(tmp_path, "youla")))
@@ -195,7 +195,8 @@ def test_after_warm_up_nothing_grows(tmp_path, folder):
             plant.terminate()
     in_use = recorder.in_use[4:13]  # from tick 1000 on
     assert (in_use > 0).all()
-    assert np.ptp(in_use) < 8000, in_use
+    assert np.median(np.diff(in_use)) < 500, in_use  # what is kept each tick shows in each interval
+    assert np.ptp(in_use) < 40_000, in_use  # what happens for the first time, as a missed tick does, costs once
     assert Recording.open(folder.recording).ticks == 3000
 
 

@@ -1,7 +1,10 @@
 """A cluster beyond this machine is reached by TLS only, with certificates on both sides."""
 
+import multiprocessing
 import shutil
+import signal
 import subprocess
+from pathlib import Path
 
 import pytest
 
@@ -9,6 +12,7 @@ from hil.commands.studies.montecarlo import montecarlo
 from hil.commands.studies.tune import tune
 from hil.commands.studies.wafer_yield import wafer_yield
 from hil.studies.spread.cluster import CERTIFICATES, Cluster, cluster_at
+from hil.studies.spread.processes import processes
 from hil.studies.spread.workers import as_done, worker_pool
 from pkxyz_ctrl.config.files import ConfigError
 
@@ -86,3 +90,17 @@ def test_certificates_that_are_missing_or_of_no_use_are_told(tmp_path):
             cluster_at(address, tmp_path)
     with pytest.raises(ConfigError, match="with --dask-tls"):
         cluster_at("tls://127.0.0.1:1", None)
+
+
+def test_no_process_of_this_machine_ever_hears_ctrl_c():
+    """All are started at once, with SIGINT kept from them from their first instruction on."""
+    before = multiprocessing.active_children()
+    with processes(3):
+        begun = [child for child in multiprocessing.active_children() if child not in before]
+        assert len(begun) == 3
+        for child in begun:
+            (blocked,) = [
+                line.split()[1] for line in Path(f"/proc/{child.pid}/status").read_text().splitlines()
+                if line.startswith("SigBlk")
+            ]  # fmt: skip
+            assert int(blocked, 16) >> signal.SIGINT - 1 & 1

@@ -11,14 +11,16 @@ from contextlib import contextmanager
 
 @contextmanager
 def processes(workers: int | None) -> Iterator[ProcessPoolExecutor]:
-    """An executor over processes (None: one for each core). Left by an exception, nothing more is begun or finished;
+    """An executor over processes, one for each core if None. Left by an exception, nothing more is begun or finished;
     nor is it if this process is killed.
     """
+    workers = workers or os.cpu_count() or 1
     pool = ProcessPoolExecutor(workers, multiprocessing.get_context("spawn"), initializer=_end_with_the_parent)
     before = multiprocessing.active_children()
     try:
         with _ctrl_c_kept_back():
-            pool.submit(int)  # the first call starts them all
+            for _ in range(workers):
+                pool.submit(int)  # each starts one, as none is idle yet
         yield pool
     except BaseException:
         for child in multiprocessing.active_children():
