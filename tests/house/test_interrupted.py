@@ -36,22 +36,31 @@ way_in.main()
     ],
 )
 def test_ctrl_c_while_it_starts_is_one_word(tmp_path, words, after_s):
-    """A command that is over by then, in its own words, is well, too; and a run that had begun keeps what it has."""
+    """A command that is over by then, in its own words, is well, too; and a run that had begun keeps what it has.
+
+    Python drops an interrupt that meets it in a finaliser or a callback of C: whoever presses once more is heard.
+    """
+    code, stdout, stderr = _interrupted(tmp_path, words, after_s)
+    if code == 0 and stderr == "":
+        code, stdout, stderr = _interrupted(tmp_path, words, after_s)
+    if words[0] == "replay" and code == 2:
+        assert stderr.count("\n") == 1
+        return
+    assert code == 130, stderr
+    own = [] if "interrupted: what was recorded until then is kept" in stdout else ["interrupted"]
+    assert [line for line in stderr.splitlines() if not line.startswith("First run here")] == own
+
+
+def _interrupted(folder, words, after_s):
     with subprocess.Popen(
-        [sys.executable, "-c", _BEGIN, *words], cwd=tmp_path, env={**os.environ, "PYTHONPATH": str(ROOT)}, text=True,
+        [sys.executable, "-c", _BEGIN, *words], cwd=folder, env={**os.environ, "PYTHONPATH": str(ROOT)}, text=True,
         stdout=subprocess.PIPE, stderr=subprocess.PIPE,
     ) as process:  # fmt: skip
         assert process.stdout.readline() == "begun\n"
         time.sleep(after_s)
         process.send_signal(signal.SIGINT)
         stderr, stdout = process.stderr.read(), process.stdout.read()
-        process.wait(timeout=60)
-    if words[0] == "replay" and process.returncode == 2:
-        assert stderr.count("\n") == 1
-        return
-    assert process.returncode == 130, stderr
-    own = [] if "interrupted: what was recorded until then is kept" in stdout else ["interrupted"]
-    assert [line for line in stderr.splitlines() if not line.startswith("First run here")] == own
+        return process.wait(timeout=60), stdout, stderr
 
 
 def test_the_way_in_loads_nothing_that_takes_time():
