@@ -39,10 +39,9 @@ def identify(
 
     Configurations by name or file; ``plant``: where it is simulated, ``nominal`` by default. ``lane``: by default the
     machine's clock on a bus that leads to other processes or devices, which ``say`` is told about, and else the fast
-    one. ``amplitude_nm``: of each tone, by default 5 (all at once) or 25 (one after
-    another); ``periods``: measured on each axis, of 1 s or 0.1 s; ``at_um``: strokes, by default mid-workspace. Raises
-    ``ConfigError`` for what can't be excited, ``MeasurementError`` where the loop opens, ``FitError`` where the
-    response doesn't tell the modes.
+    one. ``amplitude_nm``: of each tone, by default 5 (all at once) or 25 (one after another); ``periods``: measured on
+    each axis, of 1 s or 0.1 s; ``at_um``: strokes, by default mid-workspace. Raises ``ConfigError`` for what can't be
+    excited, ``MeasurementError`` where the loop opens, ``FitError`` where the response doesn't tell the modes.
     """
     on_bus, law = load("buses", bus, BusConfig), load("controllers", controller, ControllerConfig)
     closed_in = lane_on(on_bus, lane, plant)

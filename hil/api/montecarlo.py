@@ -8,9 +8,9 @@ from typing import Any
 from hil.runs.scenario import Scenario, load_scenario
 from hil.studies.montecarlo import Result, Results, Study, run_study, summary
 from hil.studies.spread.cluster import cluster_at
-from hil.studies.spread.workers import cores
 from pkxyz_ctrl.config.files import load
 from pkxyz_ctrl.design.margins.tolerances import Tolerances
+from pkxyz_ctrl.io.realtime import cores
 
 Progress = Callable[[int, int], None]
 

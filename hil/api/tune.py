@@ -8,11 +8,11 @@ from pathlib import Path
 import optuna
 
 from hil.studies.spread.cluster import cluster_at
-from hil.studies.spread.workers import cores
 from hil.studies.tune.search import Problem, load_problem
 from hil.studies.tune.taps import FoundTaps, TapsSearch, asks_for_taps, find_taps, write_taps
 from hil.studies.tune.tuning import Best, best, importances, judged, nearest, open_study, search, write_controller
 from pkxyz_ctrl.config.files import ConfigError, load
+from pkxyz_ctrl.io.realtime import cores
 
 Progress = Callable[[int, int], None]
 

@@ -10,6 +10,7 @@ from hil.bench import beside, control, lanes, learning, limits, margins, parts, 
 from hil.bench.figure import Figure
 from hil.runs.versions import versions
 from pkxyz_ctrl.config.files import ConfigError
+from pkxyz_ctrl.io.realtime import cores
 
 Measurement = Callable[[], list[Figure]]
 
@@ -68,11 +69,10 @@ def results(machine: dict[str, Any], figures: list[Figure]) -> dict[str, Any]:
 
 def describe_machine() -> dict[str, Any]:
     """The class of machine, without names: architecture, cores, clock, what else is running now, versions."""
-    cores = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count()
     load = round(os.getloadavg()[0], 1) if hasattr(os, "getloadavg") else None
     return {
         "architecture": platform.machine(),
-        "cores": cores,
+        "cores": cores(),
         "clock_ghz": next(_clock_ghz(), None),
         "load_average": load,
         "versions": versions(),

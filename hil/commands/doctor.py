@@ -1,7 +1,6 @@
 """``pkxyz doctor``: what this machine has of what a stage needs, and the command that mends what it lacks."""
 
 import json
-import os
 import platform
 import sys
 from importlib.util import find_spec
@@ -9,6 +8,8 @@ from pathlib import Path
 from typing import Annotated, Literal, NamedTuple
 
 import typer
+
+from pkxyz_ctrl.io.realtime import cores
 
 _CAN = "280"  # ARPHRD_CAN of linux/if_arp.h
 _LATE_US = 200
@@ -41,7 +42,7 @@ def doctor(
     if can is not None and can.data_bitrate_bit_per_s:
         rates += f" dbitrate {can.data_bitrate_bit_per_s} fd on"
     found = [
-        python(sys.version_info[:2]), cores(len(_cores())), real_time(), kernel(Path("/sys"), platform.version()),
+        python(sys.version_info[:2]), how_many_cores(cores()), real_time(), kernel(Path("/sys"), platform.version()),
         governor(Path("/sys")), *adapters(Path("/sys"), rates or "bitrate 1000000"), compiled(), extras(),
     ]  # fmt: skip
     if seconds > 0:
@@ -59,7 +60,7 @@ def python(version: tuple[int, int]) -> Finding:
     return Finding("Python", "good" if good else "bad", ".".join(map(str, version)), "" if good else "install 3.11")
 
 
-def cores(count: int) -> Finding:
+def how_many_cores(count: int) -> Finding:
     """That this process may use: the loop wants one to itself."""
     if count >= 2:
         return Finding("cores", "good", f"{count}")
@@ -153,10 +154,6 @@ def latency(period_us: int, seconds: float) -> Finding:
 
 def _install(lacking: list[str]) -> str:
     return f"pip install 'pkxyz-ctrl[{','.join(lacking)}]'"
-
-
-def _cores() -> set[int]:
-    return set(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else set(range(os.cpu_count() or 1))
 
 
 def _show(found: list[Finding]) -> None:

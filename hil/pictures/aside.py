@@ -14,6 +14,8 @@ from collections.abc import Callable
 from types import TracebackType
 from typing import TYPE_CHECKING, Self
 
+from pkxyz_ctrl.io.realtime import cores
+
 if TYPE_CHECKING:
     from hil.runs.run_folder import RunFolder
     from hil.runs.summary import Summary
@@ -89,8 +91,3 @@ def _loaded() -> Callable[..., None]:
     figure.add_subplot(projection="3d")
     figure.canvas.draw()
     return draw_report
-
-
-def cores() -> int:
-    """Cores that this process may use."""
-    return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1

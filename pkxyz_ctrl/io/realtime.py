@@ -10,6 +10,11 @@ _LOCK_CURRENT, _LOCK_FUTURE, _LOCK_ON_FAULT = 1, 2, 4  # sys/mman.h: MCL_CURRENT
 _SET_TIMER_SLACK = 29  # linux/prctl.h: PR_SET_TIMERSLACK
 
 
+def cores() -> int:
+    """Cores that this process may use."""
+    return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
+
+
 def settle_memory() -> None:
     """Collect garbage once, then never again: what is left is there to stay. Call when everything is set up."""
     gc.collect()

@@ -24,7 +24,15 @@ from pkxyz_ctrl.safety.modes import (
     next_mode,
     next_safe_cycles,
 )
-from pkxyz_ctrl.safety.monitors import LIMITS, MONITOR_MEMORY, OBSERVATION, SenseStatus, check, implausible_combs
+from pkxyz_ctrl.safety.monitors import (
+    LIMITS,
+    MONITOR_MEMORY,
+    OBSERVATION,
+    UNUSABLE,
+    SenseStatus,
+    check,
+    implausible_combs,
+)
 from pkxyz_ctrl.safety.trips import LANDS, Trip
 
 Array = NDArray[np.float64]
@@ -91,7 +99,7 @@ MEMORY = np.dtype(
     align=True,
 )
 
-_UNUSABLE = int(SenseStatus.MISSING | SenseStatus.CRC | SenseStatus.LENGTH | SenseStatus.DUPLICATE)
+_UNUSABLE = int(UNUSABLE)
 _IMPLAUSIBLE = int(SenseStatus.IMPLAUSIBLE)
 _NONE, _HOME, _HOMED, _ENABLE, _TRACK, _TRIP, _CLEAR = (
     int(e) for e in (Event.NONE, Event.HOME, Event.HOMED, Event.ENABLE, Event.TRACK, Event.TRIP, Event.CLEAR)

@@ -135,7 +135,9 @@ OBSERVATION: Final = np.dtype(
 )
 
 
-_UNUSABLE = int(SenseStatus.MISSING | SenseStatus.CRC | SenseStatus.LENGTH | SenseStatus.DUPLICATE)
+UNUSABLE = SenseStatus.MISSING | SenseStatus.CRC | SenseStatus.LENGTH | SenseStatus.DUPLICATE
+"""No sample of this tick came, or none that may be believed."""
+_UNUSABLE = int(UNUSABLE)
 _MISSING = int(SenseStatus.MISSING)
 _IMPOSSIBLE = int(SenseStatus.COUNTER | SenseStatus.DUPLICATE)
 _CRC = int(SenseStatus.CRC)

@@ -5,7 +5,7 @@ import json
 import pytest
 from command_line import pkxyz
 
-from hil.commands.doctor import adapters, cores, governor, kernel, python
+from hil.commands.doctor import adapters, governor, how_many_cores, kernel, python
 
 
 def put(folder, name, text):
@@ -56,7 +56,7 @@ def test_python(version, state):
 
 
 def test_one_core_is_too_few_for_comfort():
-    assert [cores(n).state for n in (1, 2)] == ["could be better", "good"]
+    assert [how_many_cores(n).state for n in (1, 2)] == ["could be better", "good"]
 
 
 def test_whatever_lacks_here_has_its_command(tmp_path):

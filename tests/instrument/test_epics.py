@@ -3,9 +3,6 @@
 import asyncio
 import itertools
 import os
-import signal
-import subprocess
-import sys
 import time
 from collections.abc import Iterator
 
@@ -17,7 +14,7 @@ from bluesky import plans as bp
 from bluesky.utils import FailedStatus
 from caproto import ErrorResponseReceived
 from caproto.sync.client import read, write
-from command_line import STARTS_S, alive, driven, served
+from command_line import STARTS_S, alive, beside_a_stage
 from ophyd import EpicsMotor
 from ophyd.utils import LimitError
 from ophyd_async.core import init_devices
@@ -32,23 +29,9 @@ PORT = int(os.environ["EPICS_CA_SERVER_PORT"])
 @pytest.fixture(scope="module")
 def ioc(tmp_path_factory: pytest.TempPathFactory) -> Iterator[None]:
     """In the middle of the workspace; control is the IOC's."""
-    folder = tmp_path_factory.mktemp("ioc")
-    with served(folder):
-        with alive() as stage:
-            driven(stage)
-        with (folder / "ioc.err").open("wb") as err:
-            process = subprocess.Popen(
-                [sys.executable, "-m", "hil", "ioc", "--port", str(PORT)], stdout=subprocess.PIPE, stderr=err, text=True
-            )
-        try:
-            assert process.stdout is not None
-            assert process.stdout.readline() == f"pkxyz:x, pkxyz:y, pkxyz:z at 127.0.0.1:{PORT}\n"
-            yield
-            process.send_signal(signal.SIGTERM)
-            assert process.wait(20) == 0
-            assert "Traceback" not in (folder / "ioc.err").read_text()
-        finally:
-            process.kill()
+    with beside_a_stage(tmp_path_factory.mktemp("ioc"), "ioc", "--port", str(PORT)) as said:
+        assert said == f"pkxyz:x, pkxyz:y, pkxyz:z at 127.0.0.1:{PORT}"
+        yield
 
 
 @pytest.fixture

@@ -2,15 +2,12 @@
 
 import asyncio
 import re
-import signal
-import subprocess
-import sys
 from collections.abc import Iterator
 
 import numpy as np
 import pytest
 import pyvisa
-from command_line import alive, driven, served
+from command_line import beside_a_stage
 from pymeasure.adapters import VISAAdapter
 from pymeasure.instruments import Instrument, SCPIMixin
 from pymeasure.instruments.validators import truncated_range
@@ -22,24 +19,9 @@ from pkxyz_ctrl.instrument.scpi_errors import ErrorQueue, ScpiError
 
 @pytest.fixture(scope="module")
 def address(tmp_path_factory: pytest.TempPathFactory) -> Iterator[str]:
-    folder = tmp_path_factory.mktemp("scpi")
-    with served(folder):
-        with alive() as stage:
-            driven(stage)
-        with (folder / "scpi.err").open("wb") as err:
-            process = subprocess.Popen(
-                [sys.executable, "-m", "hil", "scpi", "--port", "0"], stdout=subprocess.PIPE, stderr=err, text=True
-            )
-        try:
-            assert process.stdout is not None
-            said = process.stdout.readline().strip()
-            assert re.fullmatch(r"TCPIP::127\.0\.0\.1::\d+::SOCKET", said)
-            yield said
-            process.send_signal(signal.SIGTERM)
-            assert process.wait(20) == 0
-            assert "Traceback" not in (folder / "scpi.err").read_text()
-        finally:
-            process.kill()
+    with beside_a_stage(tmp_path_factory.mktemp("scpi"), "scpi", "--port", "0") as said:
+        assert re.fullmatch(r"TCPIP::127\.0\.0\.1::\d+::SOCKET", said)
+        yield said
 
 
 @pytest.fixture

@@ -77,6 +77,26 @@ def served(folder: Path) -> Iterator[Server]:
 
 
 @contextlib.contextmanager
+def beside_a_stage(folder: Path, *words: str) -> Iterator[str]:
+    """``pkxyz`` with words that serve a stage in the middle of its workspace to others: its first line."""
+    with served(folder):
+        with alive() as stage:
+            driven(stage)
+        with (folder / "beside.err").open("wb") as err:
+            process = subprocess.Popen(
+                [sys.executable, "-m", "hil", *words], stdout=subprocess.PIPE, stderr=err, text=True
+            )
+        try:
+            assert process.stdout is not None
+            yield process.stdout.readline().strip()
+            process.send_signal(signal.SIGTERM)
+            assert process.wait(20) == 0
+            assert "Traceback" not in (folder / "beside.err").read_text()
+        finally:
+            process.kill()
+
+
+@contextlib.contextmanager
 def alive(control: bool = True) -> Iterator[Stage]:
     """Connected, once the loop is there."""
     with pkxyz_ctrl.connect(control=control) as stage:

@@ -1,7 +1,7 @@
 """Stacks that are built by hand, CANopenNode and lely-core, over the kernel's CAN sockets (CONTRIBUTING.md says how).
 
-In a guest: ``python tests/socketcan/run.py tests/socketcan/on_vcan_built.py``. What is not in ``.uml/root/usr/bin`` is
-skipped. Each test leaves what was on the bus in ``.uml/guest/NAME.log``; those in ``tests/peers/recorded`` are its.
+In a guest: ``python tests/socketcan/run.py tests/socketcan/on_vcan_built.py``. What is not in the guest's ``usr/bin``
+is skipped. Each test leaves what was on the bus in ``.uml/guest/NAME.log``; those in ``tests/peers/recorded`` are its.
 """
 
 import json

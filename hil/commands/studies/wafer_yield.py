@@ -52,12 +52,12 @@ def wafer_yield(
     """
     from hil.runs.scenario import load_scenario
     from hil.studies.spread.cluster import cluster_at
-    from hil.studies.spread.workers import cores
     from hil.studies.wafer.closed_loop import ClosedLoops
     from hil.studies.wafer.study import WaferStudy
     from pkxyz_ctrl.config.files import load
     from pkxyz_ctrl.config.stage import StageConfig
     from pkxyz_ctrl.fabrication.process import Process
+    from pkxyz_ctrl.io.realtime import cores
 
     study = WaferStudy(load("processes", process, Process), load("stages", stage, StageConfig), seed)
     closed = ClosedLoops(study, load_scenario(scenario, stage=stage, controller=controller), known)

@@ -17,7 +17,7 @@ from hil.lanes.excitation import Excitation
 from hil.lanes.lane import Lane
 from hil.lanes.setup import Setup
 from pkxyz_ctrl.safety.modes import Mode
-from pkxyz_ctrl.safety.monitors import SenseStatus
+from pkxyz_ctrl.safety.monitors import UNUSABLE
 from pkxyz_ctrl.stage import Stage
 from pkxyz_ctrl.trajectory import Hold, Move, Trajectory
 
@@ -34,8 +34,6 @@ Tones = Literal["multisine", "stepped"]
 
 _AT_RATE = 4
 """Parts into which a second is divided where ticks may be missed: a shorter period is sooner undisturbed."""
-
-_LOST = int(SenseStatus.MISSING | SenseStatus.CRC | SenseStatus.LENGTH | SenseStatus.DUPLICATE)
 
 
 class MeasurementError(RuntimeError):
@@ -113,7 +111,7 @@ def excite(
         tracked = (tick >= 0) & (tick < excitation.ticks)
         for name, values in seen.items():
             values[tick[tracked]] = block[name][tracked]
-        spoilt[tick[tracked]] |= ((block["overrun"] > 0) | (block["sense_status"] & _LOST != 0))[tracked]
+        spoilt[tick[tracked]] |= ((block["overrun"] > 0) | (block["sense_status"] & int(UNUSABLE) != 0))[tracked]
         homing.append(block["sense_count"][block["mode"] == Mode.HOMING].copy())
         if tracked.any():
             last[:] = [block[tracked][-1].copy()]

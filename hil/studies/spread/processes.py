@@ -8,13 +8,15 @@ from collections.abc import Iterator
 from concurrent.futures import ProcessPoolExecutor
 from contextlib import contextmanager
 
+from pkxyz_ctrl.io.realtime import cores
+
 
 @contextmanager
 def processes(workers: int | None) -> Iterator[ProcessPoolExecutor]:
     """An executor over processes, one for each core if None. Left by an exception, nothing more is begun or finished;
     nor is it if this process is killed.
     """
-    workers = workers or os.cpu_count() or 1
+    workers = workers or cores()
     pool = ProcessPoolExecutor(workers, multiprocessing.get_context("spawn"), initializer=_end_with_the_parent)
     before = multiprocessing.active_children()
     try:

@@ -22,11 +22,6 @@ Result = TypeVar("Result")
 _THREADS = ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS", "NUMBA_NUM_THREADS")
 
 
-def cores() -> int:
-    """Cores that this process may use."""
-    return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
-
-
 @contextmanager
 def worker_pool(workers: int, cluster: Cluster | None = None) -> Iterator[tuple[Executor, int]]:
     """An executor and how many pieces it can work at: processes here, or the threads of a Dask cluster.
