@@ -7,6 +7,7 @@ import os
 import signal
 import subprocess
 import sys
+import threading
 import time
 from pathlib import Path
 
@@ -15,6 +16,7 @@ import pytest
 from hil import cli
 from hil.screen.errors import was_interrupted
 from hil.screen.outputs import what_to_do
+from hil.studies.spread.processes import ctrl_c_kept_back
 from pkxyz_ctrl.config.files import CONFIG_DIR
 
 ROOT = Path(__file__).parents[2]
@@ -146,6 +148,25 @@ def ended(tmp_path, ready, *words, by=signal.SIGINT):
         with contextlib.suppress(ProcessLookupError):
             os.killpg(process.pid, signal.SIGKILL)
     return process.returncode, stdout, stderr
+
+
+def test_ctrl_c_waits_while_processes_are_started_whichever_thread_takes_it():
+    """A child that is begun and not yet told what to do would end in a trace of its own."""
+    others_end = threading.Event()
+    threading.Thread(target=others_end.wait, daemon=True).start()  # it takes the signal: it does not mask it
+    done = []
+
+    def interrupted_while_it_starts_one():
+        with ctrl_c_kept_back():
+            os.kill(os.getpid(), signal.SIGINT)
+            time.sleep(0.05)
+            done.append("all")
+
+    with pytest.raises(KeyboardInterrupt):
+        interrupted_while_it_starts_one()
+    others_end.set()
+    assert done == ["all"]
+    assert signal.getsignal(signal.SIGINT) is signal.default_int_handler
 
 
 @pytest.mark.slow

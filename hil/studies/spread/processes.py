@@ -20,7 +20,7 @@ def processes(workers: int | None) -> Iterator[ProcessPoolExecutor]:
     pool = ProcessPoolExecutor(workers, multiprocessing.get_context("spawn"), initializer=_end_with_the_parent)
     before = multiprocessing.active_children()
     try:
-        with _ctrl_c_kept_back():
+        with ctrl_c_kept_back():
             for _ in range(workers):
                 pool.submit(int)  # each starts one, as none is idle yet
         yield pool
@@ -34,13 +34,26 @@ def processes(workers: int | None) -> Iterator[ProcessPoolExecutor]:
 
 
 @contextmanager
-def _ctrl_c_kept_back() -> Iterator[None]:
-    """A process that is started inside never hears Ctrl-C, from its first instruction on; this one hears it later."""
+def ctrl_c_kept_back() -> Iterator[None]:
+    """A process that is started inside never hears Ctrl-C, from its first instruction on; this one hears it later.
+
+    The mask is for the child, which inherits it. It keeps nothing from this process as long as another thread may take
+    the signal: Python answers in the main thread whichever took it. So the answer, too, waits.
+    """
+    heard: list[int] = []
+    answer = signal.getsignal(signal.SIGINT)
+    answers_here = threading.current_thread() is threading.main_thread() and answer is not None
     masked = signal.pthread_sigmask(signal.SIG_BLOCK, {signal.SIGINT})
+    if answers_here:
+        signal.signal(signal.SIGINT, lambda number, _: heard.append(number))
     try:
         yield
     finally:
         signal.pthread_sigmask(signal.SIG_SETMASK, masked)
+        if answers_here:
+            signal.signal(signal.SIGINT, answer)
+        if heard:
+            signal.raise_signal(signal.SIGINT)
 
 
 def _end_with_the_parent() -> None:
