@@ -182,6 +182,8 @@ def _refused(
     count, is_applied, deviations = 0, False, []
     for name, data in frames:
         count += 1
+        if (outputs := talker.outputs()) != base:  # a frame that is applied would not show
+            raise NotTestedError(f"0x6411 reads {outputs} after {base} was sent")
         mark = talker.mark()
         talker.cycle(data)
         talker.cycle()

@@ -18,7 +18,7 @@ from pkxyz_ctrl.loop.runtime import Clock, Port
 
 _LATE_US = 500  # less is not worth to be called late; at slow rates, a quarter of a period
 _READ_ON = 64  # frames that wait already, when the time is over
-_LATE_ANSWERS_US = 10  # times the time-out of an answer: how long one is waited for that must not be taken for the next
+_LATE_ANSWERS, _LATE_ANSWERS_US = 10, 1_000_000  # times the time-out, so long or once more: not taken for the next
 SETTLE_US = 5_000  # for a node to take note of a command; also longer than the usual EMCY inhibit time
 ZERO: Counts = (0, 0, 0)
 SAMPLE_CYCLES = 500  # of which distributions are made: p99 is then the fifth from the top
@@ -147,7 +147,7 @@ class Talker:
                 return None
             if sdo_client.is_answer(request, reply[1].data):
                 return reply[1].data
-        self.first(replies, _LATE_ANSWERS_US * timeout_us)
+        self.first(replies, max(timeout_us, min(_LATE_ANSWERS * timeout_us, _LATE_ANSWERS_US)))
         return None
 
     def read(self, index: int, subindex: int) -> SdoResult:
