@@ -148,9 +148,9 @@ class Command:
         with suppress(ProcessLookupError):  # it has ended by itself
             os.kill(self.pid, number)
 
-    def wait(self):
+    def wait(self, longest_s=200):
         """Its exit code, and what it wrote to both streams."""
-        self.process.join(200)
+        self.process.join(longest_s)
         return self.process.exitcode, self.out.read_text(), self.err.read_text()
 
     def __enter__(self):
@@ -224,6 +224,8 @@ def drive_frames(looking, run, driven, frames=20):
             seen.append(next_frame(looking))
             can_id, data = seen[-1][:2]
             came += can_id == DRIVE and any(data[:6]) == driven
+            if driven and can_id == DRIVE:
+                end_s = time.monotonic() + 20  # in FAULT none come any more
             if driven and came and can_id == EMCY and any(data):  # in the start-up the node misses us as it should
                 return []
     looking.settimeout(90)

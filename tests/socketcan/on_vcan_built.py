@@ -150,7 +150,7 @@ def test_what_the_check_says_of_canopennode(bench):
     with canopennode(bench), recorded("canopennode_check.log"):
         words = ("--bus", "plain.toml", "--allow-voltage", "--out", "report")
         with Command(bench, "check-amplifier", *words) as check:
-            code, out, err = check.wait()
+            code, out, err = check.wait(600)
     (LOGS / "canopennode_check.txt").write_text(f"{code}\n{out}\n{err}")
     assert out, err
 
