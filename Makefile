@@ -10,7 +10,7 @@
 # make prove  every state that shipped controller and node can reach under any law with faults: EXPLORED="two one"
 # make coverage  branches and conditions (MC/DC) of safety, codec, driver and the node's drive path that the tests meet
 # make fuzz   hostile frames and broken documents: FRAMES=1000000 DOCUMENTS=10000
-# make kills  SIGKILL at random moments of runs, KILLS=300, and in lockstep's clock, KILLS_LOCKSTEP=10000: 0 V in time, recordings open
+# make kills  SIGKILL, SIGSTOP and SIGTERM at random moments, KILLS=300 at rate, KILLS_LOCKSTEP=10000 in lockstep's clock: 0 V in time?
 # make docs   draw every figure of docs/ and fill in the generated tables
 # make docs-site  build the documentation into site/: open site/index.html
 PYTHON ?= python3
@@ -64,7 +64,7 @@ fuzz: .venv/.ready
 KILLS ?= 300
 KILLS_LOCKSTEP ?= 10000
 kills: .venv/.ready
-	$(BIN)/python tests/recording/kills.py $(KILLS)
+	$(BIN)/python tests/recording/kills_at_rate.py $(KILLS)
 	$(BIN)/python tests/recording/kills_lockstep.py $(KILLS_LOCKSTEP)
 
 docs: .venv/.ready
