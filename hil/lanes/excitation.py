@@ -56,14 +56,14 @@ class Excitation:
         """Trajectory tick at which the measured periods of a passage begin."""
         return self.first_tick + passage * self.passage_ticks + SETTLE_PERIODS * self.period_ticks
 
-    def undisturbed(self, passage: int, spoilt: NDArray[np.bool_]) -> NDArray[np.int64]:
-        """Which of its measured periods, from 0, ran through as played, and the one before them too, whose transients
-        they would show; ``spoilt`` (ticks,) says at which ticks of the trajectory the loop did not see what it should.
+    def undisturbed(self, passage: int, spoilt: NDArray[np.bool_], settling_ticks: int) -> NDArray[np.int64]:
+        """Which of its measured periods, from 0, ran through as played, and so did what is before them while the loop
+        settles, whose transients they would show; ``spoilt`` (ticks,) says at which ticks of the trajectory the loop
+        did not see what it should.
         """
-        begin = self.measured_from(passage) - self.period_ticks
-        played = spoilt[begin : begin + (self.periods + 1) * self.period_ticks].reshape(-1, self.period_ticks)
-        broken = played.sum(axis=1)
-        return np.flatnonzero(broken[1:] + broken[:-1] == 0)
+        begin = self.measured_from(passage) + self.period_ticks * np.arange(self.periods)
+        broken = np.concatenate([[0], np.cumsum(spoilt)])
+        return np.flatnonzero(broken[begin + self.period_ticks] == broken[np.maximum(begin - settling_ticks, 0)])
 
     def ticks_of(self, passage: int, periods: NDArray[np.int64]) -> NDArray[np.int64]:
         """(len(periods) N,) ticks of the trajectory of some of its measured periods."""

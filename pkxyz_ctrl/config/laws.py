@@ -117,7 +117,7 @@ class Mpc(FrozenModel):
         return self
 
 
-Taps = Annotated[tuple[float, ...], Field(min_length=1, max_length=48)]
+Taps = Annotated[tuple[float, ...], Field(min_length=1, max_length=40)]
 
 
 class InnovationFilter(FrozenModel):
@@ -128,11 +128,18 @@ class InnovationFilter(FrozenModel):
     plane: Taps
     """q_0, q_1, ... of x and of y"""
     z: Taps
+    quiet_plane: Taps | None = None
+    """the same in a quiet hold: less noise, less rejection; left out, a quiet hold is like any other"""
+    quiet_z: Taps | None = None
 
     @model_validator(mode="after")
     def _as_many(self) -> Self:
-        if len(self.plane) != len(self.z):
-            raise ValueError(f"plane has {len(self.plane)} taps and z {len(self.z)}; give both as many, with zeros")
+        if (self.quiet_plane is None) != (self.quiet_z is None):
+            raise ValueError("give both quiet_plane and quiet_z, or neither")
+        counts = {name: len(taps) for name, taps in self if name.endswith(("plane", "z")) and taps is not None}
+        if len(set(counts.values())) > 1:
+            words = ", ".join(f"{name} has {count}" for name, count in counts.items())
+            raise ValueError(f"of the taps, {words}; give all as many, with zeros")
         return self
 
 
@@ -143,10 +150,8 @@ class Youla(FrozenModel):
 
     filter: tuple[InnovationFilter, ...] = ()
     """one for each kind of bus; on others the state feedback stands alone"""
-    quiet_share: Annotated[float, Field(ge=0, le=1)] = 0.4
-    """how much of the filter is left while a quiet hold is asked for: less noise, less rejection"""
     fade_s: Positive = 0.02
-    """how long the filter takes to fade to that, and to come back"""
+    """how long the filter takes to fade to that of a quiet hold, and to come back"""
     quiet_holds: bool = False
     """every hold is a quiet one, without an operator who asks for it"""
 

@@ -4,7 +4,8 @@
 
 nu (m) is what a sample shows beyond what the model predicted for the forces that were really given. Set-points, jumps
 and limits are in that prediction, so none of them reaches w, and no choice of taps can make the nominal loop unstable:
-sensitivity is affine in them (Youla, Bongiorno, Lu 1976), which is what their design rests on.
+sensitivity is affine in them (Youla, Bongiorno, Lu 1976), which is what their design rests on. For the same reason a
+quiet hold may have taps of its own: what lies between both sets of them is as stable.
 """
 
 import numpy as np
@@ -13,14 +14,14 @@ from numpy.typing import NDArray
 
 Array = NDArray[np.float64]
 
-TAPS_MAX = 48
+TAPS_MAX = 40
 
 YOULA = np.dtype(
     [
         ("tap_n_per_m", "f8", (TAPS_MAX, 3)),  # q_j of axes x, y, z
+        ("quiet_tap_n_per_m", "f8", (TAPS_MAX, 3)),  # ... and of a quiet hold
         ("taps", "i4"),  # how many of them are in use; 0: there is no such filter
-        ("fade_ticks", "i4"),  # from the full filter to what is left of it in a quiet hold, or back
-        ("quiet_share", "f8"),  # which is this share of the taps
+        ("fade_ticks", "i4"),  # from one set of taps to the other
     ],
     align=True,
 )
@@ -30,7 +31,7 @@ YOULA_STATE = np.dtype(
         ("innovation_m", "f8", (2 * TAPS_MAX, 3)),  # twice the same ring: from ``newest`` on, newest first
         ("newest", "i4"),
         ("quiet", "i4"),  # 1: a quiet hold is asked for
-        ("faded", "i4"),  # ticks of ``fade_ticks`` that it has faded out
+        ("faded", "i4"),  # ticks of ``fade_ticks`` on the way to the quiet taps
     ],
     align=True,
 )
@@ -63,10 +64,18 @@ def note(youla: np.void, state: np.void, innovation_m: Array) -> None:
 @njit(cache=True, error_model="numpy")
 def add_feedback(youla: np.void, state: np.void, share: float, out: Array) -> None:
     """Add share times w to ``out`` (3,)."""
-    tap, innovation, at = youla["tap_n_per_m"], state["innovation_m"], state["newest"]
-    share *= 1.0 - (1.0 - youla["quiet_share"]) * (state["faded"] / youla["fade_ticks"])
+    faded, ticks = state["faded"], youla["fade_ticks"]
+    if faded < ticks:
+        _add_filtered(youla["tap_n_per_m"], youla["taps"], state, share * ((ticks - faded) / ticks), out)
+    if faded > 0:
+        _add_filtered(youla["quiet_tap_n_per_m"], youla["taps"], state, share * (faded / ticks), out)
+
+
+@njit(cache=True, error_model="numpy")
+def _add_filtered(tap: Array, taps: int, state: np.void, share: float, out: Array) -> None:
+    innovation, at = state["innovation_m"], state["newest"]
     x, y, z = 0.0, 0.0, 0.0
-    for j in range(youla["taps"]):
+    for j in range(taps):
         x += tap[j, 0] * innovation[at + j, 0]
         y += tap[j, 1] * innovation[at + j, 1]
         z += tap[j, 2] * innovation[at + j, 2]

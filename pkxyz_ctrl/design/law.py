@@ -168,9 +168,10 @@ def _fill_linear(record: Any, stage: Stage, controller: ControllerConfig, bus: B
 def _fill_youla(record: Any, youla: Youla, bus: BusConfig) -> None:
     for taps in youla.filter:
         if (taps.period_us, taps.delay_periods) == (bus.period_us, bus.delay_periods):
+            quiet_plane, quiet_z = taps.quiet_plane or taps.plane, taps.quiet_z or taps.z
             record["tap_n_per_m"][:, : len(taps.z)] = np.stack([taps.plane, taps.plane, taps.z], axis=1)
+            record["quiet_tap_n_per_m"][:, : len(taps.z)] = np.stack([quiet_plane, quiet_plane, quiet_z], axis=1)
             record["taps"] = len(taps.z)
-    record["quiet_share"] = youla.quiet_share
     record["fade_ticks"] = max(1, round(youla.fade_s / bus.period_s))
 
 

@@ -61,20 +61,21 @@ def test_the_law_bears_devices_with_everything_changed_at_once():
     assert 2.5 < max(ends) <= 4.0
 
 
-@pytest.mark.parametrize("scale", [0.0, 0.4, 0.7])
-def test_a_quiet_hold_is_quieter_and_as_stable_on_its_way(scale):
-    """The filter fades by a factor on all taps: what it passes on the way is stable everywhere, too."""
+@pytest.mark.parametrize(("faded", "least_nm", "most_nm"), [(0.3, 0.7, 0.8), (0.6, 0.55, 0.65), (1.0, 0.4, 0.5)])
+def test_a_quiet_hold_is_quieter_and_more_robust_all_the_way_to_it(faded, least_nm, most_nm):
+    """What lies between both sets of taps is stable for the stage as drawn whatever they are; here for the others."""
     config = load("controllers", "youla", ControllerConfig)
-    fade = {n: tuple(scale * q for q in getattr(config.youla.filter[0], n)) for n in ("plane", "z")}
-    faded = Youla(filter=(config.youla.filter[0].model_copy(update=fade),))
-    loop = loop_of(config.model_copy(update={"youla": faded}))
+    taps = config.youla.filter[0]
+    between = {
+        name: tuple((1.0 - faded) * q + faded * p for q, p in zip(own, quiet, strict=True))
+        for name, own, quiet in (("plane", taps.plane, taps.quiet_plane), ("z", taps.z, taps.quiet_z))
+    }
+    loop = loop_of(config.model_copy(update={"youla": Youla(filter=(taps.model_copy(update=between),))}))
     tolerances = load("tolerances", "wide", Tolerances)
-    assert max(loop.peak_sensitivity(case) for case in tolerances.combined(3)) <= 4.0  # as sampled devices may have
+    assert 2.0 < max(loop.peak_sensitivity(case) for case in tolerances.combined(3)) <= 3.3
+    assert max(axis.peak_s for axis in loop.margins(MIDDLE).axes) < 1.75
     plant, about = loop_plant(stage(), bus(), MIDDLE), law_about(stage(), loop.law, MIDDLE)
-    noise_nm = 1e9 * hold_noise_m(stage(), bus(), plant, about).max()
-    if scale == 0.0:
-        assert 0.5 < noise_nm <= 0.9
-    assert noise_nm < (0.8 if scale == 0.4 else 1.0)
+    assert least_nm < 1e9 * hold_noise_m(stage(), bus(), plant, about).max() < most_nm
 
 
 def test_on_a_bus_without_a_filter_the_state_feedback_stands_alone():

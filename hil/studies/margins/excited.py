@@ -1,7 +1,7 @@
 """A loop that is excited about a point, in any lane, and what was seen at each tick of its trajectory.
 
-At the machine's clock a tick may be missed: the excitation stands still meanwhile, so its period is spoilt, and the one
-after it by what that stirred up. Both are left out.
+At the machine's clock a tick may be missed: the excitation stands still meanwhile, so its period is spoilt, and so is
+one that begins before the loop has settled again. They are left out.
 """
 
 from collections.abc import Callable
@@ -16,6 +16,9 @@ from hil.lanes.at_rate import run_at_rate
 from hil.lanes.excitation import Excitation
 from hil.lanes.lane import Lane
 from hil.lanes.setup import Setup
+from pkxyz_ctrl.design.law_about import law_about
+from pkxyz_ctrl.design.margins.settling import settling_ticks
+from pkxyz_ctrl.design.model.loop_plant import NOMINAL, Perturbation, loop_plant
 from pkxyz_ctrl.safety.modes import Mode
 from pkxyz_ctrl.safety.monitors import UNUSABLE
 from pkxyz_ctrl.stage import Stage
@@ -31,6 +34,9 @@ PERIODS_LEAST = 3
 
 Tones = Literal["multisine", "stepped"]
 """All at once, or one after another."""
+
+HARDLY_DAMPED = 200.0
+"""Quality factor of a device in coarse vacuum, whose transients last longest."""
 
 _AT_RATE = 4
 """Parts into which a second is divided where ticks may be missed: a shorter period is sooner undisturbed."""
@@ -128,12 +134,26 @@ def excite(
     if not closed.all():
         raise MeasurementError(f"the loop was closed for {closed.sum()} of {len(closed)} ticks only")
     missed = int(spoilt[excitation.first_tick :].sum())
-    periods = _periods(excitation, spoilt, missed)
+    settling = _settling_ticks(setup, last[0]["reference_m"]) if missed else 0
+    periods = _periods(excitation, spoilt, settling, missed)
     return Excited(excitation, seen, periods, np.concatenate(homing), last[0], missed)
 
 
-def _periods(excitation: Excitation, spoilt: NDArray[np.bool_], missed: int) -> tuple[NDArray[np.int64], ...]:
-    each = [excitation.undisturbed(n, spoilt) for n in range(len(excitation.passages))]
+def _settling_ticks(setup: Setup, position_m: Array) -> int:
+    """Until nothing is left of what a missed tick stirred up: of the loop as drawn, or of the same hardly damped."""
+    stage = Stage(setup.stage)
+    strokes = stage.inverse_kinematics(position_m)
+    law = law_about(stage, setup.law, strokes)
+    return max(
+        settling_ticks(loop_plant(stage, setup.bus, strokes, change), law)
+        for change in (NOMINAL, Perturbation(quality_factor=HARDLY_DAMPED))
+    )
+
+
+def _periods(
+    excitation: Excitation, spoilt: NDArray[np.bool_], settling: int, missed: int
+) -> tuple[NDArray[np.int64], ...]:
+    each = [excitation.undisturbed(n, spoilt, settling) for n in range(len(excitation.passages))]
     count = min(len(periods) for periods in each)
     if count < PERIODS_LEAST:
         raise MeasurementError(

@@ -5,7 +5,7 @@ It is convex, so there is nothing to try: no trials, no database, the same taps 
 """
 
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Annotated, Any
 
@@ -21,14 +21,14 @@ from pkxyz_ctrl.config.files import ConfigError, FrozenModel
 from pkxyz_ctrl.config.refused import reason
 from pkxyz_ctrl.design.hold_noise import rounding_force_n
 from pkxyz_ctrl.design.law import design_law
-from pkxyz_ctrl.design.laws.estimator_gain import measurement_noise
+from pkxyz_ctrl.design.laws.estimator_gain import measurement_noise, shaken_covariance
 from pkxyz_ctrl.design.laws.youla import Bounds, InnovationLoop, Noise, youla_taps
 from pkxyz_ctrl.design.lqg_equivalent import lqg_equivalent, seen_by
 from pkxyz_ctrl.design.margins.margins import HALF_POWER
 from pkxyz_ctrl.design.margins.tolerances import Case, Tolerances
 from pkxyz_ctrl.design.model.discrete_law import LawError
 from pkxyz_ctrl.design.model.loop_plant import NOMINAL, loop_plant
-from pkxyz_ctrl.design.model.plant_model import linearise
+from pkxyz_ctrl.design.model.plant_model import LinearStage, linearise
 from pkxyz_ctrl.stage import Stage
 
 Array = NDArray[np.float64]
@@ -58,6 +58,13 @@ class TapBounds(FrozenModel):
     """... and of those that have all changed at once"""
 
 
+class QuietBounds(TapBounds):
+    """What is asked of each axis in a quiet hold."""
+
+    base_noise_m_per_s2_per_rt_hz: Positive
+    """white acceleration of the base, one-sided density: what it leaves at hold counts beside the sense noise"""
+
+
 class TapsSearch(FrozenModel):
     """A file of configs/searches that asks for taps."""
 
@@ -66,10 +73,12 @@ class TapsSearch(FrozenModel):
     stage: Text
     bus: Text
     tolerances: Text
-    taps: Annotated[int, Field(ge=2, le=48)]
+    taps: Annotated[int, Field(ge=2, le=40)]
     across: Annotated[int, Field(ge=2)] = 9
     """devices from soft and heavy to stiff and light that have all changed at once"""
     bounds: TapBounds
+    quiet: QuietBounds | None = None
+    """of a filter for quiet holds, if there is to be one"""
 
 
 @dataclass(frozen=True)
@@ -79,6 +88,8 @@ class FoundTaps:
     plane: tuple[float, ...]
     z: tuple[float, ...]
     hold_noise_m: tuple[float, float]
+    quiet: "FoundTaps | None" = None
+    """of quiet holds"""
 
 
 def asks_for_taps(name_or_path: str | Path) -> bool:
@@ -88,19 +99,26 @@ def asks_for_taps(name_or_path: str | Path) -> bool:
 
 def find_taps(search: TapsSearch, on_progress: Callable[[str], None] = lambda line: None) -> FoundTaps:
     """Taps for the stage, bus and tolerances of a search. Raises ``ConfigError`` where there are none."""
+    quiet = None if search.quiet is None else _within(search, search.quiet, ", quiet", on_progress)
+    return replace(_within(search, search.bounds, "", on_progress), quiet=quiet)
+
+
+def _within(search: TapsSearch, asked: TapBounds, which: str, on_progress: Callable[[str], None]) -> FoundTaps:
     axes = {}
-    for axis, name in ((0, "x and y"), (2, "z")):
+    for axis, name in ((0, f"x and y{which}"), (2, f"z{which}")):
         try:
-            axes[axis] = _axis_taps(search, axis, lambda line, name=name: on_progress(f"{name}: {line}"))  # type: ignore[misc]
+            axes[axis] = _axis_taps(search, asked, axis, lambda line, name=name: on_progress(f"{name}: {line}"))  # type: ignore[misc]
         except LawError as error:
             raise ConfigError(f"search {search.name!r}: {name}: {error}") from error
     return FoundTaps(_rounded(axes[0][0]), _rounded(axes[2][0]), (axes[0][1], axes[2][1]))
 
 
-def _axis_taps(search: TapsSearch, axis: int, on_progress: Callable[[str], None]) -> tuple[Array, float]:
+def _axis_taps(
+    search: TapsSearch, asked: TapBounds, axis: int, on_progress: Callable[[str], None]
+) -> tuple[Array, float]:
     stage, bus = Stage.load(search.stage), config.load("buses", search.bus, BusConfig)
     controller = config.load("controllers", search.controller, ControllerConfig)
-    tolerances, asked = config.load("tolerances", search.tolerances, Tolerances), search.bounds
+    tolerances = config.load("tolerances", search.tolerances, Tolerances)
     alone = design_law(stage, without_filter(controller), bus, autostart=True)
     seen = seen_by(alone["tick"][0]["estimator"])
 
@@ -119,6 +137,7 @@ def _axis_taps(search: TapsSearch, axis: int, on_progress: Callable[[str], None]
     noise = Noise(
         float(np.sqrt(np.diag(measurement_noise(stage, model, bus)))[axis]),
         float(rounding_force_n(stage, bus, model)[axis]),
+        _shaken(model, asked, bus.period_s, axis),
     )
     bounds = Bounds(
         asked.edge_hz, _EDGE, asked.slope, asked.peak_s_max, asked.disk_margin_min, asked.effort_max
@@ -126,6 +145,14 @@ def _axis_taps(search: TapsSearch, axis: int, on_progress: Callable[[str], None]
     return youla_taps(
         loop(Case("as drawn", middle, NOMINAL), asked.peak_s_max), changed, bounds, noise, search.taps, on_progress
     )
+
+
+def _shaken(model: LinearStage, asked: TapBounds, period_s: float, axis: int) -> Array:
+    """(2,2) factor of the covariance that the base adds to position and velocity of an axis in a period."""
+    if not isinstance(asked, QuietBounds):
+        return np.zeros((2, 2))
+    covariance = shaken_covariance(model, model.mass_kg * asked.base_noise_m_per_s2_per_rt_hz, period_s)
+    return np.asarray(np.linalg.cholesky(covariance[axis::3, axis::3]))
 
 
 def without_filter(controller: ControllerConfig) -> ControllerConfig:
@@ -157,6 +184,9 @@ def write_taps(search: TapsSearch, found: FoundTaps, path: Path) -> None:
     table.add("delay_periods", bus.delay_periods)
     table.add("plane", _array(found.plane))
     table.add("z", _array(found.z))
+    if found.quiet is not None:
+        table.add("quiet_plane", _array(found.quiet.plane))
+        table.add("quiet_z", _array(found.quiet.z))
     x, z = (1e9 * value for value in found.hold_noise_m)
     table.comment(f"pkxyz tune {search.name}: stage {search.stage}, {x:.2f} nm of noise in x and y, {z:.2f} in z")
     filters.append(table)

@@ -31,6 +31,12 @@ def process_noise(model: LinearStage, config: EstimatorConfig, period_s: float) 
     return van_loan_discretization(model.a, shaping, period_s)
 
 
+def shaken_covariance(model: LinearStage, force_n_per_rthz: float, period_s: float) -> Array:
+    """(6,6) that a white force on the platform, of a one-sided density, adds to position and velocity in a period."""
+    shaping = np.vstack([np.zeros((3, 3)), np.eye(3) * force_n_per_rthz / (math.sqrt(2.0) * model.mass_kg)])
+    return np.asarray(van_loan_discretization(model.a[:6, :6], shaping, period_s)[1])
+
+
 def sense_noise(stage: Stage, bus: BusConfig) -> Array:
     """Standard deviation (3,) in m of one sample of each stroke:
     white noise up to half the sampling rate, and quantisation.

@@ -63,6 +63,8 @@ class Noise:
     """of a measured position"""
     rounding_n: float
     """of the force at the platform that is rounded away; its difference acts, and the filter is told"""
+    shaken: Array = field(default_factory=lambda: np.zeros((2, 2)))
+    """(2,2) factor L of the covariance L L^T that white forces on the stage add to position and velocity in a period"""
 
 
 class InnovationLoop:
@@ -87,6 +89,7 @@ class InnovationLoop:
         self.c = np.block([[one.c, np.zeros((1, len(a)))], [one.c, -shown], [-d @ one.c, -c]])
         self.d = np.array([[0.0, 0.0], [1.0, 0.0], [-d[0, 0], -1.0]])
         self.rounded = np.vstack([one.b, told])
+        self.shaken = np.eye(n + len(a), 2)  # position and velocity of the stage
         self.position = np.eye(1, n + len(a))
         self.period_s, self.peak_s = plant.period_s, peak_s
         self.stiffness_n_per_m = float(one.stiffness_n_per_m[0, 0])
@@ -191,20 +194,17 @@ def _hold_variance(drawn: InnovationLoop, noise: Noise, taps: int) -> tuple[Arra
     points = 4096
     f = (np.arange(points) + 0.5) * 0.5 / drawn.period_s / points
     z, late = np.exp(2j * math.pi * f * drawn.period_s), delays(f, drawn.period_s, taps)
-    inputs = np.hstack([drawn.b, drawn.rounded])
+    inputs = np.hstack([drawn.b, drawn.rounded, drawn.shaken @ noise.shaken])
     outputs = np.vstack([drawn.position, drawn.c[1]])
-    through = np.array([[0.0, 0.0, 0.0], [1.0, 0.0, 0.0]])
+    through = np.zeros((2, 5))
+    through[1, 0] = 1.0
     h = response(drawn.a, inputs, outputs, through, z)
     shaped = np.abs(1.0 - 1.0 / z) * noise.rounding_n
-    fixed = np.concatenate([h[:, 0, 0] * noise.sense_m, h[:, 0, 2] * shaped])
-    by_tap = np.concatenate(
-        [
-            (h[:, 0, 1] * h[:, 1, 0] * noise.sense_m)[:, None] * late,
-            (h[:, 0, 1] * h[:, 1, 2] * shaped)[:, None] * late,
-        ]
-    )
+    sources = ((0, noise.sense_m), (2, shaped), (3, 1.0), (4, 1.0))
+    fixed = np.concatenate([h[:, 0, k] * size for k, size in sources])
+    by_tap = np.concatenate([(h[:, 0, 1] * h[:, 1, k] * size)[:, None] * late for k, size in sources])
     quadratic = np.real(by_tap.conj().T @ by_tap) / points
-    return quadratic, np.real(by_tap.conj().T @ fixed) / points, float(np.mean(np.abs(fixed) ** 2) * 2.0)
+    return quadratic, np.real(by_tap.conj().T @ fixed) / points, float(np.sum(np.abs(fixed) ** 2) / points)
 
 
 def _ask_as_drawn(cones: "_Cones", drawn: InnovationLoop, f: Array, bounds: Bounds) -> None:
