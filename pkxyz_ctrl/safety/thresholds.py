@@ -3,7 +3,7 @@
 Measured on the plant with the laws of configs/controllers: moves between the corners of the workspace at 0.5 and
 2 mm/s, circles of 4 um at 100 Hz and 2 um at 200 Hz, the shipped scans; on the plant ``harsh`` (10 % in combs and
 springs), and where stiffness is 20 % off, mass 10 % and each comb 10 %, with quality factors of 5 to 200 (the
-tolerances ``wide``). ``tests/studies/test_false_alarms.py`` repeats it.
+tolerances ``wide``). ``tests/studies/alarms/test_false_alarms.py`` repeats it.
 """
 
 from typing import Final
