@@ -222,7 +222,7 @@ CHECKS = (
     Check(_A, "boot-up", "one frame, 00, within the boot time-out after NMT reset node", _NMT, _boot_up),
     Check(
         _A, "communication reset", "communication objects at defaults, application objects kept", _STATES,
-        _communication_reset,
+        _communication_reset, False,
     ),
     Check(_A, "states", "pre-operational or by itself operational after boot-up, then as commanded", _STATES, _states),
     Check(_A, "addressing", "commands to other nodes are ignored, those to node 0 obeyed", _NMT, _addressing),

@@ -55,7 +55,7 @@ TARGETS = {
     "pkxyz_ctrl.learning.store": ("learning/test_learning.py",),
     "hil.node.drive": _NODE,
     "hil.node.amplifier": (*_NODE, "node/test_node_sdo.py"),
-    "hil.recording.journal": ("recording/test_recording.py", "recording/test_wall_recorder.py"),
+    "hil.recording.journal": ("recording/test_recording.py",),
 }
 
 

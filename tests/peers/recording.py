@@ -4,9 +4,10 @@ A line of a log is ``(seconds) interface identifier#data``, as ``candump -L`` wr
 """
 
 import re
-from collections import defaultdict, deque
+from collections import deque
 from pathlib import Path
 
+from hil.bus.clock import Lockstep
 from pkxyz_ctrl.can.frame import Frame
 
 RECORDED = Path(__file__).parent / "recorded"
@@ -28,7 +29,7 @@ class RecordedNode:
     """
 
     def __init__(self, name: str, own: frozenset[int]) -> None:
-        self._answers: dict[bytes, deque[Frame]] = defaultdict(deque)
+        self._answers: dict[bytes, deque[Frame]] = {}
         self._after: deque[tuple[bytes, list[tuple[int, Frame]]]] = deque()
         asked, began_us = b"", 0
         for t_us, frame in frames_of(name):
@@ -37,6 +38,7 @@ class RecordedNode:
                 began_us = t_us
             elif frame.can_id == REQUEST:
                 asked = frame.data
+                self._answers.setdefault(asked, deque())  # or none
             elif frame.can_id == REPLY:
                 self._answers[asked].append(frame)
             elif frame.can_id in own and self._after:
@@ -46,9 +48,10 @@ class RecordedNode:
     def receive(self, frame: Frame, t_us: int) -> None:
         """What a master sends."""
         if frame.can_id == REQUEST:
-            answers = self._answers[frame.data]
-            assert answers, f"{frame.data.hex(' ')} was not asked when this was recorded: record it again"
-            self.waiting.append((t_us + 1000, answers[0] if len(answers) == 1 else answers.popleft()))
+            answers = self._answers.get(frame.data)
+            assert answers is not None, f"{frame.data.hex(' ')} was not asked when this was recorded: record it again"
+            if answers:
+                self.waiting.append((t_us + 1000, answers[0] if len(answers) == 1 else answers.popleft()))
         elif frame.can_id == NMT:
             while self._after and self._after[0][0] != frame.data:
                 self._after.popleft()
@@ -60,3 +63,26 @@ class RecordedNode:
         ready = [frame for at_us, frame in self.waiting if at_us <= t_us]
         self.waiting = [entry for entry in self.waiting if entry[0] > t_us]
         return ready
+
+
+class RecordedPort:
+    """A port with such a node at the other end, on the clock of lockstep."""
+
+    def __init__(self, node: RecordedNode, clock: Lockstep) -> None:
+        self._node, self._clock = node, clock
+
+    def send(self, frame: Frame) -> None:
+        self._node.receive(frame, self._clock.now_us)
+
+    def receive(self, deadline_us: int) -> Frame | None:
+        waiting = sorted(self._node.waiting, key=lambda entry: entry[0])
+        if not waiting or waiting[0][0] > deadline_us:
+            self._clock.run_until(max(self._clock.now_us, deadline_us))
+            return None
+        at_us, frame = waiting[0]
+        self._node.waiting.remove(waiting[0])
+        self._clock.run_until(max(self._clock.now_us, at_us))
+        return frame
+
+    def unsent(self) -> int:
+        return 0

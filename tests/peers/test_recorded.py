@@ -2,14 +2,21 @@
 
 import pytest
 from node_rig import EDS, RecordingPlant
-from recording import NMT, REPLY, REQUEST, RecordedNode, frames_of
+from recording import NMT, REPLY, REQUEST, RecordedNode, RecordedPort, frames_of
 
 from hil.bus.clock import Lockstep
+from hil.conformance import network, objects
+from hil.conformance.eds import read_eds
+from hil.conformance.run import conformance
+from hil.conformance.talker import Talker
+from hil.conformance.verdict import Verdict
 from hil.node.amplifier import AmplifierNode
 from pkxyz_ctrl.can.driver import AmplifierDriver
 from pkxyz_ctrl.can.driver_config import DriverConfig
 from pkxyz_ctrl.can.frame import Frame
 from pkxyz_ctrl.can.start_sequence import DriverState
+from pkxyz_ctrl.config.bus import BusConfig
+from pkxyz_ctrl.config.files import load
 
 SLOW = DriverConfig(  # as in the guest
     fd=False,
@@ -66,6 +73,23 @@ def test_a_master_hears_from_our_node_what_it_heard_when_it_was_recorded(name):
     assert len(answers) == len(expected) > 8
     aborts = {int.from_bytes(data[4:], "little") for data in answers if data[0] == 0x80}
     assert {0x06020000, 0x06010002} <= aborts
+
+
+def test_what_the_check_says_of_canopennode():
+    """Objects, SDO and resets: it refuses all that CiA 301 wants refused but values beyond their range, and a reset of
+    communication leaves its objects as they are.
+    """
+    shipped, clock = load("buses", "socketcan_classic", BusConfig), Lockstep()
+    bus = shipped.model_copy(update={"can": shipped.can.model_copy(update={"driver": SLOW})})
+    port = RecordedPort(RecordedNode("canopennode_check.log", FROM_THE_NODE), clock)
+    talker = Talker(clock, port, bus, read_eds(EDS, 10), allow_voltage=True)
+    checks = (objects.ANSWERS, *objects.CHECKS, *network.CHECKS[:2])
+    lines = {f"{line.group}: {line.name}": line for line in conformance(talker, checks)}
+    assert len(lines) == 19
+    deviating = {name: line.got for name, line in lines.items() if line.verdict is not Verdict.PASS}
+    assert list(deviating) == ["SDO: out of range", "boot-up and NMT: communication reset"]
+    assert "0x1029:01 = 3: accepted" in deviating["SDO: out of range"]
+    assert deviating["boot-up and NMT: communication reset"] == "0x1017:00 64 00, default 00 00"
 
 
 def test_frames_are_read_as_candump_writes_them():

@@ -265,7 +265,7 @@ class Kill:
     def _left(self, ended_by):
         path, code = self._run / "recording.parquet", self.controller.code
         if not path.exists() and not journal_of(path).exists():
-            assert ended_by, f"no recording, exit code {code}: {self._told()}"
+            assert ended_by or code == -signal.SIGTERM, f"no recording, exit code {code}: {self._told()}"
             return "no recording yet"
         recording = Recording.open(path)
         missing = np.diff(recording["tick"]) - 1

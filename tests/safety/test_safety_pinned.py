@@ -240,6 +240,8 @@ def test_limits_of_the_monitors() -> None:
     assert limits["safe_cycles"] == 10
     assert (limits["residual_max_m"], limits["unexplained_force_max_n"]) == (0.7e-6, 0.8e-3)
     assert (limits["force_change_max_n"], limits["force_change_share"]) == (40e-6, 0.4)
+    assert limits["innovation_share_m_per_n"] == 1.5e-3
+    assert limits["force_forget_share"] == pytest.approx(200e-6 / 2e-3, rel=1e-12)
     assert limits["force_trend_share"] == pytest.approx(200e-6 / 0.03, rel=1e-12)
     assert (limits["stroke_min_m"], limits["stroke_max_m"]) == (-2e-6, 27e-6)
     assert 19.99 < limits["voltage_step_max_v"] < 20.0  # 100 V/ms at 5 kHz, to whole counts and half of one
