@@ -90,13 +90,13 @@ def load(path: Path) -> Stored:
         belongs = Belongs(int(data["period_ticks"]), int(data["period_us"]), marks, dict(data["digests"]))
         if cosine.shape != sine.shape:
             raise ValueError("cosines and sines are not as many")
-        stored = Stored(belongs, np.asarray(0.5 * (cosine - 1j * sine), np.complex128), dict(data["provenance"]))
+        provenance = dict(data["provenance"])
     except (KeyError, TypeError, ValueError, OverflowError) as error:
         raise LearningError(f"{path}: is damaged: {type(error).__name__}: {error}; learn anew") from None
     shapes = marks.shape == (_MARKS, 3) and cosine.ndim == 2 and cosine.shape[1] == 3
     if not shapes or not (np.isfinite(cosine).all() and np.isfinite(sine).all()):
         raise LearningError(f"{path}: is damaged: its numbers do not have the shape of a correction; learn anew")
-    return stored
+    return Stored(belongs, np.asarray(0.5 * (cosine - 1j * sine), np.complex128), provenance)
 
 
 def require_same(stored: Stored, here: Belongs, path: str) -> None:

@@ -13,6 +13,7 @@ from pkxyz_ctrl.can.sense_input import (
     SENSE_MISSING,
     SenseInput,
 )
+from pkxyz_ctrl.safety.monitors import SenseStatus
 
 CODEC = ProcessCodec(0x28A, protected=True)
 
@@ -39,6 +40,12 @@ def running() -> SenseInput:
     return sense
 
 
+def test_what_is_flagged_is_what_the_monitors_know():
+    names = ("MISSING", "COUNTER", "CRC", "LENGTH", "DUPLICATE")
+    flags = (SENSE_MISSING, SENSE_COUNTER, SENSE_CRC, SENSE_LENGTH, SENSE_DUPLICATE)
+    assert flags == tuple(SenseStatus[name] for name in names)
+
+
 def test_nothing_received_is_missing_and_zero():
     assert tick(SenseInput(CODEC)) == (0, SENSE_MISSING)
 
@@ -52,6 +59,20 @@ def test_values_age(running):
     assert running.fresh
     assert tick(running) == (100, SENSE_MISSING)
     assert not running.fresh
+
+
+def test_a_late_frame_is_counted_as_the_sync_that_it_belongs_to(running):
+    """254 SYNCs behind it a counter still tells: its predecessor is no frame of today's."""
+    running.on_sync()
+    assert tick(running, frame(101)) == (100, SENSE_MISSING | SENSE_COUNTER)
+    for _ in range(252):
+        running.on_sync()
+    assert tick(running, frame(100)) == (100, SENSE_MISSING | SENSE_COUNTER)
+
+
+def test_a_node_that_starts_anew_has_said_nothing_yet(running):
+    running.reset()
+    assert tick(running) == (0, SENSE_MISSING)
 
 
 def test_after_a_loss_the_next_frame_is_used_and_flagged(running):

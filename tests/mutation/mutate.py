@@ -52,7 +52,7 @@ TARGETS = {
         "loop/test_overrun.py",
     ),
     "pkxyz_ctrl.loop.controller": ("loop/test_controller.py", "loop/test_overrun.py", "loop/test_flood.py"),
-    "pkxyz_ctrl.learning.store": ("learning/test_learning.py",),
+    "pkxyz_ctrl.learning.store": ("learning/test_learning_store.py", "learning/test_learning.py"),
     "hil.node.drive": _NODE,
     "hil.node.amplifier": (*_NODE, "node/test_node_sdo.py"),
     "hil.recording.journal": ("recording/test_recording.py",),
