@@ -124,6 +124,73 @@ def test_one_comb_alone_is_a_voltage(counts: tuple[int, int, int]) -> None:
     assert ErrorCode.DRIVE_STEP in rig.node.emergency.active
 
 
+@pytest.mark.parametrize("rig_type", [Rig, Mapped])
+@pytest.mark.parametrize("counts", [(9, 0, 0), (0, 9, 0), (0, 0, 9)])
+def test_one_comb_alone_is_late_and_not_the_0_v_that_is_due(rig_type: type[Rig], counts: tuple[int, int, int]) -> None:
+    rig = rig_type()
+    rig.start()
+    rig.cycle((0, 0, 0))
+    rig.cycle()
+    rig.sync()
+    rig.drive(counts)  # late
+    rig.sync()
+    assert rig.node.outputs == (0, 0, 0)
+    rig.cycle((1, 1, 1))  # late, too
+    rig.cycle((1, 1, 1))
+    rig.cycle()
+    assert rig.node.outputs == (1, 1, 1)
+    for _ in range(7):
+        rig.cycle()  # released
+    rig.drive(counts)  # late, and only 0 V may come
+    rig.cycle(counts)
+    rig.cycle()
+    assert rig.node.outputs == (0, 0, 0)
+
+
+@pytest.mark.parametrize("rig_type", [Rig, Mapped])
+def test_the_largest_count_of_the_eds_passes(rig_type: type[Rig]) -> None:
+    rig = rig_type()
+    rig.start()
+    rig.drive((32767, 32767, 32767))
+    assert rig.node._drive.pending == (32767, 32767, 32767)
+
+
+@pytest.mark.parametrize("rig_type", [Rig, Mapped])
+def test_counter_and_crc_of_the_last_frame_are_read_back(rig_type: type[Rig]) -> None:
+    rig = rig_type()
+    assert (rig.read(0x2000, 1), rig.read(0x2000, 2)) == (0, 0)
+    rig.start()
+    rig._counter = 7
+    data = protected(DRIVE, (1, 2, 3) if rig_type is Rig else (3, 2, 1), 7)
+    rig.drive((1, 2, 3))
+    assert (rig.read(0x2000, 1), rig.read(0x2000, 2)) == (7, data[7])
+
+
+def test_what_was_pending_when_it_left_operational_is_forgotten() -> None:
+    rig = Rig()
+    rig.start()
+    rig.cycle((0, 0, 0))
+    rig.drive((1, 1, 1))
+    rig.nmt(0x80)
+    rig.start()
+    rig.sync()
+    assert rig.node.outputs == (0, 0, 0)
+    assert rig.node._drive.pending is None
+
+
+def test_a_refused_frame_excuses_one_sync_and_not_the_next() -> None:
+    rig = Rig()
+    rig.start()
+    rig.cycle((1, 1, 1))
+    rig.sync()
+    rig.give(DRIVE, protected(DRIVE, (2, 2, 2), 9))  # its counter has jumped
+    rig.sync()
+    rig.sync()
+    rig.forget()
+    rig.give(DRIVE, protected(DRIVE, (3, 3, 3), 10))
+    assert rig.node._drive.pending is None  # late for the second of them
+
+
 def test_a_frame_that_is_late_may_have_any_counter() -> None:
     rig = Rig()
     rig._counter = 255

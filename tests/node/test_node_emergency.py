@@ -2,7 +2,16 @@
 
 import canopen
 import pytest
-from node_rig import EMCY, PRE_OPERATIONAL, Rig, assert_only_zero_energises, in_state, master
+from node_rig import (
+    DRIVE,
+    EMCY,
+    PRE_OPERATIONAL,
+    Rig,
+    assert_only_zero_energises,
+    in_state,
+    master,
+    protected,
+)
 
 from hil.node.amplifier import NmtState
 
@@ -88,3 +97,44 @@ def test_emergencies_wait_while_stopped_and_can_be_switched_off() -> None:
     rig.run(10_000)
     assert rig.sent == []
     assert rig.read(0x1001, 0) == 7
+
+
+@pytest.mark.parametrize("mapped", [False, True])
+@pytest.mark.parametrize(
+    ("data", "info"),
+    [
+        (protected(DRIVE, (1, 2, 3), 6)[:7], bytes((7, 8))),
+        (protected(DRIVE, (1, 2, 3), 6) + b"\0", bytes((9, 8))),
+        (protected(DRIVE, (1, 2, 0x1234), 6)[:7] + b"\x55", bytes((0, 0x34, 0x12, 6, 0x55))),
+        (protected(DRIVE, (1, 2, 3), 9), bytes((5, 9))),
+        (protected(DRIVE, (-1, 32767, 3), 6), bytes((1,))),
+        (protected(DRIVE, (32767, -1, -32768), 6), bytes((6,))),
+        (protected(DRIVE, (1, 2, 3), 6), bytes((6,))),
+    ],
+)
+def test_an_emergency_says_what_was_wrong(mapped: bool, data: bytes, info: bytes) -> None:
+    """Length and the one expected; the frame's end; last counter and this one; the combs, a bit each; the counter."""
+    rig = Rig()
+    if mapped:  # by the general way, which any other mapping takes
+        rig.node._drive.receive = rig.node._drive._receive_mapped
+    rig.start()
+    rig.give(DRIVE, protected(DRIVE, (0, 0, 0), 5))
+    rig.sync()
+    rig.sync()  # for which nothing came: the next frame is late, if nothing else is wrong with it
+    rig.run(10_000)
+    rig.forget()
+    rig.give(DRIVE, data)
+    rig.run(1000)
+    assert [frame[3:] for frame in rig.of(EMCY)] == [info.ljust(5, b"\0")]
+
+
+def test_an_emergency_of_a_late_frame_says_its_counter_0_too() -> None:
+    rig = Rig()
+    rig.start()
+    rig.give(DRIVE, protected(DRIVE, (0, 0, 0), 255))
+    rig.sync()
+    rig.sync()
+    rig.forget()
+    rig.give(DRIVE, protected(DRIVE, (1, 2, 3), 0))
+    rig.run(10_000)
+    assert [frame[3:] for frame in rig.of(EMCY)] == [bytes(5)]

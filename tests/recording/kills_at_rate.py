@@ -201,8 +201,8 @@ class Kill:
                 somebody.send(STOP_ALL)
             states = [] if self.when == "fault" else ["operational"]
             waited_for(lambda: self._has_shown(since, ["pre-operational", *states]), self._told)
-        elif self.who == "recorder":
-            waited_for(self.controller.child, self._told)
+        else:
+            waited_for(lambda: self.controller.child() or self.controller.has_ended(), self._told)
         time.sleep(self._delay_s)
 
     def _has_shown(self, since, states):

@@ -44,8 +44,9 @@ TIMEOUT_US = 1_000_000  # the guest stands still for longer than 0.2 s now and t
 DRIVE_TIMEOUT_US = 600_000
 CAPABILITIES_VERSION, SYS_NICE = 0x2008_0522, 23  # linux/capability.h
 CANFD_BRS = 0x01  # linux/can.h
+ATTEMPTS = 6
 STUCK_S = 60  # a process that still runs then writes where it is
-SYNC, DRIVE, SENSE, EMCY, OURS = 0x080, 0x30A, 0x28A, 0x08A, 0x77F
+NMT, SYNC, DRIVE, SENSE, EMCY, OURS = 0x000, 0x080, 0x30A, 0x28A, 0x08A, 0x77F
 SCENARIO = """
 name = "slow_scan"
 duration_s = 3.2
@@ -213,9 +214,9 @@ def next_frame(looking):
 
 def drive_frames(looking, run, driven, frames=20):
     """Frames seen until so many drive frames of a controller carried a voltage, or none; empty if they did not come, or
-    if the node complained before.
+    if the node complained before, or was taken out of operational.
     """
-    seen, came, end_s = [], 0, time.monotonic() + 120
+    seen, came, is_running, end_s = [], 0, False, time.monotonic() + 120
     looking.settimeout(1)
     while came < frames:
         if not run.process.is_alive() or time.monotonic() > end_s:
@@ -224,9 +225,8 @@ def drive_frames(looking, run, driven, frames=20):
             seen.append(next_frame(looking))
             can_id, data = seen[-1][:2]
             came += can_id == DRIVE and any(data[:6]) == driven
-            if driven and can_id == DRIVE:
-                end_s = time.monotonic() + 20  # in FAULT none come any more
-            if driven and came and can_id == EMCY and any(data):  # in the start-up the node misses us as it should
+            is_running = is_running or can_id == DRIVE  # in the start-up before the node misses us as it should
+            if driven and is_running and ((can_id == EMCY and any(data)) or can_id == NMT):
                 return []
     looking.settimeout(90)
     return seen
@@ -235,10 +235,10 @@ def drive_frames(looking, run, driven, frames=20):
 @contextmanager
 def driving(bench, plant, *words, bus="bus.toml"):
     """A controller that drives the combs, a socket that looks on, and the frames seen so far. A guest that stands still
-    for a second puts it in fault at 0 V instead, so it may begin three times.
+    for a second puts it in fault at 0 V instead, so it may begin some times.
     """
     said = []
-    for _ in range(3):
+    for _ in range(ATTEMPTS):
         plant.seen("pre-operational", False)
         with (
             Command(bench, "run", "slow_scan.toml", "--bus", bus, *words) as run,

@@ -27,6 +27,7 @@ import cantools
 import numpy as np
 import pytest
 from on_vcan import (
+    ATTEMPTS,
     DRIVE,
     EMCY,
     SCENARIO,
@@ -42,6 +43,7 @@ from on_vcan import (
     slow_bus,
     slow_law,
 )
+from patience import replaced
 
 sys.path.insert(0, str(Path(__file__).parent.parent / "peers"))
 from durand_module import PRODUCT, VENDOR, DurandModule
@@ -70,14 +72,12 @@ def bench(request):
     folder = Path(tempfile.mkdtemp(prefix=request.param))
     slow_law(folder)
     (folder / "slow_scan.toml").write_text(SCENARIO)
-    text = slow_bus(request.param)
+    text = replaced(r"^drive_timeout_ms = \d+", "drive_timeout_ms = 1000", slow_bus(request.param))
     (folder / "bus.toml").write_text(text)
     identity = f"vendor_id = {VENDOR}\nproduct_code = {PRODUCT}\n"
     (folder / "plain.toml").write_text(text.replace("protection = true", "protection = false") + identity)
     load_scenario(folder / "slow_scan.toml").setup().law  # noqa: B018  imports the rest, before processes part
     simulated_plant(load("buses", folder / "plain.toml", BusConfig))
-    for tool in ("candump", "cansend", "canplayer"):  # once read from the host's disk, one that starts delays no tick
-        subprocess.run([tool, "-?"], capture_output=True, check=False)
     return folder
 
 
@@ -255,13 +255,20 @@ def test_canopens_local_node_stores_everything_and_is_not_enabled(bench):
 
 
 def test_can_utils_and_cantools_read_a_run_and_anothers_nmt_is_a_fault(bench):
-    """candump sees what our own log says, cantools reads it by our DBC; cansend's NMT command ends it."""
-    log = bench / "dump"
-    with served(bench) as plant, log.open("w") as out, subprocess.Popen(["candump", "-L", "can0"], stdout=out) as dump:
+    """candump sees what our own log says, cantools reads it by our DBC; canplayer's NMT command ends it. Both are there
+    before: a program that is started in the guest holds everybody up for too long.
+    """
+    log, pipe = bench / "dump", {"stdin": subprocess.PIPE, "bufsize": 0}
+    with (
+        served(bench) as plant,
+        log.open("w") as out,
+        subprocess.Popen(["candump", "-L", "can0"], stdout=out) as dump,
+        subprocess.Popen(["canplayer", "-t"], **pipe) as somebody,
+    ):
         words = ("--out", "watched", "--replace", "--seconds", "60", "--json")
-        for _ in range(3):  # a guest that stands still meanwhile is a fault of its own
+        for _ in range(ATTEMPTS):  # a guest that stands still meanwhile is a fault of its own
             with driving(bench, plant, *words) as (run, looking, _):
-                subprocess.run(["cansend", "can0", "000##10200" if is_fd(bench) else "000#0200"], check=True)
+                somebody.stdin.write(b"(0.0) can0 000##10200\n" if is_fd(bench) else b"(0.0) can0 000#0200\n")
                 assert drive_frames(looking, run, driven=False)
                 run.signal(signal.SIGTERM)
                 code, text, err = run.wait()
@@ -269,7 +276,8 @@ def test_can_utils_and_cantools_read_a_run_and_anothers_nmt_is_a_fault(bench):
             if "FOREIGN_FRAME" in fault:
                 break
             assert any(word in fault for word in STOOD_STILL), fault
-        dump.terminate()
+        for tool in (dump, somebody):
+            tool.terminate()
     assert code == 128 + signal.SIGTERM, err
     assert "FOREIGN_FRAME" in fault
     assert "0x000 [02 00], an NMT command" in fault
