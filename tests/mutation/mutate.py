@@ -181,7 +181,9 @@ def report(jobs: list[Job], outcomes: dict[Job, str]) -> tuple[str, int]:
         tried = [job for job in made if job in outcomes]
         lived = [job for job in tried if outcomes[job] == "survived"]
         slow = sum(outcomes[job] == "timeout" for job in tried)
-        rows.append(f"| `{module}` | {len(made)} | {len(tried)} | {len(tried) - len(lived)} ({slow}) | {len(lived)} |")
+        untried = f", {len(made) - len(tried)} untried" if len(tried) < len(made) else ""
+        late = f", {slow} by time-out" if slow else ""
+        rows.append(f"| `{module}` | {len(tried) - len(lived)} of {len(tried)}{late}{untried} |")
         for job in lived:
             key = key_of(job)
             met[key] += 1
@@ -195,14 +197,13 @@ def report(jobs: list[Job], outcomes: dict[Job, str]) -> tuple[str, int]:
         f"""# Mutation testing
 
 `make mutate` changes one thing at a time in the code that stands between a mistake and 200 V, and asks whether a test
-notices. It ends with exit code 1 if a survivor has no reason in `tests/mutation/mutation_survivors.toml`; nearly all
-survivors are equivalent code.
+notices. It ends with exit code 1 if a survivor has no reason in `tests/mutation/mutation_survivors.toml`.
 
 Last result: **{len(outcomes)} of {len(jobs)} mutants tried, {killed} killed, {len(outcomes) - killed} survived,
 {len(unexplained)} of them without a reason.**
 
-| module | mutants | tried | killed (by time-out) | survived |
-|---|---|---|---|---|
+| module | killed |
+|---|---|
 {table}
 {listed}""",
         len(unexplained),

@@ -5,7 +5,8 @@ from gate_frames import CONFIG, drive, holding, nmt, sdo_write, sync
 
 from pkxyz_ctrl.can.frame import Frame
 from pkxyz_ctrl.safety import gate_rules
-from pkxyz_ctrl.safety.gate import TransmitGate
+from pkxyz_ctrl.safety.gate import TransmitGate, _words
+from pkxyz_ctrl.safety.gate_rules import FrameKind, Reason
 from pkxyz_ctrl.safety.modes import Mode
 
 NO_MODE = 99
@@ -148,3 +149,37 @@ def test_the_first_refusal_is_kept_until_it_is_cleared() -> None:
     gate.clear()
     assert not gate.latched
     assert reason(drive(6, 5, 5, 0), gate=gate) is None
+
+
+WORD = int.from_bytes(bytes.fromhex("fe ff 03 00 ff 7f 07 ab"), "little", signed=True)  # -2, 3, 32767, counter 7
+
+
+@pytest.mark.parametrize(
+    ("what", "words"),
+    [
+        (Reason.NOT_NOW + FrameKind.SYNC, "SYNC is not permitted now"),
+        (Reason.LATCHED, "the gate is latched"),
+        (Reason.NMT_NODE, "NMT command to node 255; only node 10 is ours, never all"),
+        (Reason.DRIVE_LENGTH, "drive PDO has 5 bytes instead of 8"),
+        (Reason.DRIVE_REPEATED, "drive PDO repeats alive counter 7: the node would ignore it"),
+        (Reason.DRIVE_TOO_SOON, "drive PDO 40 us after the one before, at least 100 us apart"),
+        (Reason.DRIVE_RANGE, f"drive counts -2, 3, 32767 are not all in 0..{CONFIG.count_max}"),
+        (Reason.DRIVE_STEP, f"drive counts -2, 3, 32767 after 4, 5, 6: a step beyond {CONFIG.count_slew_max}"),
+        (Reason.DRIVE_COUNTER, "drive PDO has alive counter 7 instead of 9"),
+        (Reason.DRIVE_CRC, "drive PDO has a wrong CRC, 0xAB"),
+        (Reason.SDO_LENGTH, "SDO request has 5 bytes instead of 8"),
+    ],
+)
+def test_words_of_a_reason(what: int, words: str) -> None:
+    gate = TransmitGate(CONFIG)
+    memory = gate.memory
+    memory["count"], memory["time_us"], memory["counter_next"] = (4, 5, 6), 160, 9
+    assert _words(what, gate.record[0], memory[0], 5, WORD, 200) == words
+
+
+def test_only_a_reason_of_a_mode_names_a_kind_of_frame() -> None:
+    assert min(Reason.NOT_NOW + kind for kind in FrameKind) > max(kind for kind in Reason if kind != Reason.NOT_NOW)
+
+
+def test_a_payload_of_full_negative_bytes_is_looked_at_like_any_other() -> None:
+    assert "has a wrong CRC, 0xFF" in (reason(of(0x30A, bytes(7) + b"\xff")) or "")
