@@ -177,6 +177,12 @@ def test_words_of_a_reason(what: int, words: str) -> None:
     assert _words(what, gate.record[0], memory[0], 5, WORD, 200) == words
 
 
+def test_words_of_a_refused_write_name_the_object_and_what_is_permitted() -> None:
+    told = reason(sdo_write(0x6444, 1, 5, 4), Mode.PRE_OPERATIONAL) or ""
+    assert "0x6444:01" in told
+    assert told.startswith("frame 0x60A [23 44 64 01 05 00 00 00] blocked in PRE_OPERATIONAL: SDO write")
+
+
 def test_only_a_reason_of_a_mode_names_a_kind_of_frame() -> None:
     assert min(Reason.NOT_NOW + kind for kind in FrameKind) > max(kind for kind in Reason if kind != Reason.NOT_NOW)
 

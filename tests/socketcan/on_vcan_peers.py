@@ -155,6 +155,16 @@ def controller(folder, bus_file, *words):
     return Command(folder, "run", "slow_scan.toml", "--bus", bus_file, *words)
 
 
+@contextmanager
+def tool(*words, **streams):
+    """A program of can-utils, ended with this."""
+    with subprocess.Popen(words, **streams) as process:
+        try:
+            yield process
+        finally:
+            process.terminate()
+
+
 def test_durands_module_is_driven_and_does_without_a_controller_that_is_killed(bench):
     with durand_module(bench) as module:
         words = ("--out", "plain", "--replace", "--seconds", "60", "--json")
@@ -258,12 +268,12 @@ def test_can_utils_and_cantools_read_a_run_and_anothers_nmt_is_a_fault(bench):
     """candump sees what our own log says, cantools reads it by our DBC; canplayer's NMT command ends it. Both are there
     before: a program that is started in the guest holds everybody up for too long.
     """
-    log, pipe = bench / "dump", {"stdin": subprocess.PIPE, "bufsize": 0}
+    log = bench / "dump"
     with (
         served(bench) as plant,
         log.open("w") as out,
-        subprocess.Popen(["candump", "-L", "can0"], stdout=out) as dump,
-        subprocess.Popen(["canplayer", "-t"], **pipe) as somebody,
+        tool("candump", "-L", "can0", stdout=out),
+        tool("canplayer", "-t", stdin=subprocess.PIPE, bufsize=0) as somebody,
     ):
         words = ("--out", "watched", "--replace", "--seconds", "60", "--json")
         for _ in range(ATTEMPTS):  # a guest that stands still meanwhile is a fault of its own
@@ -276,8 +286,6 @@ def test_can_utils_and_cantools_read_a_run_and_anothers_nmt_is_a_fault(bench):
             if "FOREIGN_FRAME" in fault:
                 break
             assert any(word in fault for word in STOOD_STILL), fault
-        for tool in (dump, somebody):
-            tool.terminate()
     assert code == 128 + signal.SIGTERM, err
     assert "FOREIGN_FRAME" in fault
     assert "0x000 [02 00], an NMT command" in fault
