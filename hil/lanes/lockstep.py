@@ -97,7 +97,7 @@ class LockstepRig:
         latency_us = (setup.bus.delay_periods - 1) * setup.bus.period_us
         self._endpoint = self.wire.attach("controller")
         self.port: Port = WirePort(self._endpoint, self.clock, latency_us)
-        self.controller = Controller(setup.law, setup.bus, setup.gate, self.port.send, self.port.discard_unsent)
+        self.controller = Controller(setup.law.copy(), setup.bus, setup.gate, self.port.send, self.port.discard_unsent)
         self.injection = _injection_of(self) if setup.faults or setup.clear_s is not None else None
         self.log = FrameLog(frame_log, can.channel) if frame_log is not None else None
         if self.log is not None:

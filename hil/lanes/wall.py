@@ -105,7 +105,7 @@ class WallRig:
         self._recorder = recorder
         self._ending = ending
         can_config = require_real_bus(setup.bus)
-        law = setup.law
+        law = setup.law.copy()  # a stage in operation may be given another
         learner = setup.new_learner()
         self.live = None if learner is None else LiveReference(setup.trajectory, setup.bus.period_us, learner)
         _warm_up(law, standing_still() if self.live is None else self.live.rows)

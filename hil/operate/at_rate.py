@@ -13,6 +13,7 @@ from hil.lanes.ending import Ended, Ending
 from hil.lanes.setup import Setup
 from hil.lanes.wall import WallRig, require_real_bus
 from hil.operate.commands import COMMAND, PATH_BLOCK, TICK, Verb, new_command
+from hil.operate.law_change import OFFER
 from hil.operate.memory import StageMemory
 from hil.operate.path_stream import PathStream
 from hil.operate.reach import Reach
@@ -65,6 +66,7 @@ class OperatedLoop:
         self._ticks, self._frames = memory.writer("ticks"), memory.writer("frames")
         self._commands = memory.reader("commands", from_start=True)  # what was asked while the amplifier started, too
         self._path = memory.reader("path", from_start=True)
+        self._laws = memory.reader("laws")
         self._head = memory.head
         self._stops = 0
         self._tick = np.zeros(1, TICK)
@@ -94,7 +96,13 @@ class OperatedLoop:
             given.append(new_command(Verb.STOP, 0)[0])
         while len(given) < _COMMANDS_A_TICK and (command := self._commands.read()) is not None:
             given.append(np.frombuffer(command, COMMAND)[0])
+            if given[-1]["verb"] == Verb.LAW:
+                self._take_law()
         return given
+
+    def _take_law(self) -> None:
+        while (offered := self._laws.read()) is not None:
+            self._session.offer(np.frombuffer(offered, OFFER)[0])
 
     def _take_rows(self) -> None:
         block = self._path.read()
@@ -137,7 +145,7 @@ def operate(setup: Setup, settings: Settings, name: str, files: dict[str, str], 
 def _session_of(setup: Setup, settings: Settings, rig: WallRig, memory: StageMemory) -> Session:
     reach = Reach(Stage(setup.stage), DriveLimits.of(setup.controller, setup.bus))
     rehearse(reach, settings)
-    return Session(rig.controller, reach, settings, memory.writer("answers").write)
+    return Session(rig.controller, reach, settings, memory.writer("answers").write, setup.controller.name)
 
 
 def rehearse(reach: Reach, settings: Settings) -> None:

@@ -6,6 +6,7 @@ from typing import Final
 import numpy as np
 from numpy.typing import NDArray
 
+from hil.operate.law_change import NAME_BYTES
 from pkxyz_ctrl.loop.row import ROW
 
 
@@ -28,6 +29,9 @@ class Verb(IntEnum):
     SETTLE = 14
     LIMITS = 15
     RELEASE = 16
+    FRAME = 17
+    QUIET = 18
+    LAW = 19
 
 
 MEANING: Final[dict[Verb, str]] = {
@@ -46,6 +50,9 @@ MEANING: Final[dict[Verb, str]] = {
     Verb.AUTO_ZERO: "park, home, and back to where the stage held",
     Verb.SETTLE: "the window and dwell by which the stage is in position",
     Verb.LIMITS: "velocity, acceleration and jerk of moves that name none",
+    Verb.FRAME: "where the sample lies: targets and positions are in its coordinates from now on",
+    Verb.QUIET: "quiet holds: less noise and less rejection while the set-point stands; or no longer",
+    Verb.LAW: "another law, taken over without a jump; while the stage holds, or is off",
     Verb.RELEASE: "0 V at once, whatever runs; a fault that has to be cleared",
 }
 
@@ -102,6 +109,10 @@ COMMAND = np.dtype(
         ("jerk_m_per_s3", "<f8"),
         ("window_m", "<f8"),  # SETTLE
         ("dwell_s", "<f8"),
+        ("sigmas", "<f8"),
+        ("matrix", "<f8", (3, 4)),  # FRAME, as of ``SampleFrame.matrix``
+        ("on", "<i4"),  # QUIET
+        ("law", "<u8"),  # LAW: number of the one that was offered
         ("path", "<u8"),  # PATH: number of the path whose rows are streamed ...
         ("rows", "<u8"),  # ... and how many it has
         ("start_m", "<f8", (3,)),  # ... and where it begins
@@ -126,7 +137,10 @@ SESSION = np.dtype(
         ("in_position", "<i4"),
         ("homed", "<i4"),
         ("running_id", "<u8"),  # of the command that moves the stage, 0 for none
-        ("target_m", "<f8", (3,)),  # where the motion ends
+        ("target_m", "<f8", (3,)),  # where the motion ends, in the stage's coordinates
+        ("matrix", "<f8", (3, 4)),  # of the sample's coordinates, as of ``SampleFrame.matrix``
+        ("uncertainty_m", "<f8", (3,)),  # standard deviation of the estimate
+        ("law", f"S{NAME_BYTES}"),
         ("progress", "<f8"),  # 0..1 of a path
         ("path_row", "<f8"),  # where on the path, in its rows
         ("commands", "<u8"),  # taken out of the memory so far

@@ -14,13 +14,14 @@ from zlib import crc32
 import numpy as np
 
 from hil.operate.commands import ANSWER, COMMAND, PATH_BLOCK, TICK
+from hil.operate.law_change import OFFER
 from hil.operate.ring import Reader, Writer, bytes_for
 from hil.operate.tick_frames import FRAMES
 from pkxyz_ctrl.client import place
 
 _HEAD = np.dtype([("kept_ticks", "<u8"), ("server", "<u8"), ("stop", "<u8")])
 _HEAD_BYTES = 4096
-_COMMANDS, _ANSWERS, _BLOCKS = 256, 1024, 128
+_COMMANDS, _ANSWERS, _BLOCKS, _LAWS = 256, 1024, 128, 4
 _FRAMES_SHARE = 12  # of the ticks, the frames are kept of one in so many: the last 5 s of 60
 _IN_MEMORY = Path("/dev/shm")
 
@@ -64,7 +65,7 @@ class StageMemory:
         return cls(base / f"pkxyz-{os.getuid()}-{crc32(os.fsencode(folder)):08x}-{name}", kept_ticks)
 
     def writer(self, ring: str) -> Writer:
-        """To write to a ring: "ticks", "frames" and "answers" are the loop's, "commands" and "path" the server's."""
+        """To write to a ring: "ticks", "frames" and "answers" are the loop's, "commands", "path" and "laws" the server's."""
         return Writer(*self._parts[ring])
 
     def reader(self, ring: str, *, from_start: bool = False) -> Reader:
@@ -86,6 +87,7 @@ def _rings(kept_ticks: int) -> list[tuple[str, np.dtype[Any], int]]:
         ("commands", COMMAND, _COMMANDS),
         ("answers", ANSWER, _ANSWERS),
         ("path", PATH_BLOCK, _BLOCKS),
+        ("laws", OFFER, _LAWS),
         ("ticks", TICK, kept_ticks),
         ("frames", FRAMES, max(1, kept_ticks // _FRAMES_SHARE)),
     ]

@@ -1,7 +1,7 @@
 """The verbs that take time, each as a generator that is resumed once a tick and returns what was reached, in words."""
 
 from collections.abc import Generator
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 
 import numpy as np
 from numpy.typing import NDArray
@@ -11,6 +11,7 @@ from hil.operate.reach import Reach
 from hil.operate.setpoints import Setpoints
 from hil.operate.settings import Settings
 from pkxyz_ctrl.loop.controller import Controller
+from pkxyz_ctrl.loop.in_position import IN_POSITION
 from pkxyz_ctrl.safety.modes import LOOP_CLOSED, MODE_FACTS, Event, Mode, refusal
 from pkxyz_ctrl.trajectory import TrajectoryError
 from pkxyz_ctrl.trajectory.segments import Limits
@@ -43,8 +44,7 @@ class Operated:
     reach: Reach
     settings: Settings
     period_s: float
-    ticks_in_position: int = 0
-    """in a row, this one included"""
+    in_position: NDArray[np.void] = field(default_factory=lambda: np.zeros(1, IN_POSITION))
     path: PathStream | None = None
     """that is being followed"""
     said: str = ""
@@ -68,7 +68,13 @@ class Operated:
     @property
     def is_in_position(self) -> bool:
         """Whether the estimate has been within the window of the target for the dwell, and the set-point is there."""
-        return self.setpoints.has_arrived and self.ticks_in_position * self.period_s >= self.settings.dwell_s
+        return self.setpoints.has_arrived and bool(
+            self.in_position["ticks"][0] * self.period_s >= self.settings.dwell_s
+        )
+
+    def where(self, position_m: Array) -> str:
+        """A position (3,) of the stage in words: where on the sample."""
+        return _um(self.reach.turn.to_sample(position_m))
 
     def ticks(self, seconds: float) -> range:
         """As many as there are in a time."""
@@ -136,11 +142,11 @@ def move(stage: Operated, target_m: Array, limits: Limits) -> Steps:
         yield
     for n in stage.ticks(stage.settings.settle_s):
         if stage.is_in_position:
-            return f"in position at {_um(target_m)}, {n * stage.period_s * 1e3:.1f} ms after the set-point"
+            return f"in position at {stage.where(target_m)}, {n * stage.period_s * 1e3:.1f} ms after the set-point"
         yield
     window_nm, dwell_ms = stage.settings.window_m * 1e9, stage.settings.dwell_s * 1e3
     raise AbortedError(
-        f"the set-point is at {_um(target_m)}, but the stage has not been within {window_nm:g} nm of it for "
+        f"the set-point is at {stage.where(target_m)}, but the stage has not been within {window_nm:g} nm of it for "
         f"{dwell_ms:g} ms in {stage.settings.settle_s:g} s: widen the window, or look for what disturbs it"
     )
 
@@ -150,10 +156,12 @@ def jog(stage: Operated, direction: Array, limits: Limits, lease: "Lease") -> St
     stage.require_holding("a jog")
     axis = int(np.argmax(np.abs(direction)))
     here = stage.setpoints.state()[0]
-    target = here.copy()
-    target[axis] += np.sign(direction[axis]) * stage.reach.farthest(here, axis, float(direction[axis])) * 0.999
-    if abs(target[axis] - here[axis]) < 1e-9:
-        raise RefusedError(f"the stage is at the end of what the combs hold along {_AXES[axis]}, at {_um(here)}")
+    far_m = stage.reach.farthest(here, axis, float(direction[axis])) * 0.999
+    if far_m < 1e-9:
+        raise RefusedError(
+            f"the stage is at the end of what the combs hold along {_AXES[axis]}, at {stage.where(here)}"
+        )
+    target = here + stage.reach.turn.way_to_stage(np.sign(direction) * far_m)
     _set_out(stage, target, limits)
     while lease.lasts and not stage.setpoints.has_arrived:
         yield
@@ -162,7 +170,7 @@ def jog(stage: Operated, direction: Array, limits: Limits, lease: "Lease") -> St
     stage.setpoints.brake(stage.settings.limits)
     while not stage.setpoints.has_arrived:
         yield
-    return f"stands at {_um(stage.setpoints.target_m)}: {lease.why}"
+    return f"stands at {stage.where(stage.setpoints.target_m)}: {lease.why}"
 
 
 class Lease:
@@ -225,7 +233,7 @@ def pause(stage: Operated) -> Steps:
     yield
     while stage.is_driven and not stage.setpoints.stands_on_path:
         yield
-    return f"stands on its path at {_um(stage.setpoints.state()[0])}"
+    return f"stands on its path at {stage.where(stage.setpoints.state()[0])}"
 
 
 def resume(stage: Operated) -> Steps:
@@ -254,7 +262,7 @@ def halt(stage: Operated, *, on_path: bool) -> Steps:
         yield
         while stage.is_driven and not stage.setpoints.has_arrived:
             yield
-    return f"stands at {_um(stage.setpoints.target_m)} and holds" if stage.is_driven else "the loop is open"
+    return f"stands at {stage.where(stage.setpoints.target_m)} and holds" if stage.is_driven else "the loop is open"
 
 
 def park(stage: Operated) -> Steps:
@@ -274,7 +282,7 @@ def auto_zero(stage: Operated) -> Steps:
         return "the sense offsets are known"
     yield from enable(stage)
     yield from move(stage, back_m, stage.settings.limits)
-    return f"the sense offsets are known anew; back at {_um(back_m)}"
+    return f"the sense offsets are known anew; back at {stage.where(back_m)}"
 
 
 def clear(stage: Operated) -> Steps:

@@ -11,6 +11,7 @@ import numpy as np
 from numba import njit
 from numpy.typing import NDArray
 
+from hil.operate.sample_frame import PLAIN, Turn
 from pkxyz_ctrl.core import kinematics
 from pkxyz_ctrl.stage import Stage
 from pkxyz_ctrl.trajectory.check import DriveLimits
@@ -37,10 +38,13 @@ _AXES = "xyz"
 
 
 class Reach:
-    """Asks for one stage and drive; what it answers is a sentence, or None where there is no objection."""
+    """Asks for one stage and drive; what it answers is a sentence, or None where there is no objection. Positions are
+    the stage's; sentences, axes and how far one can go along them are those of ``turn``, the sample's.
+    """
 
     def __init__(self, stage: Stage, drive: DriveLimits) -> None:
         self._stage = stage
+        self.turn = Turn(PLAIN)
         self._limit_v = min(stage.voltage_max_v, drive.voltage_max_v)
         limits = stage.config.limits
         self._limits = np.zeros(1, _LIMITS)
@@ -63,7 +67,9 @@ class Reach:
         code, comb, value = self._look(self._at(position_m))
         if code == _FINE:
             return None
-        return f"{_where(position_m)} can't be held: {self._words(code, comb, value)}{self._range_words(position_m)}"
+        return (
+            f"{self.where(position_m)} can't be held: {self._words(code, comb, value)}{self._range_words(position_m)}"
+        )
 
     def motion_refusal(self, rows: Array, periods: int = 1) -> str | None:
         """Why rows (n, 9) of a motion, so many periods apart, can't be followed: where, comb, value, unit, limit."""
@@ -74,13 +80,13 @@ class Reach:
         )
         if code == _FINE:
             return None
-        return f"on the way, at {_where(rows[at, 0:3])}, {self._words(code, comb, value)}"
+        return f"on the way, at {self.where(rows[at, 0:3])}, {self._words(code, comb, value)}"
 
     def farthest(self, position_m: Array, axis: int, direction: float) -> float:
         """How far along an axis (0, 1, 2) one can go from a position that is held, in m; 0 where it isn't held."""
         way = np.zeros(3)
         way[axis] = math.copysign(self._span_m, direction)
-        return self.share(position_m, way) * self._span_m
+        return self.share(position_m, self.turn.way_to_stage(way)) * self._span_m
 
     def share(self, position_m: Array, way_m: Array) -> float:
         """What share of a way (3,) one can go from a position that is held; 0 where it isn't held."""
@@ -93,19 +99,28 @@ class Reach:
         for n, angle in enumerate(np.linspace(0.0, 2.0 * math.pi, points, endpoint=False)):
             way = np.zeros(3)
             way[first], way[second] = self._span_m * math.cos(angle), self._span_m * math.sin(angle)
+            way = self.turn.way_to_stage(way)
             border[n] += self.share(position_m, way) * way
         return border
 
     def range_along(self, position_m: Array, axis: int) -> tuple[float, float] | None:
         """Least and greatest coordinate of an axis that can be held, the others as they are; None if none is found."""
         geometry, elastic = self._stage.geometry, self._stage.elasticity
-        probe = np.array(position_m, dtype=np.float64)
-        if not _held_along(
-            geometry, elastic, self._limits, probe, axis, np.linspace(-self._span_m, self._span_m, _PROBES)
-        ):
+        base = np.array(self.turn.to_sample(position_m), dtype=np.float64)
+        base[axis] = 0.0
+        way = self.turn.way_to_stage(np.eye(3)[axis])
+        coordinates = np.linspace(-self._span_m, self._span_m, _PROBES)
+        origin = np.ascontiguousarray(self.turn.to_stage(base))
+        n = _held_along(geometry, elastic, self._limits, origin, np.ascontiguousarray(way), coordinates)
+        if n < 0:
             return None
-        value = float(probe[axis])
+        value = float(coordinates[n])
+        probe = origin + value * way
         return value - self.farthest(probe, axis, -1.0), value + self.farthest(probe, axis, 1.0)
+
+    def where(self, position_m: Array) -> str:
+        """A position (3,) in words."""
+        return f"({', '.join(_um(v) for v in self.turn.to_sample(position_m))}) um"
 
     def _at(self, position_m: Array) -> Array:
         return np.concatenate([position_m, np.zeros(6)])
@@ -116,12 +131,13 @@ class Reach:
 
     def _range_words(self, position_m: Array) -> str:
         """How far one can go along an axis instead, the others as they are asked for."""
+        asked_m = self.turn.to_sample(position_m)
         for axis, name in enumerate(_AXES):
             found = self.range_along(position_m, axis)
             if found is not None and found[1] - found[0] > 1e-9:
-                others = ", ".join(f"{a} = {_um(v)}" for a, v in zip(_AXES, position_m, strict=True) if a != name)
+                others = ", ".join(f"{a} = {_um(v)}" for a, v in zip(_AXES, asked_m, strict=True) if a != name)
                 low, high = found
-                asked = f"; {name} = {_um(position_m[axis])} um is asked for"
+                asked = f"; {name} = {_um(asked_m[axis])} um is asked for"
                 return f"{asked}, limits {_um(low)} to {_um(high)} um at {others} um"
         return "; no single axis can mend that: go nearer to the middle of the workspace"
 
@@ -143,10 +159,6 @@ class Reach:
 
 def _um(metres: float) -> str:
     return f"{round(metres * 1e6, 5) + 0.0:.4g}"
-
-
-def _where(position_m: Array) -> str:
-    return f"({', '.join(_um(v) for v in position_m)}) um"
 
 
 @njit(cache=True)
@@ -210,14 +222,13 @@ def _share(geometry: Records, elastic: Records, limits: Records, position_m: Arr
 
 @njit(cache=True)
 def _held_along(
-    geometry: Records, elastic: Records, limits: Records, probe_m: Array, axis: int, coordinates_m: Array
-) -> bool:
-    """Move ``probe_m`` (3,) along an axis to the first of the coordinates that can be held; whether there is one."""
+    geometry: Records, elastic: Records, limits: Records, origin_m: Array, way: Array, coordinates_m: Array
+) -> int:
+    """Which is the first of the coordinates along a way (3,) from an origin (3,) that can be held; -1 if none."""
     row, force = np.zeros(9), np.empty(3)
-    for i in range(3):
-        row[i] = probe_m[i]
-    for value in coordinates_m:
-        row[axis] = probe_m[axis] = value
+    for n in range(len(coordinates_m)):
+        for i in range(3):
+            row[i] = origin_m[i] + coordinates_m[n] * way[i]
         if _objection(geometry, elastic, limits, row, force)[0] == _FINE:
-            return True
-    return False
+            return n
+    return -1

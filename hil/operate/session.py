@@ -10,13 +10,15 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from hil.operate import procedures
+from hil.operate import law_change, procedures
 from hil.operate.commands import ANSWER, SESSION, Activity, State, Verb
 from hil.operate.path_stream import PathStream
 from hil.operate.procedures import AbortedError, Lease, Operated, RefusedError, Steps
 from hil.operate.reach import Reach
+from hil.operate.sample_frame import PLAIN, Turn
 from hil.operate.setpoints import Setpoints
 from hil.operate.settings import Settings
+from pkxyz_ctrl.loop import in_position
 from pkxyz_ctrl.loop.controller import Controller
 from pkxyz_ctrl.safety.modes import Mode
 from pkxyz_ctrl.safety.trips import Trip
@@ -27,9 +29,13 @@ Say = Callable[[bytes], object]
 """Takes an answer as bytes of ``ANSWER``."""
 
 _WORDS_BYTES = ANSWER["words"].itemsize
-_MODAL = frozenset({Verb.HOME, Verb.ENABLE, Verb.CLEAR, Verb.AUTO_ZERO, Verb.PATH})
+_MODAL = frozenset({Verb.HOME, Verb.ENABLE, Verb.CLEAR, Verb.AUTO_ZERO, Verb.PATH, Verb.LAW})
 """Begun only while nothing else runs."""
+_AT_ONCE = frozenset({Verb.SETTLE, Verb.LIMITS, Verb.FRAME, Verb.QUIET})
+"""Done within a tick."""
 _LEAST, _MOST = 1e-12, 1e6
+_SIGMAS_MOST = 10.0
+_LISTENS_S = 0.05  # a new law, before it acts
 
 
 class _Job(NamedTuple):
@@ -41,21 +47,27 @@ class _Job(NamedTuple):
 
 
 class Session:
-    """``stage`` is what it works on, ``say`` where answers go."""
+    """``stage`` is what it works on, ``say`` where answers go.
 
-    def __init__(self, controller: Controller, reach: Reach, settings: Settings, say: Say) -> None:
+    Targets and directions of commands, and positions in answers, are of the sample; paths, rows and ``state`` of the
+    stage.
+    """
+
+    def __init__(self, controller: Controller, reach: Reach, settings: Settings, say: Say, law_name: str = "") -> None:
         law, period_us = controller.law, controller.period_us
         delay = int(law["tick"]["delay_periods"][0])
         setpoints = Setpoints(period_us, delay, int(law["feed_hold_ticks"][0]))
         self.stage = Operated(controller, setpoints, reach, settings, period_us * 1e-6)
         self.settings = settings
         self.state = np.zeros(1, SESSION)
+        self.state["matrix"], self.state["law"] = PLAIN, law_name.encode()[: law_change.NAME_BYTES]
         self.now_us = 0
         self._say = say
         self._period_us = period_us
         self._job: _Job | None = None
         self._beside: _Job | None = None  # pause, resume: besides the job that they act on
         self._lease: Lease | None = None
+        self._offered: np.void | None = None
         self._jog_id = -1
         self._known_faults = len(controller.faults)
         self._server_us: int | None = None
@@ -79,6 +91,10 @@ class Session:
         """Rows (n, 9) of the path that is followed; others are left aside."""
         if self.stage.path is not None:
             self.stage.path.take(number, first, motion)
+
+    def offer(self, offered: np.void) -> None:
+        """A law, a record of ``law_change.OFFER``, for a command that will name its number."""
+        self._offered = offered
 
     @property
     def wants_rows(self) -> bool:
@@ -121,7 +137,7 @@ class Session:
                 command_id, verb, State.DONE, "the stage is led down and the combs go to 0 V; clear when ready"
             )
             return
-        if verb in (Verb.SETTLE, Verb.LIMITS):
+        if verb in _AT_ONCE:
             self._answer(command_id, verb, State.DONE, self._set(verb, command))
             return
         if verb is Verb.JOG and self._renewed(command):
@@ -146,7 +162,7 @@ class Session:
         if verb is Verb.MOVE:
             return procedures.move(stage, self._target(command), self._limits(command))
         if verb is Verb.JOG:
-            direction = np.array(command["target_m"])
+            direction = np.array(command["target_m"])  # of the sample
             if not np.isfinite(direction).all() or np.count_nonzero(direction) != 1:
                 raise RefusedError("a jog goes along one axis: give a direction of +1 or -1 for it, 0 for the others")
             self._lease = Lease(self.now_us + round(self.settings.lease_s * 1e6))
@@ -154,6 +170,8 @@ class Session:
         if verb is Verb.PATH:
             path = PathStream(int(command["path"]), int(command["rows"]), command["start_m"].copy(), stage.reach)
             return procedures.follow(stage, path, command["start_m"].copy())
+        if verb is Verb.LAW:
+            return self._change_law(command)
         if verb in (Verb.STOP, Verb.ABORT):
             return procedures.halt(stage, on_path=verb is Verb.ABORT)
         plain = {
@@ -164,10 +182,10 @@ class Session:
         return plain[verb](stage)
 
     def _target(self, command: np.void) -> Array:
-        asked, target = command["target_m"], self.stage.setpoints.target_m
+        asked, target, turn = command["target_m"], self.stage.setpoints.target_m, self.stage.reach.turn
         if command["relative"]:
-            return np.asarray(target + np.where(np.isnan(asked), 0.0, asked))
-        return np.asarray(np.where(np.isnan(asked), target, asked))
+            return np.asarray(target + turn.way_to_stage(np.where(np.isnan(asked), 0.0, asked)))
+        return np.asarray(turn.to_stage(np.where(np.isnan(asked), turn.to_sample(target), asked)))
 
     def _limits(self, command: np.void) -> Limits:
         """Those of the command, else those in force."""
@@ -183,11 +201,48 @@ class Session:
             self.settings.limits = self._limits(command)
             v, a, j = self.settings.limits
             return f"moves that name none: {v:g} m/s, {a:g} m/s2, {j:g} m/s3"
-        window_m, dwell_s = float(command["window_m"]), float(command["dwell_s"])
+        if verb is Verb.FRAME:
+            return self._take_frame(command)
+        if verb is Verb.QUIET:
+            self.stage.controller.hold_quietly(bool(command["on"]))
+            return "holds are quiet: less noise, less rejection" if command["on"] else "holds are as stiff as moves"
+        window_m, dwell_s, sigmas = (float(command[name]) for name in ("window_m", "dwell_s", "sigmas"))
+        if not 0.0 <= sigmas <= _SIGMAS_MOST:
+            raise RefusedError(f"sigmas {sigmas:g}, limits 0 to {_SIGMAS_MOST:g}")
         if not 0.1e-9 <= window_m <= 10e-6 or not 0.0 <= dwell_s <= 10.0:
             raise RefusedError(f"window {window_m:g} m, limits 1e-10 to 1e-05 m; dwell {dwell_s:g} s, limits 0 to 10 s")
-        self.settings.window_m, self.settings.dwell_s = window_m, dwell_s
-        return f"in position within {window_m * 1e9:g} nm for {dwell_s * 1e3:g} ms"
+        self.settings.window_m, self.settings.dwell_s, self.settings.sigmas = window_m, dwell_s, sigmas
+        of_it = f", {sigmas:g} standard deviations of the estimate included" if sigmas else ""
+        return f"in position within {window_m * 1e9:g} nm for {dwell_s * 1e3:g} ms{of_it}"
+
+    def _take_frame(self, command: np.void) -> str:
+        try:
+            turn = Turn(command["matrix"])
+        except ValueError as error:
+            raise RefusedError(str(error)) from None
+        self.stage.reach.turn = turn
+        self.state["matrix"] = turn.matrix
+        return "the stage's own coordinates" if turn.is_plain else "coordinates of the sample, from now on"
+
+    def _change_law(self, command: np.void) -> Steps:
+        stage, offered = self.stage, self._offered
+        if offered is None or int(offered["number"]) != int(command["law"]):
+            raise RefusedError("that law did not come: ask again")
+        if not (stage.mode == Mode.IDLE or self._activity() is Activity.HOLDING):
+            raise RefusedError(f"a law is changed while the stage holds or is off, and it is {self._activity().name}")
+        new = np.array([offered["law"]])
+        new["autostart"] = stage.controller.law["autostart"]
+        if (why := law_change.objection(stage.controller.law, new)) is not None:
+            raise RefusedError(f"{offered['name'].decode()}: {why}")
+        heard = law_change.Listening(new, stage.controller.memory)
+        for _ in stage.ticks(_LISTENS_S if stage.is_driven else 0.0):
+            yield
+            heard.listen()
+        if stage.mode not in (Mode.IDLE, Mode.TRACKING):
+            raise AbortedError("the stage no longer held")
+        law_change.take_over(stage.controller.law, stage.controller.memory, new, heard.x)
+        self.state["law"] = offered["name"]
+        return f"the law is {offered['name'].decode()}"
 
     def _renewed(self, command: np.void) -> bool:
         """Whether this only says again, or ends, the jog that runs."""
@@ -271,10 +326,14 @@ class Session:
         self._answer(0, 0, State.ABORTED, words)
 
     def _look_at_position(self, row: np.void) -> None:
-        stage = self.stage
-        error = np.abs(row["estimate_m"] - stage.setpoints.target_m)
-        inside = stage.is_driven and bool((error <= self.settings.window_m).all())
-        stage.ticks_in_position = stage.ticks_in_position + 1 if inside else 0
+        stage, settings = self.stage, self.settings
+        state, gain = stage.in_position[0], stage.controller.law["tick"]["estimator"]["gain"][0]
+        in_position.look(
+            state, gain, stage.setpoints.target_m, row["estimate_m"], row["innovation_m"], settings.window_m,
+            settings.sigmas,
+        )  # fmt: skip
+        if not stage.is_driven:
+            state["ticks"] = 0
 
     def _look_at_leases(self) -> None:
         if self._lease is not None:
@@ -309,7 +368,7 @@ class Session:
         state["in_position"] = stage.is_in_position and stage.is_driven
         state["homed"] = stage.is_homed
         state["running_id"] = self._job.id if self._job is not None else 0
-        state["target_m"] = setpoints.target_m
+        state["target_m"], state["uncertainty_m"] = setpoints.target_m, stage.in_position["uncertainty_m"]
         on_path = self._is_on_path
         state["path_row"] = setpoints.path_row if on_path else 0.0
         state["progress"] = setpoints.path_row / max(1, path.rows) if on_path and path is not None else 0.0

@@ -15,7 +15,9 @@ class Settings:
     window_m: float = 20e-9
     """in position: each axis of the estimate at most so far from its target ..."""
     dwell_s: float = 2e-3
-    """... for so long"""
+    """... for so long ..."""
+    sigmas: float = 3.0
+    """... so many standard deviations of the estimate included"""
     settle_s: float = 1.0
     """a move that is not in position so long after its set-point arrived has failed"""
     on_silence: Literal["hold", "park"] = "hold"

@@ -1,0 +1,105 @@
+"""Another law for a stage that holds: its numbers take the place of the present one's between two ticks, and its memory
+begins where the force at the platform stays what it is.
+
+Filter and model of the set-points go on. What the adaptation had added becomes disturbance in the filter where the new
+law does not adapt likewise. A linear law listens for a while before, told which force is given in its place: its memory
+is then that of a law which has given this force itself (Hanus, Kinnaert, Henrotte 1987).
+"""
+
+import numpy as np
+from numpy.typing import NDArray
+
+from pkxyz_ctrl.core import youla
+from pkxyz_ctrl.core.demand import LINEAR, OPEN_LOOP, PREDICTIVE
+from pkxyz_ctrl.core.linear_law import ORDER_MAX
+from pkxyz_ctrl.loop import cycle as cycling
+
+Array = NDArray[np.float64]
+Records = NDArray[np.void]
+
+NAME_BYTES = 32
+OFFER = np.dtype([("number", "<u8"), ("name", f"S{NAME_BYTES}"), ("law", cycling.LAW)], align=True)
+"""A law that was designed elsewhere, and what people call it."""
+
+_SAME = ("geometry", "elasticity", "sense", "drive", "delay_periods")
+_GIVES_LEAST = 0.99
+"""So much of a force at rest a linear law has to be able to give by its memory alone."""
+
+
+def objection(present: Records, new: Records) -> str | None:
+    """Why a stage that works with one law (1,) of ``cycle.LAW`` can't be given another."""
+    ours, theirs = present["tick"][0], new["tick"][0]
+    different = [name for name in _SAME if not _alike(present["tick"][name], new["tick"][name])]
+    if different or present["period_us"][0] != new["period_us"][0]:
+        named = ", ".join(different) or "period_us"
+        return f"it is meant for another stage, bus or voltage limit ({named}): end, and serve with it"
+    kinds = {int(ours["kind"]), int(theirs["kind"])}
+    if PREDICTIVE in kinds:
+        return "a predictive law plans beside the tick and is begun with it: end, and serve with it"
+    if OPEN_LOOP in kinds and len(kinds) > 1:
+        return "open loop has no feedback that could take over the force: end, and serve with it"
+    if theirs["kind"] == LINEAR and _gives_at_rest(theirs["linear"]) < _GIVES_LEAST:
+        return "it has no integral action, so it can't take over the force that holds the stage"
+    return None
+
+
+def take_over(present: Records, memory: Records, new: Records, heard: Array | None = None) -> None:
+    """Write the numbers of ``new`` into ``present``, which the loop reads, and its memory (1,) of ``cycle.MEMORY``
+    likewise; ``heard`` is what a linear law begins with. Both as ``objection`` accepts them, between two ticks, the
+    stage at rest or its loop open.
+    """
+    before, after, state = present["tick"][0].copy(), new["tick"][0], memory["tick"][0]
+    added = state["adaptation"]["added_n"].copy() if before["adaptation"]["on"] else np.zeros(3)
+    adapts_alike = _alike(present["tick"]["adaptation"], new["tick"]["adaptation"])
+    present[:] = new
+    _move_origin(before, after, state)
+    if not adapts_alike:
+        state["adaptation"] = np.zeros((), state["adaptation"].dtype)
+        for estimate in ("predicted", "filtered", "ahead"):
+            state["estimate"][estimate][6:9] -= added
+        added = np.zeros(3)
+    state["held_n"] = state["feedforward_n"] + added  # not every law keeps it
+    youla.clear(state["youla"])
+    state["youla"]["faded"] = 0
+    state["linear"]["x"] = 0.0 if heard is None else heard
+
+
+def _alike(one: Records, other: Records) -> bool:
+    """Whether two records say the same; what lies between their fields is nothing."""
+    return bool(np.all(one == other))
+
+
+class Listening:
+    """A linear law of ``new`` (1,) that does not act yet. ``x`` (ORDER_MAX,) is its memory."""
+
+    def __init__(self, new: Records, memory: Records) -> None:
+        self._linear, self._state = new["tick"]["linear"][0], memory["tick"][0]
+        self.x = np.zeros(ORDER_MAX)
+        self._expected_m = self._state["set_point_model"]["sample_m"][0].copy()
+
+    def listen(self) -> None:
+        """A tick is over: x+ = A x + B e + U (w - w given), with w = -(C x + D e)."""
+        linear, state = self._linear, self._state
+        error = state["seen_m"] - self._expected_m
+        self._expected_m[:] = state["set_point_model"]["sample_m"][0]
+        w = -(linear["c"] @ self.x + linear["d"] @ error)
+        given = state["set_point_model"]["fed_back_n"]
+        self.x = linear["a"] @ self.x + linear["b"] @ error + linear["unwind"] @ (w - given)
+
+
+def _move_origin(before: np.void, after: np.void, state: np.void) -> None:
+    """The filter's states are about an operating point, which may be another one."""
+    moved = before["estimator"]["operating_point_m"] - after["estimator"]["operating_point_m"]
+    for estimate in ("predicted", "filtered", "ahead"):
+        state["estimate"][estimate][0:3] += moved
+    state["set_point_model"]["state"][0:3] += moved
+
+
+def _gives_at_rest(linear: np.void) -> float:
+    """The least share of a steady force (3,) that a law's memory alone can give: w = -C x with x = A x."""
+    order = int(linear["order"])
+    a, c = linear["a"][:order, :order], linear["c"][:, :order]
+    scale = 1e6 * np.abs(c).max()  # rest is what has to be met, by as much as there is; then the force
+    rows = np.concatenate([(np.eye(order) - a) * scale, c])
+    x = np.linalg.lstsq(rows, np.concatenate([np.zeros((order, 3)), -np.eye(3)]))[0]
+    return float(np.linalg.svd(c @ x, compute_uv=False).min())
