@@ -142,7 +142,7 @@ SESSION = np.dtype(
         ("uncertainty_m", "<f8", (3,)),  # standard deviation of the estimate
         ("law", f"S{NAME_BYTES}"),
         ("progress", "<f8"),  # 0..1 of a path
-        ("path_row", "<f8"),  # where on the path, in its rows
+        ("path_row", "<f8"),  # where on the path, in its rows; NaN off it
         ("commands", "<u8"),  # taken out of the memory so far
         ("missed", "<i8"),  # ticks, since the loop began
         ("frames", "<i8"),  # sent and received

@@ -65,7 +65,7 @@ class StageMemory:
         return cls(base / f"pkxyz-{os.getuid()}-{crc32(os.fsencode(folder)):08x}-{name}", kept_ticks)
 
     def writer(self, ring: str) -> Writer:
-        """To write to a ring: "ticks", "frames" and "answers" are the loop's, "commands", "path" and "laws" the server's."""
+        """To write to a ring: "ticks", "frames" and "answers" are the loop's, the others the server's."""
         return Writer(*self._parts[ring])
 
     def reader(self, ring: str, *, from_start: bool = False) -> Reader:

@@ -103,6 +103,18 @@ class Reach:
             border[n] += self.share(position_m, way) * way
         return border
 
+    def surface(self, position_m: Array, rings: int = 12, around: int = 24) -> Array:
+        """What can be held about a position that is, as far as one can go straight: points (rings + 1, around + 1, 3)
+        of its surface, from straight down to straight up.
+        """
+        tilt, angle = np.linspace(0.0, math.pi, rings + 1)[:, None], np.linspace(0.0, 2.0 * math.pi, around + 1)
+        down, ones = -np.cos(tilt), np.ones_like(angle)
+        ways = self._span_m * np.stack(
+            [np.sin(tilt) * np.cos(angle), np.sin(tilt) * np.sin(angle), down * ones], axis=-1
+        )
+        shares = np.array([[self.share(position_m, way) for way in ring] for ring in ways])
+        return np.asarray(position_m + shares[:, :, None] * ways)
+
     def range_along(self, position_m: Array, axis: int) -> tuple[float, float] | None:
         """Least and greatest coordinate of an axis that can be held, the others as they are; None if none is found."""
         geometry, elastic = self._stage.geometry, self._stage.elasticity

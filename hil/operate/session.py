@@ -370,7 +370,7 @@ class Session:
         state["running_id"] = self._job.id if self._job is not None else 0
         state["target_m"], state["uncertainty_m"] = setpoints.target_m, stage.in_position["uncertainty_m"]
         on_path = self._is_on_path
-        state["path_row"] = setpoints.path_row if on_path else 0.0
+        state["path_row"] = setpoints.path_row if on_path else np.nan
         state["progress"] = setpoints.path_row / max(1, path.rows) if on_path and path is not None else 0.0
         state["missed"] = stage.controller.missed_ticks
 

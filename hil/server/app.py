@@ -15,7 +15,8 @@ from starlette.staticfiles import StaticFiles
 from starlette.types import ASGIApp, Receive, Scope, Send
 from starlette.websockets import WebSocket, WebSocketDisconnect
 
-from hil.server.desk import Client, Desk
+from hil.server.client import Client
+from hil.server.desk import Desk
 from pkxyz_ctrl.client.protocol import SUBPROTOCOL, TEXT_MAX_BYTES, TOKEN_PREFIX
 
 PAGE = Path(__file__).parent / "page"

@@ -3,7 +3,6 @@
 It knows messages and no sockets: a client is whatever takes texts and bytes.
 """
 
-import asyncio
 import contextlib
 import json
 from collections.abc import Awaitable, Callable
@@ -13,74 +12,39 @@ from typing import Any
 import numpy as np
 
 from hil.operate.commands import FINAL, State, Verb
+from hil.server.client import Client
+from hil.server.designing import offer_of
 from hil.server.link import Answer, BusyError, Link
+from hil.server.messages import FIELDS, AskedWrongError, number, of_sample, shown, tag_of
+from hil.server.messages import answer as answer_of
 from hil.server.paths import Feeding, Planner, StagePath
 from hil.server.saving import AFTER_S, BEFORE_S, NotSavedError, save
+from hil.server.setting import ASKED, Setting
 from hil.server.status import status_of
-from pkxyz_ctrl.client.protocol import Block, packed
+from hil.server.stored_settings import SettingsStore
+from pkxyz_ctrl.client.protocol import Block
 from pkxyz_ctrl.config.files import ConfigError
-from pkxyz_ctrl.loop.row import ROW
 
-_SAID_MOST, _BLOCKS_MOST = 400, 4
-_FIELDS = frozenset(name for name in ROW.names or () if ROW[name].base.kind in "fi")
 _AXES = ("x", "y", "z")
 _LIMITS = ("velocity_m_per_s", "acceleration_m_per_s2", "jerk_m_per_s3")
-_FREE = frozenset({"stop", "release", "subscribe", "take_control", "give_control", "preview", "body", "save"})
+_FREE = frozenset(
+    {"stop", "release", "subscribe", "take_control", "give_control", "preview", "body", "save", "settings"}
+)
 """What needs no control: nothing of it moves anything, or it stops what moves."""
-
-
-class AskedWrongError(ValueError):
-    """A message that means nothing; the text says what was expected."""
-
-
-class Client:
-    """One that is connected. ``said`` waits for its socket; what is too much for a slow one is left out."""
-
-    def __init__(self, number: int) -> None:
-        self.number = number
-        self.said: asyncio.Queue[str | bytes] = asyncio.Queue(_SAID_MOST)
-        self.fields: tuple[str, ...] = ()
-        self.precision: Any = "f4"
-        self.tags: dict[int, Any] = {}
-        self.lost = 0
-        self._blocks = 0
-        self.is_hopeless = False
-
-    def tell(self, message: dict[str, Any]) -> None:
-        """Queue a message; a client that takes none of hundreds is given up."""
-        self.tell_text(json.dumps(message, allow_nan=False))
-
-    def tell_text(self, text: str) -> None:
-        """The same, of what is a text already."""
-        try:
-            self.said.put_nowait(text)
-        except asyncio.QueueFull:
-            self.is_hopeless = True
-
-    def show(self, block: Block) -> None:
-        """Queue a block of telemetry, or leave it out and count its rows."""
-        if self._blocks >= _BLOCKS_MOST or self.said.full():
-            self.lost += len(block)
-            return
-        self._blocks += 1
-        self.said.put_nowait(packed(Block(block.first_tick, block.columns, self.lost), self.precision))
-        self.lost = 0
-
-    async def next_said(self) -> str | bytes:
-        """What comes next."""
-        said = await self.said.get()
-        if isinstance(said, bytes):
-            self._blocks -= 1
-        return said
 
 
 class Desk:
     """``plan`` runs a function where it doesn't hold up the others."""
 
     def __init__(
-        self, link: Link, planner: Planner, plan: Callable[..., Awaitable[Any]], saves: Path = Path("runs")
+        self,
+        link: Link,
+        planner: Planner,
+        plan: Callable[..., Awaitable[Any]],
+        saves: Path = Path("runs"),
+        store: SettingsStore | None = None,
     ) -> None:
-        """``saves``: where faults are kept."""
+        """``saves``: where faults are kept; ``store``: where settings are."""
         self.link = link
         self.saved = ""
         """where the last fault is kept, or why it isn't"""
@@ -96,6 +60,7 @@ class Desk:
         self._numbers = 0
         self._frames = (0, 0, 0)
         self._load = 0.0
+        self._setting = Setting(link, planner, store or SettingsStore(), self._settings_changed)
         self._ranges: tuple[list[float], list[list[float | None]]] = ([], [])
 
     # -- clients -------------------------------------------------------------------------------------------------------
@@ -107,12 +72,13 @@ class Desk:
         self.clients.append(client)
         client.tell(self._hello(client))
         self._tell_control(client)
+        client.tell({"settings": self._setting.told()})
         if self.last_fault:
             client.tell({"event": {"kind": "fault", "words": self.last_fault, "old": True}})
         return client
 
     def _hello(self, client: Client) -> dict[str, Any]:
-        return {"hello": self.link.description | {"fields": sorted(_FIELDS), "client": client.number}}
+        return {"hello": self.link.description | {"fields": sorted(FIELDS), "client": client.number}}
 
     def leave(self, client: Client) -> None:
         """Somebody is gone; what was moved by hand ends."""
@@ -128,7 +94,7 @@ class Desk:
             message = json.loads(text)
             if not isinstance(message, dict) or not isinstance(message.get("do"), str):
                 raise AskedWrongError('a message is {"do": what, ...}')
-            tag = _tag(message.get("tag"))
+            tag = tag_of(message.get("tag"))
             await self._do(client, message["do"], message, tag)
         except (AskedWrongError, BusyError, ConfigError, RecursionError, ValueError, TypeError) as error:
             ours = isinstance(error, AskedWrongError | BusyError | ConfigError)
@@ -145,7 +111,7 @@ class Desk:
         elif what == "stop":
             self.link.stop()
             self._feeding = self._asked_for = None
-            client.tell(_answer(tag, "stop", "done", "the loop was told to stop"))
+            client.tell(answer_of(tag, "stop", "done", "the loop was told to stop"))
         elif what == "subscribe":
             self._subscribe(client, message)
         elif what == "take_control":
@@ -153,19 +119,31 @@ class Desk:
         elif what == "give_control":
             if self.holder is client:
                 self._end_control()
-            client.tell(_answer(tag, "give_control", "done", ""))
+            client.tell(answer_of(tag, "give_control", "done", ""))
         elif what == "preview":
             path = await self._planned(message)
-            client.tell({"preview": {"tag": tag, **_shown(path)}})
+            client.tell({"preview": {"tag": tag, **shown(path)}})
         elif what == "body":
             newest = self.link.newest()
             target = np.zeros(3) if newest is None else newest["session"]["target_m"].copy()
             client.tell({"body": await self._plan(self._planner.body, target)})
         elif what == "save":
-            seconds = _number(message, "seconds", 60.0)
-            client.tell(_answer(tag, "save", "done", await self._kept(min(max(seconds, 0.1), 60.0), "")))
+            seconds = number(message, "seconds", 60.0)
+            client.tell(answer_of(tag, "save", "done", await self._kept(min(max(seconds, 0.1), 60.0), "")))
         elif what == "path":
             await self._send_path(client, message, tag)
+        elif what == "settings":
+            client.tell({"settings": self._setting.told()})
+            client.tell(answer_of(tag, what, "done", ""))
+        elif what == "law":
+            await self._change_law(client, message, tag)
+        elif what in ASKED:
+            command_id, words = self._setting.ask(what, message)
+            if command_id is None:
+                client.tell(answer_of(tag, what, "done", words))
+            else:
+                client.tags[command_id] = tag
+                self._tell(what, command_id, State.ACCEPTED, words)
         else:
             self._command(client, what, message, tag)
 
@@ -175,7 +153,7 @@ class Desk:
         if self.holder not in (None, client):
             raise AskedWrongError("another client has control; it has to give it back, or to leave")
         self.holder = client
-        client.tell(_answer(tag, "take_control", "done", "you have control"))
+        client.tell(answer_of(tag, "take_control", "done", "you have control"))
         self._tell_all_control()
 
     def _end_control(self) -> None:
@@ -211,19 +189,23 @@ class Desk:
             verb = Verb[what.upper()]
         except KeyError:
             raise AskedWrongError(f"there is nothing called {what!r} to do") from None
-        if verb is Verb.MOVE:
-            fields["target_m"] = [_number(message, f"{axis}_m", np.nan) for axis in _AXES]
+        if verb in (Verb.FRAME, Verb.LAW):
+            raise AskedWrongError(f"{what} is asked otherwise")
+        if verb is Verb.QUIET:
+            fields["on"] = int(bool(message.get("on", True)))
+        if verb is Verb.MOVE and "to" in message:
+            fields["target_m"] = self._setting.position(message["to"])
+        elif verb is Verb.MOVE:
+            fields["target_m"] = [number(message, f"{axis}_m", np.nan) for axis in _AXES]
             fields["relative"] = int(bool(message.get("relative", False)))
         if verb is Verb.JOG:
-            axis, sign = message.get("axis"), _number(message, "direction", 1.0)
+            axis, sign = message.get("axis"), number(message, "direction", 1.0)
             if axis not in _AXES or sign == 0:
                 raise AskedWrongError("jog needs axis x, y or z, and a direction of 1 or -1")
             self._jog_direction = [float(np.sign(sign)) * (a == axis) for a in _AXES]
             fields["target_m"] = self._jog_direction
-        if verb in (Verb.MOVE, Verb.JOG, Verb.LIMITS):
-            fields |= {name: _number(message, name, 0.0) for name in _LIMITS}
-        if verb is Verb.SETTLE:
-            fields |= {name: _number(message, name, None) for name in ("window_m", "dwell_s")}
+        if verb in (Verb.MOVE, Verb.JOG):
+            fields |= {name: number(message, name, 0.0) for name in _LIMITS}
         command_id = self.link.next_id()
         self.link.command(verb, command_id, **fields)
         client.tags[command_id] = tag
@@ -247,6 +229,22 @@ class Desk:
         self._asked_for = Feeding(self.link, command_id, path)
         self._tell("path", command_id, State.ACCEPTED, f"{path.name}: {path.duration_s:.3g} s")
 
+    async def _change_law(self, client: Client, message: dict[str, Any], tag: Any) -> None:
+        name, text = str(message.get("controller", "")), message.get("toml")
+        command_id = self.link.next_id()
+        files = self._planner.files
+        text = None if text is None else str(text)
+        self.link.offer(await self._plan(offer_of, files["stage"], files["bus"], name, text, command_id))
+        self.link.command(Verb.LAW, command_id, law=command_id)
+        client.tags[command_id] = tag
+        self._tell("law", command_id, State.ACCEPTED, "")
+
+    def _settings_changed(self) -> None:
+        self._ranges = ([], [])
+        for client in self.clients:
+            client.tell(self._hello(client))
+            client.tell({"settings": self._setting.told()})
+
     # -- what the loop says --------------------------------------------------------------------------------------------
 
     def look(self) -> None:
@@ -254,6 +252,7 @@ class Desk:
         if not self.link.is_joined:
             if not self.link.join():
                 return
+            self._setting.joined()
             for client in self.clients:
                 client.tell(self._hello(client))
         self.link.sign_of_life()
@@ -273,12 +272,13 @@ class Desk:
             if answer.state not in FINAL:
                 self._feeding = self._asked_for
             self._asked_for = None
+        verb, words = self._setting.heard(answer)
         if answer.state in FINAL:
             if self._feeding is not None and self._feeding.number == answer.id:
                 self._feeding = None
             if answer.id == self._jog_id:
                 self._jog_id = 0
-        self._tell(answer.verb, answer.id, answer.state, answer.words)
+        self._tell(verb, answer.id, answer.state, words)
 
     async def keep_fault(self) -> None:
         """Save what was around a fault, once that is over."""
@@ -306,7 +306,7 @@ class Desk:
             tag = client.tags.get(command_id)
             if state in FINAL:
                 client.tags.pop(command_id, None)
-            client.tell(_answer(tag, verb, state.name.lower(), words, command_id))
+            client.tell(answer_of(tag, verb, state.name.lower(), words, command_id))
 
     def tell_status(self) -> None:
         """Where the stage is, to everybody."""
@@ -344,9 +344,9 @@ class Desk:
 
     def _subscribe(self, client: Client, message: dict[str, Any]) -> None:
         fields = message.get("fields", [])
-        unknown = [f for f in fields if f not in _FIELDS] if isinstance(fields, list) else [fields]
-        if unknown or len(fields) > len(_FIELDS):
-            raise AskedWrongError(f"no telemetry is called {unknown[:1]}; there are: {', '.join(sorted(_FIELDS))}")
+        unknown = [f for f in fields if f not in FIELDS] if isinstance(fields, list) else [fields]
+        if unknown or len(fields) > len(FIELDS):
+            raise AskedWrongError(f"no telemetry is called {unknown[:1]}; there are: {', '.join(sorted(FIELDS))}")
         if message.get("precision", "f4") not in ("f4", "f8"):
             raise AskedWrongError("precision is f4 or f8")
         client.fields, client.precision = tuple(dict.fromkeys(fields)), message.get("precision", "f4")
@@ -359,38 +359,8 @@ class Desk:
         rows = ticks.read_block(most)
         if not len(rows):
             return
-        first, values = int(rows["row"]["tick"][0]), rows["row"]
+        first, values = int(rows["row"]["tick"][0]), of_sample(rows)
         for client in self.clients:
             if client.fields:
                 client.lost += ticks.lost - before
                 client.show(Block(first, {name: values[name] for name in client.fields}))
-
-
-def _answer(tag: Any, verb: str, state: str, words: str, command_id: int | None = None) -> dict[str, Any]:
-    return {"answer": {"tag": tag, "id": command_id, "verb": verb, "state": state, "words": words}}
-
-
-def _tag(value: Any) -> str | int | None:
-    """What a client may put on a message to know its answers by."""
-    if value is None or (isinstance(value, str) and len(value) <= 64):
-        return value
-    if isinstance(value, int) and abs(value) < 1 << 53:
-        return value
-    raise AskedWrongError("a tag is a short text or a whole number")
-
-
-def _shown(path: StagePath) -> dict[str, Any]:
-    points = path.shown()
-    return {
-        "name": path.name, "duration_s": path.duration_s, "start_m": path.start_m.tolist(),
-        "points_m": np.round(points, 12).tolist(), "low_m": points.min(0).tolist(), "high_m": points.max(0).tolist(),
-    }  # fmt: skip
-
-
-def _number(message: dict[str, Any], name: str, absent: float | None) -> float:
-    value = message.get(name, absent)
-    if value is None and absent is not None:
-        value = absent
-    if isinstance(value, bool) or not isinstance(value, int | float):
-        raise AskedWrongError(f"{name} is a number, not {value!r}")
-    return float(value)

@@ -63,6 +63,7 @@ class Link:
         self.description = found
         memory = StageMemory(Path(found["memory"]))
         self._commands, self._path = memory.writer("commands"), memory.writer("path")
+        self._laws = memory.writer("laws")
         self._answers, self.ticks = memory.reader("answers"), memory.reader("ticks")
         self._memory = memory
         return True
@@ -112,6 +113,12 @@ class Link:
         """Stop, past all that waits."""
         if self._memory is not None:
             self._memory.count_up("stop")
+
+    def offer(self, offered: bytes) -> None:
+        """A law, as bytes of ``OFFER``. Raises ``BusyError``."""
+        if self._memory is None:
+            raise BusyError("the loop is not there yet")
+        self._laws.write(offered)
 
     def rows(self, path: int, first: int, motion: Array) -> None:
         """Rows (n, 9) of a path, n at most ``PATH_ROWS``."""

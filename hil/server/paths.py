@@ -2,6 +2,7 @@
 
 import math
 import tempfile
+from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Annotated, Any
@@ -12,6 +13,7 @@ from pydantic import Field, TypeAdapter
 
 from hil.operate.commands import PATH_ROWS
 from hil.operate.reach import Reach
+from hil.operate.sample_frame import Turn
 from hil.runs.scenario import load_scenario
 from hil.server.link import Link
 from pkxyz_ctrl.config.bus import BusConfig
@@ -19,9 +21,9 @@ from pkxyz_ctrl.config.controller import ControllerConfig
 from pkxyz_ctrl.config.files import ConfigError, FrozenModel, load, parse
 from pkxyz_ctrl.config.stage import StageConfig
 from pkxyz_ctrl.stage import Stage
-from pkxyz_ctrl.trajectory import Segment, Trajectory
+from pkxyz_ctrl.trajectory import Raster, Segment, Trajectory
 from pkxyz_ctrl.trajectory.check import DriveLimits, check_against
-from pkxyz_ctrl.trajectory.table import Table
+from pkxyz_ctrl.trajectory.table import Table, in_folder
 
 Array = NDArray[np.float64]
 
@@ -36,11 +38,36 @@ class _Segments(FrozenModel):
     reference: Annotated[tuple[Segment, ...], Field(min_length=1, max_length=1000)]
 
 
+class _OfSample(Trajectory):
+    """A trajectory in the sample's coordinates, sampled in the stage's. Before ``begin_us``, to which the stage goes by
+    itself, it stands.
+    """
+
+    def __init__(self, segments: Sequence[Segment], turn: Turn) -> None:
+        super().__init__(segments)
+        self.turn = turn
+        self.lines_a_frame = [segment.lines if isinstance(segment, Raster) else 1 for segment in segments]
+        begins = [s.t_start_us for s in self.segments if s.kind not in _LEADING]
+        self.begin_us = begins[0] if begins else 0
+
+    def sample(self, first_tick: int, count: int, period_us: int) -> Array:
+        if self.turn.is_plain:
+            return super().sample(first_tick, count, period_us)
+        begin = -(-self.begin_us // period_us)
+        before = min(max(begin - first_tick, 0), count)
+        rows = np.concatenate([
+            np.repeat(super().sample(begin, 1, period_us), before, axis=0),
+            super().sample(first_tick + before, count - before, period_us),
+        ])  # fmt: skip
+        turned = [self.turn.to_stage(rows[:, 0:3]), *(self.turn.way_to_stage(rows[:, n : n + 3]) for n in (3, 6))]
+        return np.concatenate(turned, axis=1)
+
+
 @dataclass(frozen=True)
 class StagePath:
     """A path that the stage can follow: a trajectory from the first segment that is more than going there."""
 
-    trajectory: Trajectory
+    trajectory: _OfSample
     period_us: int
     first_tick: int
     rows: int
@@ -48,7 +75,7 @@ class StagePath:
 
     @property
     def start_m(self) -> Array:
-        """(3,), where it begins at rest."""
+        """(3,) of the stage, where it begins at rest."""
         return self.sample(0, 1)[0, 0:3]
 
     @property
@@ -60,16 +87,35 @@ class StagePath:
         """Rows (count, 9)."""
         return self.trajectory.sample(self.first_tick + first, count, self.period_us)
 
+    @property
+    def lines(self) -> list[tuple[int, int, int]]:
+        """Of each line of a raster its first and last row, and the number of its frame."""
+        found, frame = [], 0
+        for timed, lines in zip(self.trajectory.segments, self.trajectory.lines_a_frame, strict=True):
+            for n, (begin_us, end_us) in enumerate(timed.lines_us):
+                first, last = (-(-t // self.period_us) - self.first_tick for t in (begin_us, end_us))
+                found.append((first, last, frame + n // lines))
+            frame = found[-1][2] + 1 if timed.lines_us else frame
+        return found
+
+    @property
+    def backward(self) -> list[bool]:
+        """Of each line, whether it goes the other way than the first."""
+        ways = [(self.sample(last, 1) - self.sample(first, 1))[0, 0:3] for first, last, _ in self.lines]
+        return [bool(way @ ways[0] < 0.0) for way in ways]
+
     def shown(self) -> Array:
-        """Positions (n, 3) to draw it by."""
+        """Positions (n, 3) of the sample to draw it by."""
         step = max(1, self.rows // _SHOWN_POINTS)
-        return np.concatenate([self.sample(n, 1)[:, 0:3] for n in range(0, self.rows, step)])
+        points = np.concatenate([self.sample(n, 1)[:, 0:3] for n in range(0, self.rows, step)])
+        return self.trajectory.turn.to_sample(points)
 
 
 class Planner:
     """For one stage, controller and bus, by name or file. Raises ``ConfigError``."""
 
     def __init__(self, stage: str, controller: str, bus: str) -> None:
+        self.files = {"stage": stage, "bus": bus}
         config = load("stages", stage, StageConfig)
         on_bus = load("buses", bus, BusConfig)
         self.period_us = on_bus.period_us
@@ -77,16 +123,31 @@ class Planner:
         self._drive = DriveLimits.of(load("controllers", controller, ControllerConfig), on_bus)
         self._reach = Reach(self.stage, self._drive)
 
-    def body(self, position_m: Array) -> dict[str, list[list[float]]]:
-        """What the combs hold, as outlines in the three planes through a position, or through the middle above rest."""
-        inside = position_m if self._reach.holds(position_m) and position_m[2] > 0 else np.array(_MIDDLE_M)
-        return {
-            f"{'xyz'[a]}{'xyz'[b]}": self._reach.outline(inside, a, b)[:, [a, b]].tolist()
+    @property
+    def turn(self) -> Turn:
+        """The sample's coordinates, in which all that is asked here is meant."""
+        return self._reach.turn
+
+    @turn.setter
+    def turn(self, turn: Turn) -> None:
+        self._reach.turn = turn
+
+    def body(self, position_m: Array) -> dict[str, Any]:
+        """What the combs hold: outlines in the sample's three planes through a position of the stage, or through the
+        middle above rest, and the whole as points (rings, around, 3) of its surface.
+        """
+        reach, turn = self._reach, self.turn
+        inside = position_m if reach.holds(position_m) and position_m[2] > 0 else np.array(_MIDDLE_M)
+        outlines: dict[str, Any] = {
+            f"{'xyz'[a]}{'xyz'[b]}": turn.to_sample(reach.outline(inside, a, b))[:, [a, b]].tolist()
             for a, b in ((0, 1), (0, 2), (1, 2))
         }
+        return outlines | {"surface_m": np.round(turn.to_sample(reach.surface(np.array(_MIDDLE_M))), 10).tolist()}
 
     def ranges(self, target_m: Array) -> list[list[float | None]]:
-        """Least and greatest target of each axis that the combs can hold with the others at theirs, in m."""
+        """Least and greatest target of each axis that the combs can hold with the others at theirs, in m of the sample;
+        ``target_m`` (3,) is of the stage.
+        """
         found = [self._reach.range_along(target_m, axis) for axis in range(3)]
         return [[None, None] if low_high is None else list(low_high) for low_high in found]
 
@@ -94,14 +155,15 @@ class Planner:
         """The reference of a shipped scenario: names only, as a client can't be let into our files."""
         if "/" in name or "\\" in name or "." in name:
             raise ConfigError(f"{name!r}: the name of a shipped scenario is wanted; a file of yours is sent as a table")
-        return self._path(load_scenario(name).trajectory, name)
+        scenario = load_scenario(name)
+        return self._path(in_folder(scenario.config.reference, scenario.source.parent), name)
 
     def of_segments(self, segments: Any, name: str = "scan") -> StagePath:
         """Segments as in the ``[[reference]]`` of a scenario file."""
         parsed = parse({"reference": segments}, _Segments, "the path")
         if any(isinstance(segment, Table) for segment in parsed.reference):
             raise ConfigError("the path: a table is sent by itself, not by the name of a file")
-        return self._path(Trajectory(parsed.reference), name)
+        return self._path(parsed.reference, name)
 
     def of_table(self, text: str, limits: dict[str, float]) -> StagePath:
         """A table of positions at instants, as the text of a CSV file."""
@@ -110,18 +172,18 @@ class Planner:
             file.write_text(text, encoding="utf-8")
             table = TypeAdapter(Table).validate_python({"kind": "csv", "file": str(file)} | limits)
             try:
-                return self._path(Trajectory([table]), "table")
+                return self._path([table], "table")
             except ConfigError as error:
                 raise ConfigError(str(error).replace(str(file), "the table")) from None
 
-    def _path(self, trajectory: Trajectory, name: str) -> StagePath:
+    def _path(self, segments: Sequence[Segment], name: str) -> StagePath:
+        trajectory = _OfSample(segments, self.turn)
         check_against(self.stage, trajectory, self._drive)
         if any(segment.jumps_us for segment in trajectory.segments):
             raise ConfigError(
                 f"{name}: jumps on purpose, which a stage in operation does not; use `pkxyz run` for that"
             )
-        begins = [s.t_start_us for s in trajectory.segments if s.kind not in _LEADING]
-        first_tick = math.ceil((begins[0] if begins else 0) / self.period_us)
+        first_tick = math.ceil(trajectory.begin_us / self.period_us)
         rows = math.ceil(trajectory.duration_us / self.period_us) - first_tick + 1
         return StagePath(trajectory, self.period_us, first_tick, rows, name)
 
@@ -137,6 +199,7 @@ class Feeding:
         """Send some of what the loop may want next; whether there is more to send."""
         newest = self._link.newest()
         at = float(newest["session"]["path_row"]) if newest is not None else 0.0
+        at = 0.0 if math.isnan(at) else at
         for _ in range(_BLOCKS_AT_ONCE):
             if self._sent >= self.path.rows or self._sent > at + _AHEAD_ROWS:
                 break

@@ -20,6 +20,7 @@ from hil.server.app import app_of
 from hil.server.desk import Desk
 from hil.server.link import Link
 from hil.server.paths import Planner
+from hil.server.stored_settings import SettingsStore, default_folder
 from pkxyz_ctrl.client import place
 from pkxyz_ctrl.client.protocol import TEXT_MAX_BYTES
 from pkxyz_ctrl.config.files import ConfigError, find
@@ -45,6 +46,8 @@ class Served:
     port: int
     is_simulated: bool
     """whether amplifier and plant are to be started, too"""
+    settings: Path | None = None
+    """folder in which they are kept; None: the user's"""
     report: Path | None = None
     """on the amplifier"""
 
@@ -95,7 +98,8 @@ def serve(served: Served, tell: Callable[[str], object]) -> int:
             _start(children, served)
         link = Link(served.name)
         planner = Planner(served.stage, served.controller, served.bus)
-        desk = Desk(link, planner, asyncio.to_thread, served.saves)
+        store = SettingsStore((served.settings or default_folder()) / f"{served.name}.settings.jsonl")
+        desk = Desk(link, planner, asyncio.to_thread, served.saves, store)
         hosts = frozenset(f"{_in_url(host)}:{port}" for host in {*_LOOPBACK, served.host})
         url = f"http://{_in_url(served.host)}:{port}/"
         place.write(served.name, "server", {"pid": os.getpid(), "url": url, "token": token})

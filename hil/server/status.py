@@ -6,12 +6,17 @@ from typing import Any
 import numpy as np
 
 from hil.operate.commands import ACTIVITY_WORDS, Activity
+from hil.operate.sample_frame import Turn
 from pkxyz_ctrl.safety.modes import LOOP_CLOSED, MODE_FACTS, Mode
 
 
 def status_of(tick: np.void, description: dict[str, Any], bus_load: float) -> dict[str, Any]:
-    """Plain data of a record of ``TICK``; lengths in m, voltages in V."""
+    """Plain data of a record of ``TICK``; lengths in m, in the sample's coordinates; voltages in V."""
     row, session = tick["row"], tick["session"]
+    turn = Turn(session["matrix"])
+    setpoint, position, target = (
+        turn.to_sample(place) for place in (row["reference_m"], row["estimate_m"], session["target_m"])
+    )
     activity, mode = Activity(int(session["activity"])), Mode(int(row["mode"]))
     most_v = float(description.get("voltage_max_v", math.inf))
     voltage = [float(v) for v in row["voltage_v"]]
@@ -21,8 +26,9 @@ def status_of(tick: np.void, description: dict[str, Any], bus_load: float) -> di
         "activity": activity.name.lower(), "words": ACTIVITY_WORDS[activity],
         "homed": bool(session["homed"]), "driven": bool(LOOP_CLOSED[mode]),
         "in_position": bool(session["in_position"]), "running_id": int(session["running_id"]),
-        "setpoint_m": _finite(row["reference_m"]), "position_m": _finite(row["estimate_m"]),
-        "error_m": _finite(row["estimate_m"] - row["reference_m"]), "target_m": _finite(session["target_m"]),
+        "setpoint_m": _finite(setpoint), "position_m": _finite(position), "error_m": _finite(position - setpoint),
+        "target_m": _finite(target), "uncertainty_m": _finite(session["uncertainty_m"]),
+        "law": session["law"].decode(errors="replace"), "quiet": bool(row["quiet"]), "framed": not turn.is_plain,
         "voltage_v": voltage, "headroom_v": most_v - max(voltage), "saturated": bool(row["saturated"]),
         "progress": float(session["progress"]), "missed_ticks": int(session["missed"]),
         "frames": int(session["frames"]), "bus_load": round(bus_load, 4),

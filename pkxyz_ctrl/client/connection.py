@@ -20,7 +20,7 @@ _GONE = "the server has closed the connection"
 
 
 class Connection:
-    """``status``: the newest; ``description``: what the loop says of itself."""
+    """``status``, ``settings``: the newest; ``description``: what the loop says of itself."""
 
     def __init__(self, url: str, token: str) -> None:
         self._url, self._token = url, token
@@ -33,6 +33,8 @@ class Connection:
         self._is_gone = False
         self.status: Status | None = None
         self.description: dict[str, Any] = {}
+        self.settings: dict[str, Any] = {}
+        self._previews: dict[int, dict[str, Any]] = {}
 
     async def open(self) -> None:
         """Connect, and wait for the first status. Raises ``NoStageError``."""
@@ -70,6 +72,14 @@ class Connection:
         if command.answers is None or command.state in FINAL:
             return command.require_done()
         return (await self.until(command.answers, FINAL)).require_done()
+
+    async def preview(self, path: dict[str, Any]) -> dict[str, Any]:
+        """A path before it is followed. Raises ``RefusedError``."""
+        tag, queue = self.asked()
+        await self.say({"do": "preview", "tag": tag, **path})
+        (await self.until(queue, FINAL)).require_done()
+        self.forget(tag)
+        return self._previews.pop(tag)
 
     def asked(self) -> tuple[int, asyncio.Queue[Command]]:
         """A tag for a message, and where answers to it will be."""
@@ -163,5 +173,12 @@ class Connection:
                 queue.put_nowait(Command(answer["id"], answer["verb"], answer["state"], answer["words"]))
                 if answer["state"] in FINAL:
                     self.forget(answer["tag"])
+        elif "preview" in message:
+            tag = message["preview"]["tag"]
+            if tag in self._waiting:
+                self._previews[tag] = message["preview"]
+                self._waiting[tag].put_nowait(Command(None, "preview", "done"))
+        elif "settings" in message:
+            self.settings = message["settings"]
         elif "hello" in message:
             self.description = message["hello"]

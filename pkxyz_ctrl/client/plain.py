@@ -3,7 +3,7 @@
 import asyncio
 import functools
 import threading
-from collections.abc import Callable, Coroutine, Iterator
+from collections.abc import AsyncIterator, Callable, Coroutine, Iterator, Mapping, Sequence
 from concurrent.futures import Future
 from types import TracebackType
 from typing import Any, Concatenate, ParamSpec, Self, TypeVar
@@ -11,6 +11,8 @@ from typing import Any, Concatenate, ParamSpec, Self, TypeVar
 from pkxyz_ctrl.client import place
 from pkxyz_ctrl.client.protocol import Block
 from pkxyz_ctrl.client.reply import Status
+from pkxyz_ctrl.client.scan import ScanFrame
+from pkxyz_ctrl.client.settings import StageSettings
 from pkxyz_ctrl.client.stage import AsyncStage, connect_async
 
 P = ParamSpec("P")
@@ -78,6 +80,14 @@ class Stage:
     auto_zero = _waited(AsyncStage.auto_zero)
     settle_window = _waited(AsyncStage.settle_window)
     limits = _waited(AsyncStage.limits)
+    set_frame = _waited(AsyncStage.set_frame)
+    tilt_plane = _waited(AsyncStage.tilt_plane)
+    name_position = _waited(AsyncStage.name_position)
+    forget_position = _waited(AsyncStage.forget_position)
+    move_to_position = _waited(AsyncStage.move_to_position)
+    restore_settings = _waited(AsyncStage.restore_settings)
+    change_law = _waited(AsyncStage.change_law)
+    quiet_holds = _waited(AsyncStage.quiet_holds)
     save = _waited(AsyncStage.save)
     take_control = _waited(AsyncStage.take_control)
     give_control = _waited(AsyncStage.give_control)
@@ -89,6 +99,11 @@ class Stage:
     def status(self) -> Status:
         """Where the stage stood a tenth of a second ago at most."""
         return self._stage.status
+
+    @property
+    def settings(self) -> StageSettings:
+        """Frame of the sample, named positions, limits of moves, settle window, and their history."""
+        return self._stage.settings
 
     @property
     def description(self) -> dict[str, Any]:
@@ -103,6 +118,22 @@ class Stage:
                 yield self._now(_next(blocks))
         finally:
             self._now(_closed(blocks))
+
+    def frames(
+        self,
+        scenario: str | None = None,
+        *,
+        segments: Sequence[Mapping[str, Any]] | None = None,
+        fields: Sequence[str] = ("reference_m", "estimate_m"),
+        pixels: int = 128,
+    ) -> Iterator[ScanFrame]:
+        """Follow a scan and give each of its frames as soon as its last line is over."""
+        frames = self._stage.frames(scenario, segments=segments, fields=fields, pixels=pixels)
+        try:
+            while (frame := self._now(_next_if_any(frames))) is not None:
+                yield frame
+        finally:
+            self._now(_closed(frames))
 
     def _now(self, doing: Coroutine[Any, Any, T]) -> T:
         future = asyncio.run_coroutine_threadsafe(doing, self._loop)
@@ -134,6 +165,10 @@ def connect(
 def begun_in(stage: Stage, of: Callable[[AsyncStage], Coroutine[Any, Any, T]]) -> "Future[T]":
     """Begin something with the ``AsyncStage`` behind a ``Stage``, where that lives, and do not wait for its end."""
     return asyncio.run_coroutine_threadsafe(of(stage._stage), stage._loop)
+
+
+async def _next_if_any(frames: AsyncIterator[ScanFrame]) -> ScanFrame | None:
+    return await anext(frames, None)
 
 
 async def _next(blocks: Any) -> Block:

@@ -44,6 +44,8 @@ class Status:
     """(3,), as estimated"""
     setpoint_m: NDArray[np.float64]
     """(3,)"""
+    uncertainty_m: NDArray[np.float64]
+    """(3,), standard deviation of the estimate"""
     target_m: NDArray[np.float64]
     """(3,), where the present motion ends"""
     range_m: NDArray[np.float64]
@@ -53,6 +55,11 @@ class Status:
     headroom_v: float
     progress: float
     """0 to 1 of a path"""
+    law: str
+    quiet: bool
+    """whether quiet holds are asked for"""
+    framed: bool
+    """whether the sample's coordinates are other ones than the stage's"""
     missed_ticks: int
     bus_load: float
     """0 to 1"""
@@ -65,11 +72,12 @@ class Status:
     def of(cls, data: Mapping[str, Any]) -> Self:
         """From the server's words."""
         values: dict[str, Any] = {name: data.get(name) for name in cls.__dataclass_fields__}
-        for name in ("position_m", "setpoint_m", "target_m", "voltage_v"):
+        for name in ("position_m", "setpoint_m", "target_m", "voltage_v", "uncertainty_m"):
             values[name] = np.array([np.nan if v is None else v for v in values[name] or [None] * 3], np.float64)
         low_high = [[np.nan if v is None else v for v in pair] for pair in values["range_m"] or [[None] * 2] * 3]
         values["range_m"] = np.array(low_high, np.float64)
         plain: dict[str, Any] = {"homed": False, "driven": False, "in_position": False, "missed_ticks": 0}
+        plain |= {"quiet": False, "framed": False}
         plain |= dict.fromkeys(("t_s", "headroom_v", "progress", "bus_load"), 0.0)
         return cls(**{name: plain.get(name, "") if value is None else value for name, value in values.items()})
 

@@ -12,6 +12,8 @@ from pkxyz_ctrl.client import place
 from pkxyz_ctrl.client.connection import FINAL, Connection
 from pkxyz_ctrl.client.protocol import Block
 from pkxyz_ctrl.client.reply import Command, NoStageError, StageError, Status
+from pkxyz_ctrl.client.scan import PATH_ROW, Frames, ScanFrame
+from pkxyz_ctrl.client.settings import Point, StageSettings, who
 from pkxyz_ctrl.client.trigger import Trigger, beginning, column_of
 
 Axis = Literal["x", "y", "z"]
@@ -168,13 +170,64 @@ class AsyncStage:
         """Park, home, and go back."""
         return await self._done("auto_zero")
 
-    async def settle_window(self, window_m: float, dwell_s: float) -> Command:
-        """In position is: each axis within ``window_m`` of its target for ``dwell_s``."""
-        return await self._done("settle", window_m=window_m, dwell_s=dwell_s)
+    async def settle_window(self, window_m: float, dwell_s: float, sigmas: float | None = None) -> Command:
+        """In position is: each axis, ``sigmas`` standard deviations of its estimate included, within ``window_m`` of
+        its target for ``dwell_s``.
+        """
+        return await self._set("settle", window_m=window_m, dwell_s=dwell_s, sigmas=sigmas)
 
     async def limits(self, *, velocity_m_per_s: float, acceleration_m_per_s2: float, jerk_m_per_s3: float) -> Command:
         """Of moves that name none, for each axis."""
-        return await self._connection.done("limits", _limits(velocity_m_per_s, acceleration_m_per_s2, jerk_m_per_s3))
+        return await self._set("limits", **_limits(velocity_m_per_s, acceleration_m_per_s2, jerk_m_per_s3))
+
+    async def set_frame(
+        self,
+        origin_m: Point | None = None,
+        rotation_deg: float | None = None,
+        slope_x: float | None = None,
+        slope_y: float | None = None,
+        scale: Point | None = None,
+    ) -> Command:
+        """Where the sample lies on the stage; what is left out stays. Nothing moves: all targets and positions are in
+        the sample's coordinates from now on.
+        """
+        turn = {"rotation_deg": rotation_deg, "slope_x": slope_x, "slope_y": slope_y}
+        return await self._set("frame", origin_m=origin_m, scale=scale, **turn)
+
+    async def tilt_plane(self, a_m: Point, b_m: Point, c_m: Point) -> Command:
+        """Tilt the frame so that these three points, in present coordinates, are at z = 0."""
+        return await self._set("tilt_plane", points_m=[list(a_m), list(b_m), list(c_m)])
+
+    async def name_position(
+        self, name: str, x: float | None = None, y: float | None = None, z: float | None = None
+    ) -> Command:
+        """Give a place a name, in m; axes left out are where the target is. Nothing moves."""
+        return await self._set("name_position", name=name, x_m=x, y_m=y, z_m=z)
+
+    async def forget_position(self, name: str) -> Command:
+        """It has no name any more."""
+        return await self._set("forget_position", name=name)
+
+    async def move_to_position(self, name: str, *, wait: bool = True) -> Command:
+        """Go to a place that has a name."""
+        return await self._done("move", wait=wait, to=name)
+
+    async def restore_settings(self, digest: str) -> Command:
+        """Go back to the settings of a digest of ``settings.history``, or of its beginning."""
+        return await self._set("restore", digest=digest)
+
+    async def change_law(self, controller: str | None = None, *, toml: str | None = None) -> Command:
+        """Another law, a shipped one or that of the text of a controller file, taken over without a jump. Refused while
+        the stage moves. Its design may take some seconds.
+        """
+        return await self._done("law", controller=controller, toml=toml)
+
+    async def quiet_holds(self, on: bool = True) -> Command:
+        """Less noise and less rejection while the set-point stands; or no longer."""
+        return await self._done("quiet", on=on)
+
+    async def _set(self, verb: str, **arguments: Any) -> Command:
+        return await self._done(verb, who=who(), **arguments)
 
     async def save(self, seconds: float = 60.0) -> Command:
         """Keep what was in the last ``seconds``, at most 60, in a folder that the answer names. Needs no control."""
@@ -195,6 +248,11 @@ class AsyncStage:
         """Where the stage stood a tenth of a second ago at most."""
         assert self._connection.status is not None, "known since we were connected"
         return self._connection.status
+
+    @property
+    def settings(self) -> StageSettings:
+        """Frame of the sample, named positions, limits of moves, settle window, and their history."""
+        return StageSettings.of(self._connection.settings)
 
     @property
     def description(self) -> dict[str, Any]:
@@ -236,6 +294,39 @@ class AsyncStage:
         finally:
             link.forget(tag)
             await link.unlisten(queue)
+
+    async def frames(
+        self,
+        scenario: str | None = None,
+        *,
+        segments: Sequence[Mapping[str, Any]] | None = None,
+        fields: Sequence[str] = ("reference_m", "estimate_m"),
+        pixels: int = 128,
+    ) -> AsyncIterator[ScanFrame]:
+        """Follow a scan and give each of its frames as soon as its last line is over. Raises ``StageError`` for a path
+        without lines, or where rows were lost.
+        """
+        path = {"scenario": scenario} if segments is None else {"segments": list(segments)}
+        shown = await self._connection.preview(path)
+        if not shown["lines"]:
+            raise StageError(f"{shown['name']} has no lines: frames are those of a raster")
+        backward = np.array(shown["backward"]) != shown["backward"][0]
+        frames = Frames([(a, b, n) for a, b, n in shown["lines"]], backward.tolist(), pixels)
+        command: Command | None = None
+        async for block in self.telemetry(PATH_ROW, *fields):
+            if command is None:  # now that we listen
+                command = await self._done("path", wait=False, **path)
+                continue
+            if block.lost:
+                raise StageError("rows were lost, as this program was too slow: ask for fewer fields")
+            done = frames.take(block, fields)
+            for frame in done:
+                yield frame
+            if done and done[-1].number == frames.count - 1:
+                await self.ended(command)
+                return
+            if command.answers is not None and not command.answers.empty():
+                await self.ended(command)
 
     async def capture(
         self, *fields: str, seconds: float, trigger: Trigger | None = None, before_s: float = 0.0,

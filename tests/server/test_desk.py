@@ -16,7 +16,8 @@ from hil.operate.memory import StageMemory
 from hil.operate.tick_frames import TickFrames
 from hil.recording.recording import Recording
 from hil.runs.run_folder import RECORDING
-from hil.server.desk import _SAID_MOST, Client, Desk
+from hil.server.client import SAID_MOST, Client
+from hil.server.desk import Desk
 from hil.server.link import Link
 from hil.server.paths import Planner
 from hil.server.saving import AFTER_S
@@ -275,10 +276,10 @@ def test_10_000_random_messages_move_nothing_and_nobody_without_control_can(rig)
 
 def test_a_client_that_reads_nothing_is_given_up(rig):
     client = rig.desk.enter()
-    for _ in range(_SAID_MOST + 5):
+    for _ in range(SAID_MOST + 5):
         rig.desk.tell_status()
     assert client.is_hopeless
-    assert client.said.qsize() <= _SAID_MOST
+    assert client.said.qsize() <= SAID_MOST
 
 
 def test_what_is_asked_while_the_loop_starts_is_answered(tmp_path, monkeypatch):
@@ -350,7 +351,7 @@ def test_a_client_that_takes_nothing_ends_nobody_elses_telemetry(rig):
 
     def script() -> Script:
         yield from rig.wait_s(0.01)
-        for _ in range(_SAID_MOST + 5):
+        for _ in range(SAID_MOST + 5):
             rig.desk.tell_status()
             rig.heard(other)
         for client in (stalled, other):

@@ -25,6 +25,9 @@ def serve(
     ] = "hold",
     silence_s: SilentFor = 0.06,
     saves: Annotated[Path, typer.Option(help="Folder for what was around each fault.")] = Path("runs"),
+    settings: Annotated[
+        Path | None, typer.Option(help="Folder for what is set, with its history; the user's if not given.")
+    ] = None,
     host: Annotated[str, typer.Option(help="Address to listen at. Others than this machine's can reach it then.")] = (
         "127.0.0.1"
     ),
@@ -53,7 +56,9 @@ def serve(
     def tell(url: str) -> None:
         print(json.dumps({"url": url}) if as_json else f"the stage is at {url}", flush=True)
 
-    served = Served(name, stage, controller, plant, bus, on_silence, silence_s, saves, host, port, is_simulated, report)
+    served = Served(
+        name, stage, controller, plant, bus, on_silence, silence_s, saves, host, port, is_simulated, settings, report
+    )
     raise typer.Exit(serve(served, tell))
 
 

@@ -1,0 +1,50 @@
+"""A client of the desk: what it has asked to see, and what waits for its socket."""
+
+import asyncio
+import json
+from typing import Any
+
+from pkxyz_ctrl.client.protocol import Block, packed
+
+SAID_MOST, _BLOCKS_MOST = 400, 4
+
+
+class Client:
+    """One that is connected. ``said`` waits for its socket; what is too much for a slow one is left out."""
+
+    def __init__(self, number: int) -> None:
+        self.number = number
+        self.said: asyncio.Queue[str | bytes] = asyncio.Queue(SAID_MOST)
+        self.fields: tuple[str, ...] = ()
+        self.precision: Any = "f4"
+        self.tags: dict[int, Any] = {}
+        self.lost = 0
+        self._blocks = 0
+        self.is_hopeless = False
+
+    def tell(self, message: dict[str, Any]) -> None:
+        """Queue a message; a client that takes none of hundreds is given up."""
+        self.tell_text(json.dumps(message, allow_nan=False))
+
+    def tell_text(self, text: str) -> None:
+        """The same, of what is a text already."""
+        try:
+            self.said.put_nowait(text)
+        except asyncio.QueueFull:
+            self.is_hopeless = True
+
+    def show(self, block: Block) -> None:
+        """Queue a block of telemetry, or leave it out and count its rows."""
+        if self._blocks >= _BLOCKS_MOST or self.said.full():
+            self.lost += len(block)
+            return
+        self._blocks += 1
+        self.said.put_nowait(packed(Block(block.first_tick, block.columns, self.lost), self.precision))
+        self.lost = 0
+
+    async def next_said(self) -> str | bytes:
+        """What comes next."""
+        said = await self.said.get()
+        if isinstance(said, bytes):
+            self._blocks -= 1
+        return said

@@ -1,0 +1,77 @@
+"""Parts of the messages between a client and the desk."""
+
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from hil.operate.sample_frame import Turn
+from hil.server.paths import StagePath
+from pkxyz_ctrl.loop.row import ROW
+
+Array = NDArray[np.float64]
+
+_OF_SESSION = {"path_row": "path_row", "in_position": "in_position"}
+FIELDS = frozenset({*(name for name in ROW.names or () if ROW[name].base.kind in "fi"), *_OF_SESSION})
+"""Of telemetry."""
+_PLACES = frozenset({"reference_m", "measurement_m", "estimate_m", "position_m"})
+_WAYS = frozenset({"estimate_m_per_s", "innovation_m"})
+
+
+class AskedWrongError(ValueError):
+    """A message that means nothing; the text says what was expected."""
+
+
+def answer(tag: Any, verb: str, state: str, words: str, command_id: int | None = None) -> dict[str, Any]:
+    """What became of something that was asked."""
+    return {"answer": {"tag": tag, "id": command_id, "verb": verb, "state": state, "words": words}}
+
+
+def tag_of(value: Any) -> str | int | None:
+    """What a client may put on a message to know its answers by."""
+    if value is None or (isinstance(value, str) and len(value) <= 64):
+        return value
+    if isinstance(value, int) and abs(value) < 1 << 53:
+        return value
+    raise AskedWrongError("a tag is a short text or a whole number")
+
+
+def shown(path: StagePath) -> dict[str, Any]:
+    """A path before it is followed, in the sample's coordinates."""
+    points = path.shown()
+    return {
+        "name": path.name, "duration_s": path.duration_s, "start_m": points[0].tolist(),
+        "points_m": np.round(points, 12).tolist(), "low_m": points.min(0).tolist(), "high_m": points.max(0).tolist(),
+        "lines": path.lines, "backward": path.backward,
+    }  # fmt: skip
+
+
+def number(message: dict[str, Any], name: str, absent: float | None) -> float:
+    """A number of a message. Raises ``AskedWrongError``."""
+    value = message.get(name, absent)
+    if value is None and absent is not None:
+        value = absent
+    if isinstance(value, bool) or not isinstance(value, int | float):
+        raise AskedWrongError(f"{name} is a number, not {value!r}")
+    return float(value)
+
+
+def of_sample(ticks: NDArray[np.void]) -> dict[str, NDArray[Any]]:
+    """Fields of records (n,) of ``TICK`` by name, positions and velocities in the coordinates of the sample as they
+    were in each tick. Forces, voltages and what belongs to combs stay the stage's.
+    """
+    rows, matrices = ticks["row"], ticks["session"]["matrix"]
+    turns = [(0, len(ticks), Turn(matrices[0]))]
+    if (matrices != matrices[0]).any():
+        turns = [(n, n + 1, Turn(matrix)) for n, matrix in enumerate(matrices)]
+    fields: dict[str, NDArray[Any]] = {name: rows[name] for name in FIELDS - _OF_SESSION.keys()}
+    fields |= {name: ticks["session"][of] for name, of in _OF_SESSION.items()}
+    if all(turn.is_plain for *_, turn in turns):
+        return fields
+    for name in _PLACES | _WAYS:
+        parts = [
+            (turn.to_sample if name in _PLACES else turn.way_to_sample)(rows[name][begin:end])
+            for begin, end, turn in turns
+        ]
+        fields[name] = np.concatenate(parts)
+    return fields
