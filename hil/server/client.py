@@ -46,5 +46,5 @@ class Client:
         """What comes next."""
         said = await self.said.get()
         if isinstance(said, bytes):
-            self._blocks -= 1
+            self._blocks = max(0, self._blocks - 1)
         return said

@@ -17,19 +17,19 @@ from hil.server.designing import offer_of
 from hil.server.link import Answer, BusyError, Link
 from hil.server.messages import FIELDS, AskedWrongError, number, of_sample, shown, tag_of
 from hil.server.messages import answer as answer_of
+from hil.server.opening import listed, opened, values_of
 from hil.server.paths import Feeding, Planner, StagePath
 from hil.server.saving import AFTER_S, BEFORE_S, NotSavedError, save
 from hil.server.setting import ASKED, Setting
 from hil.server.status import status_of
 from hil.server.stored_settings import SettingsStore
-from pkxyz_ctrl.client.protocol import Block
+from pkxyz_ctrl.client.protocol import Block, packed
 from pkxyz_ctrl.config.files import ConfigError
 
 _AXES = ("x", "y", "z")
 _LIMITS = ("velocity_m_per_s", "acceleration_m_per_s2", "jerk_m_per_s3")
-_FREE = frozenset(
-    {"stop", "release", "subscribe", "take_control", "give_control", "preview", "body", "save", "settings"}
-)
+_LOOKS = frozenset({"settings", "values", "parameters", "recordings", "open_recording"})
+_FREE = _LOOKS | {"stop", "release", "subscribe", "take_control", "give_control", "preview", "body", "save"}
 """What needs no control: nothing of it moves anything, or it stops what moves."""
 
 
@@ -130,11 +130,11 @@ class Desk:
         elif what == "save":
             seconds = number(message, "seconds", 60.0)
             client.tell(answer_of(tag, "save", "done", await self._kept(min(max(seconds, 0.1), 60.0), "")))
+        elif what in _LOOKS:
+            await self._look_at(client, what, message)
+            client.tell(answer_of(tag, what, "done", ""))
         elif what == "path":
             await self._send_path(client, message, tag)
-        elif what == "settings":
-            client.tell({"settings": self._setting.told()})
-            client.tell(answer_of(tag, what, "done", ""))
         elif what == "law":
             await self._change_law(client, message, tag)
         elif what in ASKED:
@@ -146,6 +146,20 @@ class Desk:
                 self._tell(what, command_id, State.ACCEPTED, words)
         else:
             self._command(client, what, message, tag)
+
+    async def _look_at(self, client: Client, what: str, message: dict[str, Any]) -> None:
+        if what == "settings":
+            client.tell({"settings": self._setting.told()})
+        elif what == "parameters":
+            client.tell({"parameters": self._planner.parameters})
+        elif what == "recordings":
+            client.tell({"recordings": await self._plan(listed, self._saves)})
+        elif what == "open_recording":
+            about, block = await self._plan(opened, self._saves, message.get("name"), client.fields)
+            client.tell({"recording": about})
+            client.said.put_nowait(packed(block, "f4"))
+        elif (newest := self.link.newest()) is not None:
+            client.tell({"values": values_of(of_sample(np.array([newest])))})
 
     # -- control -------------------------------------------------------------------------------------------------------
 

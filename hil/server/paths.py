@@ -117,10 +117,16 @@ class Planner:
     def __init__(self, stage: str, controller: str, bus: str) -> None:
         self.files = {"stage": stage, "bus": bus}
         config = load("stages", stage, StageConfig)
+        law = load("controllers", controller, ControllerConfig)
         on_bus = load("buses", bus, BusConfig)
         self.period_us = on_bus.period_us
         self.stage = Stage(config)
-        self._drive = DriveLimits.of(load("controllers", controller, ControllerConfig), on_bus)
+        self._drive = DriveLimits.of(law, on_bus)
+        self.parameters = {
+            name: model.model_dump(mode="json")
+            for name, model in (("controller", law), ("stage", config), ("bus", on_bus))
+        }
+        """what the files say, for people"""
         self._reach = Reach(self.stage, self._drive)
 
     @property

@@ -1,7 +1,7 @@
 """Trigger bits for the instant at which an output of this tick acts, with the voltages. PURE and compiled.
 
-Where the stage is then: the set-point of that instant, and how far the estimate is from the present one. A position
-trigger fires in the tick nearest to the passage, so it is early as often as late, and says by how much.
+Where the stage is then: the set-point of that instant, and how far the estimate has been from its own of late; its
+noise from tick to tick, averaged out, is not known beforehand. A position trigger fires in the tick nearest to the passage, so it is early as often as late, and says by how much.
 """
 
 import math
@@ -15,6 +15,9 @@ Array = NDArray[np.float64]
 LINE, PIXEL, FRAME, POSITION, IN_POSITION = 1, 2, 4, 8, 16
 """On a line; in an even pixel of it; on the first line of a frame; passed a position; in position."""
 
+MEMORY_TICKS = 32
+"""Time constant of the mean of what the estimate is off."""
+
 POSITION_TRIGGER = np.dtype(
     [
         ("axis", "i4"),
@@ -22,6 +25,7 @@ POSITION_TRIGGER = np.dtype(
         ("start_m", "f8"),
         ("pitch_m", "f8"),
         ("count", "i8"),  # start, start + pitch, ...: how many positions
+        ("off_m", "f8"),  # estimate less set-point, of late
         ("begun", "i4"),  # 0: not asked yet
         ("passed", "i8"),  # positions below where the stage was
         ("late_s", "f8"),  # how long before the instant of action the position was passed; negative: after it
@@ -32,17 +36,18 @@ POSITION_TRIGGER = np.dtype(
 
 
 @njit(cache=True, error_model="numpy")
-def position_bit(
-    trigger: np.void, now_m: Array, then_m: Array, then_m_per_s: Array, estimate_m: Array, period_s: float
-) -> int:
+def position_bit(trigger: np.void, now_m: Array, then: Array, estimate_m: Array, period_s: float) -> int:
     """``POSITION`` if the stage passes a position of ``trigger`` within half a period of the instant of action, else 0.
 
-    Set-point now, and then with its velocity, and the estimate of now, each (3,). Of several within one period the last
-    counts: the pitch has to be more than the way of a period.
+    Set-point (3,) and estimate (3,) of now, and the row (9,) of the reference at that instant. Of several within one
+    period the last counts: the pitch has to be more than the way of a period.
     """
     i = trigger["axis"]
-    speed = then_m_per_s[i]
-    at = then_m[i] + (estimate_m[i] - now_m[i])
+    speed = then[3 + i]
+    if trigger["begun"] == 0:
+        trigger["off_m"] = estimate_m[i] - now_m[i]
+    trigger["off_m"] += (estimate_m[i] - now_m[i] - trigger["off_m"]) / MEMORY_TICKS
+    at = then[i] + trigger["off_m"]
     ahead = (at + 0.5 * period_s * speed - trigger["start_m"]) / trigger["pitch_m"]
     below = min(max(math.floor(ahead) + 1, 0), trigger["count"])
     was, trigger["passed"] = trigger["passed"], below
@@ -52,7 +57,8 @@ def position_bit(
     if below == was or speed == 0.0 or trigger["direction"] * (below - was) < 0 or (below > was) != (speed > 0.0):
         return 0
     trigger["at_m"] = trigger["start_m"] + trigger["pitch_m"] * (below - 1 if below > was else below)
-    trigger["late_s"] = (at - trigger["at_m"]) / speed
+    late_s = (at - trigger["at_m"]) / speed
+    trigger["late_s"] = (at - trigger["at_m"] + 0.5 * then[6 + i] * late_s * late_s) / speed
     return POSITION
 
 

@@ -20,8 +20,8 @@ def settles(seed: int) -> Trajectory:
     rng = np.random.default_rng(seed)
     segments = [Hold(kind="hold", duration_s=0.02, measured=False)]
     for _ in range(50):
-        place = rng.uniform(-4e-6, 4e-6, 3) + (0.0, 0.0, 18e-6)
-        segments += [Move(kind="move", to_m=tuple(place), **LIMITS), Hold(kind="hold", duration_s=0.01)]
+        place = rng.uniform((-4e-6, -4e-6, 14e-6), (4e-6, 4e-6, 22e-6))
+        segments.append(Move(kind="move", to_m=tuple(place), **LIMITS))
         for by in rng.uniform(-0.3e-6, 0.3e-6, (SETTLES // 100, 3)):
             segments.append(Steps(kind="steps", by_m=tuple(by), count=1, dwell_s=STEP_S))
     return Trajectory(segments)
@@ -29,7 +29,7 @@ def settles(seed: int) -> Trajectory:
 
 @njit(cache=True)
 def decided(rows, gain, window_m, sigmas, dwell_ticks, begins, ticks, said, was):
-    """Ticks after each jump until the window has been kept for the dwell: as said, and as it was in truth; -1: never."""
+    """Ticks after each jump until the window was kept for the dwell, as said and in truth; -1: never, -2: falsely."""
     state = np.zeros(1, IN_POSITION)
     jump = 0
     true_ticks = 0
@@ -56,29 +56,33 @@ def decided(rows, gain, window_m, sigmas, dwell_ticks, begins, ticks, said, was)
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize(("plant", "window_m"), [("nominal", 5e-9), ("mild", 8e-9), ("lab", 12e-9)])
+@pytest.mark.parametrize(("plant", "window_m"), [("nominal", 7.5e-9), ("mild", 20e-9)])
 def test_of_ten_thousand_settles_none_is_said_that_is_not(plant, window_m):
+    """With three standard deviations of the estimate inside the window. On a stage that differs from its file by some
+    per cent, where 20 nm is the window unless told; an estimate that is taken for the truth is false there.
+    """
     scenario = load_scenario("steps", controller="youla", plant=plant, bus="fd_5k")
     trajectory = settles(7)
-    run = dataclasses.replace(
-        scenario.setup(), trajectory=trajectory, duration_s=trajectory.duration_us * 1e-6 + 0.3, learning=None
-    )
+    duration_s = trajectory.duration_us * 1e-6 + 0.3
+    run = dataclasses.replace(scenario.setup(), trajectory=trajectory, duration_s=duration_s, learning=None)
     rows, _ = rows_of(run, "fast")
     assert not rows["trips"].any()
-    period_s = run.bus.period_s
-    jumps = np.abs(np.diff(rows["reference_m"], axis=0)).max(axis=1)
-    begins = np.flatnonzero((jumps > 5e-9) & (rows["estimate_m"].shape[0] > 0)) + 1
-    known_us = np.concatenate([s.jumps_us for s in trajectory.segments if s.jumps_us])
-    tracking = rows["reference_tick"]
-    begins = np.searchsorted(tracking, -(-known_us // run.bus.period_us))
-    assert len(begins) >= SETTLES
-    said, was = np.full(len(begins), -1), np.full(len(begins), -1)
+    jumps_us = np.concatenate([s.jumps_us for s in trajectory.segments if s.jumps_us])
+    begins = np.searchsorted(rows["reference_tick"], -(-jumps_us // run.bus.period_us))
+    assert len(begins) == SETTLES
     gain = np.ascontiguousarray(run.law["tick"]["estimator"]["gain"][0])
-    ticks = round(STEP_S / period_s) - 1
-    decided(rows, gain, window_m, 3.0, round(DWELL_S / period_s), begins, ticks, said, was)
-    both = (said >= 0) & (was >= 0)
-    print(plant, "false", (said == -2).sum(), "never said", (said == -1).sum(), "never true", (was == -1).sum(),
-          "median said", np.median(said[both]) * period_s * 1e3, "true", np.median(was[both]) * period_s * 1e3)
-    assert (said != -2).all(), f"{(said == -2).sum()} false"
-    assert np.median(said[both]) <= 1.3 * np.median(was[both])
-    assert both.mean() > 0.9
+    dwell_ticks, ticks = round(DWELL_S / run.bus.period_s), round(STEP_S / run.bus.period_s) - 1
+
+    def judged(window_m: float, sigmas: float) -> tuple[int, float, float]:
+        """How many were false, median over that of the truth, and the share of those that came to an end."""
+        said, was = np.full(SETTLES, -1), np.full(SETTLES, -1)
+        decided(rows, gain, window_m, sigmas, dwell_ticks, begins, ticks, said, was)
+        both = (said >= 0) & (was >= 0)
+        return int((said == -2).sum()), float(np.median(said[both]) / np.median(was[both])), float(both.mean())
+
+    false, later, ended = judged(window_m, 3.0)
+    assert false == 0
+    assert 0.95 < later <= 1.3
+    assert ended == 1.0
+    if plant == "mild":
+        assert judged(10e-9, 0.0)[0] > 4 * judged(10e-9, 3.0)[0]
