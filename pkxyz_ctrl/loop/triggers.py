@@ -1,7 +1,8 @@
 """Trigger bits for the instant at which an output of this tick acts, with the voltages. PURE and compiled.
 
 Where the stage is then: the set-point of that instant, and how far the estimate has been from its own of late; its
-noise from tick to tick, averaged out, is not known beforehand. A position trigger fires in the tick nearest to the passage, so it is early as often as late, and says by how much.
+noise from tick to tick, averaged out, is not known beforehand. A position trigger fires in the tick nearest to the
+passage, so it is early as often as late, and says by how much.
 """
 
 import math

@@ -22,8 +22,8 @@ def settles(seed: int) -> Trajectory:
     for _ in range(50):
         place = rng.uniform((-4e-6, -4e-6, 14e-6), (4e-6, 4e-6, 22e-6))
         segments.append(Move(kind="move", to_m=tuple(place), **LIMITS))
-        for by in rng.uniform(-0.3e-6, 0.3e-6, (SETTLES // 100, 3)):
-            segments.append(Steps(kind="steps", by_m=tuple(by), count=1, dwell_s=STEP_S))
+        ways = rng.uniform(-0.3e-6, 0.3e-6, (SETTLES // 100, 3))
+        segments += [Steps(kind="steps", by_m=tuple(way), count=1, dwell_s=STEP_S) for way in ways]
     return Trajectory(segments)
 
 
