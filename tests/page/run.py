@@ -59,6 +59,7 @@ def operate(browser: Browser, url: str, pictures: Path) -> None:
     logged(browser, "move done")
     activity(browser, "holding")
     assert "stage.move_to(x=0, y=0, z=0.0000192495269)" in browser.text("#as-python")
+    set_up(browser, pictures)
     fill(browser, "#move [name=x_m]", "50")
     browser.click("#move button:not([type])")
     logged(browser, "x = 50 um is asked for, limits")
@@ -71,6 +72,15 @@ def operate(browser: Browser, url: str, pictures: Path) -> None:
     browser.run("document.querySelector('#shown').onchange()")
     time.sleep(0.5)
     browser.picture(pictures / "scan.png")
+    fill(browser, "#view", "3d")
+    browser.run("document.querySelector('#view').onchange()")
+    browser.click("#theme")
+    time.sleep(0.5)
+    browser.picture(pictures / "scan-dark.png")
+    browser.resize(820, 1180)
+    browser.picture(pictures / "tablet.png")
+    browser.resize(1280, 800)
+    browser.click("#theme")
     browser.click("[data-do=pause]")
     activity(browser, "paused")
     browser.click("[data-do=resume]")
@@ -87,12 +97,60 @@ def operate(browser: Browser, url: str, pictures: Path) -> None:
     browser.until("!document.querySelector('#fault').hidden && document.body.innerText.includes('Stopped by hand')")
     browser.until("document.querySelector('#fault-words').innerText.includes('The 2 s before it: ')")
     browser.picture(pictures / "fault.png")
+    look_back(browser, pictures)
     browser.click("#fault [data-do=clear]")
     activity(browser, "off")
     for verb in ("home", "enable"):
         browser.click(f"[data-do={verb}]")
         activity(browser, "off" if verb == "home" else "holding")
     browser.until("document.body.innerText.includes('enable done')")
+
+
+def set_up(browser: Browser, pictures: Path) -> None:
+    """Window, law, frame of the sample, a position with a name, and the way back."""
+    fill(browser, "#settle [name=window]", "25")
+    browser.click("#settle button")
+    logged(browser, "settle done: settle window: settings ")
+    fill(browser, "#law-form [name=law]", "lqg")
+    browser.click("#law-form button:not([type])")
+    logged(browser, "law done: the law is lqg")
+    assert "stage.change_law(" in browser.text("#as-python")
+    fill(browser, "#frame [name=origin_z]", "19")
+    fill(browser, "#frame [name=rotation]", "30")
+    browser.click("#frame button:not([type])")
+    logged(browser, "frame done: ")
+    browser.until("document.querySelector('#facts').innerText.includes('sample')")
+    assert "rotation_deg=30" in browser.text("#as-command")
+    fill(browser, "#name-position [name=name]", "corner")
+    browser.click("#name-position button")
+    browser.until("document.querySelector('#positions').innerText.includes('corner: ')")
+    fill(browser, "#move [name=x_m]", "1.5")
+    browser.click("#move button:not([type])")
+    logged(browser, "in position at (1.5, ")
+    browser.click("#positions button")
+    logged(browser, "in position at (0, ")
+    browser.click("#tree-open")
+    browser.until("document.querySelector('#tree').innerText.includes('reference_m')")
+    browser.run("for (const each of document.querySelectorAll('#settings details, #tree details')) each.open = true")
+    browser.run("document.querySelector('#settings').scrollIntoView()")
+    time.sleep(0.6)
+    browser.picture(pictures / "settings.png")
+    browser.click("#tree-open")
+    browser.run("[...document.querySelectorAll('#history button')].at(-1).click()")
+    logged(browser, "restore done: back to ")
+    browser.until("document.querySelector('#facts').innerText.includes('stage')")
+
+
+def look_back(browser: Browser, pictures: Path) -> None:
+    """What was kept of the fault, in the same page, with its events; then live again."""
+    browser.until("document.querySelector('#recordings').innerText.includes('fault-')")
+    browser.click("#recordings button")
+    browser.until("!document.querySelector('#opened').hidden")
+    assert "Stopped by hand" in browser.text("#opened-words")
+    time.sleep(0.5)
+    browser.picture(pictures / "recording.png")
+    browser.click("#opened-close")
+    browser.until("document.querySelector('#opened').hidden")
 
 
 def main() -> None:
@@ -103,6 +161,7 @@ def main() -> None:
     folder = Path(tempfile.mkdtemp(prefix="pkxyz-served-"))
     law, bus = patient_law(folder, "youla"), patient_bus(folder / "bus.toml", "unix_2k")
     words = ["--controller", str(law), "--bus", str(bus), "--silence-s", "0.25", "--saves", str(folder / "runs")]
+    words += ["--settings", str(folder / "settings")]
     serving = subprocess.Popen(
         [sys.executable, "-m", "hil", "serve", "--name", "page", "--port", "0", "--json", *words],
         stdout=subprocess.PIPE, text=True,

@@ -38,7 +38,14 @@ class Server:
 
     def __init__(self, law: Path, bus: Path) -> None:
         words = ["serve", "--controller", str(law), "--bus", str(bus), "--port", "0", "--json"]
-        words += ["--silence-s", "0.25", "--saves", str(law.parent / "runs")]
+        words += [
+            "--silence-s",
+            "0.25",
+            "--saves",
+            str(law.parent / "runs"),
+            "--settings",
+            str(law.parent / "settings"),
+        ]
         self._command = [sys.executable, "-m", "hil", *words]
         self.process: subprocess.Popen[str]
         self.err = law.parent / "err"

@@ -23,6 +23,8 @@ export class History {
     }
   }
 
+  tickOf(n) { return this.tick[n % this.rows]; }
+
   get begin() { return Math.max(0, this.end - this.rows); }
 
   value(field, axis, n) { return this.columns[field][3 * (n % this.rows) + axis]; }

@@ -4,32 +4,45 @@ import { History } from "./history.js";
 import { Link } from "./link.js";
 import { Plane } from "./plane.js";
 import { Scope } from "./scope.js";
+import { Setting } from "./setting.js";
+import { Tree } from "./tree.js";
 
 const FIELDS = ["reference_m", "estimate_m", "voltage_v", "disturbance_n"];
 const FREE = new Set(["stop", "release"]);
 const AXES = ["x", "y", "z"];
+const QUIETLY = new Set(["settings", "values", "parameters", "recordings", "open_recording"]);  // looks, not deeds
 const JOG_MS = 60;  // a jog is said again: at least 10 times a second
 const at = (id) => document.getElementById(id);
 const history = new History(FIELDS, 1 << 15);
 const scope = new Scope(at("plot"), history);
 const plane = new Plane(at("plane"), history);
+const tree = new Tree(at("tree"));
+let opened = null;  // a recording in place of what is live
 let mine = false, held = false, status = null, hello = {}, previewTag = null;
 
 // -- what the server says
 
 const link = new Link({
-  open() { link.say({ do: "subscribe", fields: FIELDS, precision: "f4" }); },
+  open() { link.say({ do: "subscribe", fields: FIELDS, precision: "f4" }); link.say({ do: "recordings" }); },
   hello(value) {
     hello = value;
     if (value.period_us) scope.periodS = value.period_us * 1e-6;
     document.title = value.stage ? `${value.stage}: stage` : "Stage";
     if (value.period_us) bodyOf();
   },
-  block(block) { history.take(block); },
+  block(block) {
+    if (opened && !opened.isFilled) { opened.isFilled = true; history.clear(); history.take(block); seek(); return; }
+    if (!opened) history.take(block);
+  },
+  settings(value) { setting.show(value); if (hello.period_us) bodyOf(); },
+  values(value) { tree.values(value); },
+  parameters(value) { tree.parameters(value); },
+  recordings: listRecordings,
+  recording(value) { opened = { ...value, isFilled: false, live: scope.periodS }; showOpened(); },
   status: show,
   control(value) { mine = value.yours; held = value.held; showControl(); },
   answer,
-  event(value) { if (value.kind === "fault" && !value.old) log("fault", value.words.split("\n")[0], "aborted"); },
+  event(value) { if (value.kind === "saved") link.say({ do: "recordings" }); if (value.kind === "fault" && !value.old) log("fault", value.words.split("\n")[0], "aborted"); },
   preview(value) {
     plane.ghost = value.points_m;
     at("scan-words").textContent = `${value.duration_s.toFixed(2)} s; from (${um(value.low_m)}) to (${um(value.high_m)}) um; the combs can follow`;
@@ -42,6 +55,7 @@ function bodyOf() { link.say({ do: "body" }); }
 
 function show(value) {
   status = value;
+  setting.showStatus(value);
   plane.status = value;
   document.querySelector(".state").dataset.activity = value.alive === false ? "gone" : value.activity;
   at("words").textContent = value.alive === false && value.t_s ? "the loop has stopped ticking" : value.words;
@@ -52,7 +66,7 @@ function show(value) {
     at(`err-${axis}`).textContent = value.driven ? (value.error_m[n] * 1e9).toFixed(1) : "-";
   }
   const facts = value.t_s === undefined ? [] : [
-    ["in position", value.in_position ? "yes" : "no"], ["homed", value.homed ? "yes" : "no"],
+    ["in position", value.in_position ? "yes" : "no"], ["frame", value.framed ? "sample" : "stage"], ["homed", value.homed ? "yes" : "no"],
     ["bus load", `${(100 * value.bus_load).toFixed(0)} %`], ["missed ticks", value.missed_ticks], ["running", clock(value.t_s)], ["clients", value.clients],
   ];
   at("facts").replaceChildren(...facts.map(([name, v]) => { const d = document.createElement("div"); const b = document.createElement("b"); b.textContent = v; d.append(b, name); return d; }));
@@ -77,7 +91,7 @@ function combs(value) {
 
 function answer({ tag, verb, state, words }) {
   if (tag === previewTag && state === "refused") at("scan-words").textContent = words;
-  if (["done", "refused", "aborted"].includes(state) && verb !== "take_control" && verb !== "give_control") log(verb || "", words, state);
+  if (["done", "refused", "aborted"].includes(state) && (words || state !== "done" || !QUIETLY.has(verb)) && verb !== "take_control" && verb !== "give_control") log(verb || "", words, state);
 }
 
 function log(verb, words, state) {
@@ -89,6 +103,7 @@ function log(verb, words, state) {
 }
 
 function showControl() {
+  setting.lock(mine);
   at("control").textContent = mine ? "Give control" : held ? "Another has control" : "Take control";
   at("control").disabled = held && !mine;
   for (const button of document.querySelectorAll("[data-do], #move button, #scan button[name=''], #scan button:not([name]), td button"))
@@ -101,6 +116,49 @@ function ask(message, command, python) {
   at("as-command").textContent = `$ ${command}`;
   at("as-python").textContent = python;
   return link.say(message);
+}
+
+const setting = new Setting(ask);
+
+// -- recordings: the same page, the same code
+
+function listRecordings(names) {
+  at("recordings").replaceChildren(...names.map((name) => {
+    const row = document.createElement("li"), words = document.createElement("span"), open = document.createElement("button");
+    words.textContent = name; open.className = "quiet small"; open.textContent = "Open";
+    open.onclick = () => ask({ do: "open_recording", name }, `pkxyz recording ${name}`, `hil.recording.Recording.open("${name}/recording.parquet")`);
+    row.append(words, open);
+    return row;
+  }));
+}
+function showOpened() {
+  at("opened").hidden = !opened;
+  scope.events = opened?.events ?? [];
+  if (!opened) { scope.end = null; return; }
+  scope.periodS = opened.period_us * 1e-6;
+  at("opened-name").textContent = opened.name;
+  const faults = opened.events.filter((event) => event.kind === "fault").map((event) => event.words.split(":")[0]);
+  at("opened-words").textContent = `${(opened.ticks * scope.periodS).toFixed(1)} s, ${opened.events.length} events${faults.length ? `: ${[...new Set(faults)].join("; ")}` : ""}`;
+  at("opened-at").value = 1;
+}
+function seek() {
+  const share = Number(at("opened-at").value), count = Math.round(scope.spanS / scope.periodS);
+  scope.end = Math.min(history.end - 1, Math.round(history.begin + count + share * Math.max(0, history.end - 1 - history.begin - count)));
+}
+at("opened-at").oninput = seek;
+at("opened-close").onclick = () => { scope.periodS = opened.live; opened = null; history.clear(); showOpened(); };
+at("recordings-again").onclick = () => link.say({ do: "recordings" });
+at("keep").onclick = () => { ask({ do: "save", seconds: 60 }, "pkxyz ask save", "stage.save(60.0)"); setTimeout(() => link.say({ do: "recordings" }), 3000); };
+
+let treeTimer = null;
+function openTree(on) {
+  at("tree").hidden = !on;
+  at("tree-open").textContent = on ? "Hide" : "Show";
+  clearInterval(treeTimer);
+  if (!on) return;
+  link.say({ do: "parameters" });
+  link.say({ do: "values" });
+  treeTimer = setInterval(() => link.say({ do: "values" }), 500);
 }
 
 function verb(name) { ask({ do: name }, `pkxyz ask ${name.replace("_", "-")}`, `stage.${name}()`); }
@@ -179,12 +237,13 @@ at("scan").elements.preview.onclick = preview;
 function preview() { previewTag = link.say({ do: "preview", segments: segments() }); }
 
 at("step").onchange = at("speed").onchange = jogLabels;
-at("view").onchange = () => { plane.view = at("view").value; };
+at("view").onchange = () => { plane.view = at("view").value; at("view-hint").textContent = plane.view === "3d" ? "body: what the combs hold; drag to turn" : "shaded: what the combs hold"; };
 at("shown").onchange = () => { scope.what = at("shown").value; scope.rebuild(); };
-at("span").onchange = () => { scope.spanS = Number(at("span").value); };
+at("span").onchange = () => { scope.spanS = Number(at("span").value); if (opened) seek(); };
 function setTrigger() { const axis = AXES.indexOf(at("trigger").value); scope.trigger = axis < 0 ? null : { axis, level: number(at("level").value) ?? 0 }; }
 at("trigger").onchange = at("level").onchange = setTrigger;
 function toggles(id, set) { at(id).onclick = () => { const on = at(id).getAttribute("aria-pressed") !== "true"; at(id).setAttribute("aria-pressed", on); set(on); }; }
+toggles("tree-open", openTree);
 toggles("hold", (on) => { scope.held = on; });
 toggles("spectrum", (on) => { scope.inSpectrum = on; scope.rebuild(); });
 at("csv").onclick = () => save(URL.createObjectURL(new Blob([scope.csv()], { type: "text/csv" })), "scope.csv");

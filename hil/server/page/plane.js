@@ -1,11 +1,13 @@
 // Where the stage is, in a plane: its trail, its set-point, the path to come, and what the combs hold.
 
+import { Space } from "./space.js";
+
 const VIEWS = { xy: [0, 1], xz: [0, 2], yz: [1, 2] };
 
 export class Plane {
   constructor(canvas, history) {
     this.canvas = canvas; this.history = history; this.view = "xy";
-    this.ghost = null; this.body = null; this.status = null;
+    this.ghost = null; this.body = null; this.status = null; this.space = new Space(canvas);
   }
 
   draw() {
@@ -14,6 +16,14 @@ export class Plane {
     if (canvas.width !== width * scale || canvas.height !== height * scale) { canvas.width = width * scale; canvas.height = height * scale; }
     const g = canvas.getContext("2d"), css = getComputedStyle(document.documentElement);
     const colour = (name) => css.getPropertyValue(name).trim();
+    this.space.isShown = this.view === "3d";
+    if (this.space.isShown) {
+      const { history } = this, trail = [];
+      g.setTransform(scale, 0, 0, scale, 0, 0); g.clearRect(0, 0, width, height);
+      for (let n = Math.max(history.begin, history.end - 4000); n < history.end; n += 8) trail.push([0, 1, 2].map((axis) => history.value("estimate_m", axis, n)));
+      this.space.draw(g, width, height, { body: this.body, ghost: this.ghost, trail, status: this.status }, colour);
+      return;
+    }
     const [a, b] = VIEWS[this.view], box = this.box(a, b);
     const unit = Math.min((width - 70) / (box[1] - box[0]), (height - 44) / (box[3] - box[2]));
     const px = (u) => width / 2 + 14 + (u - (box[0] + box[1]) / 2) * unit;

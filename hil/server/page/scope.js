@@ -14,7 +14,7 @@ export class Scope {
   constructor(place, history) {
     this.place = place; this.history = history;
     this.what = "error"; this.spanS = 2; this.periodS = 5e-4;
-    this.held = false; this.inSpectrum = false; this.trigger = null;
+    this.held = false; this.inSpectrum = false; this.trigger = null; this.events = []; this.end = null;
     new ResizeObserver(() => this.plot?.setSize(this.size())).observe(place);
   }
 
@@ -37,13 +37,13 @@ export class Scope {
     }));
     const scales = this.inSpectrum ? { x: { time: false, distr: 3 }, y: { distr: 3 } } : { x: { time: false } };
     this.plot?.destroy();
-    this.plot = new window.uPlot({ ...this.size(), series, axes, scales, cursor: { drag: { x: true, y: true } } }, this.data(), this.place);
+    this.plot = new window.uPlot({ ...this.size(), series, axes, scales, cursor: { drag: { x: true, y: true } }, hooks: { draw: [(plot) => this.markers(plot)] } }, this.data(), this.place);
   }
 
   data() {
     const { history } = this, shown = SHOWN[this.what];
     const count = Math.min(Math.round(this.spanS / this.periodS), history.rows - 1);
-    let end = history.end - 1;
+    let end = this.end ?? history.end - 1;
     if (this.trigger) {
       const at = history.trigger(this.trigger.axis, this.trigger.level, end - Math.floor(count / 2));
       if (at >= 0) end = at + Math.floor(count / 2);
@@ -80,6 +80,23 @@ export class Scope {
       return density;
     }));
     return [hz, ...lines];
+  }
+
+  /** Events of a recording: a line each, with its words, as far as there is room. */
+  markers(plot) {
+    if (this.inSpectrum || !this.events.length) return;
+    const css = getComputedStyle(document.documentElement), { left, top, width, height } = plot.bbox, g = plot.ctx;
+    let free = -Infinity;
+    g.save();
+    g.font = `${11 * devicePixelRatio}px system-ui`;
+    for (const { tick, kind, words } of this.events) {
+      const x = plot.valToPos((tick - this.history.tickOf(this.zero)) * this.periodS, "x", true);
+      if (!(x >= left && x <= left + width)) continue;
+      g.strokeStyle = g.fillStyle = css.getPropertyValue(kind === "fault" ? "--bad" : kind === "missed" ? "--warn" : "--soft");
+      g.beginPath(); g.moveTo(x, top); g.lineTo(x, top + height); g.stroke();
+      if (x > free) { const text = words.split(":")[0].slice(0, 40); g.fillText(text, x + 4, top + 12 * devicePixelRatio); free = x + g.measureText(text).width + 8; }
+    }
+    g.restore();
   }
 
   draw() { if (!this.held && this.plot) this.plot.setData(this.data(), true); }
