@@ -286,13 +286,14 @@ class Desk:
             if answer.state not in FINAL:
                 self._feeding = self._asked_for
             self._asked_for = None
-        verb, words = self._setting.heard(answer)
+        told = self._setting.heard(answer)
         if answer.state in FINAL:
             if self._feeding is not None and self._feeding.number == answer.id:
                 self._feeding = None
             if answer.id == self._jog_id:
                 self._jog_id = 0
-        self._tell(verb, answer.id, answer.state, words)
+        if told is not None:
+            self._tell(told[0], answer.id, answer.state, told[1])
 
     async def keep_fault(self) -> None:
         """Save what was around a fault, once that is over."""

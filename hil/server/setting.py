@@ -23,6 +23,7 @@ class Setting:
 
     def __init__(self, link: Link, planner: Planner, store: SettingsStore, changed: Callable[[], object]) -> None:
         self._link, self._planner, self._store, self._changed = link, planner, store, changed
+        self._own: set[int] = set()  # commands of which nobody has to hear by themselves
         self._waiting: dict[int, tuple[str, str, str, StageSettings]] = {}  # by command: verb, who, what, then
 
     def told(self) -> dict[str, Any]:
@@ -73,11 +74,14 @@ class Setting:
         self._waiting[last] = (what, who, words, wanted)
         return last, words
 
-    def heard(self, answer: Answer) -> tuple[str, str]:
-        """What became of a command: by which verb it was asked for, and words."""
+    def heard(self, answer: Answer) -> tuple[str, str] | None:
+        """What became of a command: by which verb it was asked for, and words. None for what is nobody's business."""
         waiting = self._waiting.get(answer.id)
+        is_own = answer.id in self._own
+        if answer.state in FINAL:
+            self._own.discard(answer.id)
         if waiting is None:
-            return answer.verb, answer.words
+            return None if is_own else (answer.verb, answer.words)
         if answer.state in FINAL:
             del self._waiting[answer.id]
         verb, who, words, wanted = waiting
@@ -103,9 +107,10 @@ class Setting:
     def _tell_loop(self, settings: StageSettings) -> int:
         """All of it, the frame last; returns the id of that command."""
         link = self._link
-        link.command(Verb.LIMITS, link.next_id(), **settings.limits.model_dump())
-        link.command(Verb.SETTLE, link.next_id(), **settings.settle.model_dump())
-        last = link.next_id()
+        limits, settle, last = (link.next_id() for _ in range(3))
+        self._own |= {limits, settle, last}
+        link.command(Verb.LIMITS, limits, **settings.limits.model_dump())
+        link.command(Verb.SETTLE, settle, **settings.settle.model_dump())
         link.command(Verb.FRAME, last, matrix=settings.frame.matrix())
         return last
 

@@ -29,8 +29,8 @@ def activity(browser: Browser, *wanted: str, timeout_s: float = 60.0) -> None:
     browser.until(f"{names}.includes(document.querySelector('.state').dataset.activity)", timeout_s)
 
 
-def logged(browser: Browser, words: str) -> None:
-    browser.until(f"document.querySelector('#log').innerText.includes({json.dumps(words)})")
+def logged(browser: Browser, words: str, timeout_s: float = 30.0) -> None:
+    browser.until(f"document.querySelector('#log').innerText.includes({json.dumps(words)})", timeout_s)
 
 
 def fill(browser: Browser, selector: str, value: str) -> None:
@@ -113,7 +113,7 @@ def set_up(browser: Browser, pictures: Path) -> None:
     logged(browser, "settle done: settle window: settings ")
     fill(browser, "#law-form [name=law]", "lqg")
     browser.click("#law-form button:not([type])")
-    logged(browser, "law done: the law is lqg")
+    logged(browser, "law done: the law is lqg", timeout_s=120)  # it is designed, on a busy machine
     assert "stage.change_law(" in browser.text("#as-python")
     fill(browser, "#frame [name=origin_z]", "19")
     fill(browser, "#frame [name=rotation]", "30")
