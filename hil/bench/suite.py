@@ -6,7 +6,21 @@ from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import Any
 
-from hil.bench import beside, control, lanes, learning, limits, margins, parts, plant, quality, startup, study, tick
+from hil.bench import (
+    beside,
+    control,
+    lanes,
+    learning,
+    limits,
+    margins,
+    operate,
+    parts,
+    plant,
+    quality,
+    startup,
+    study,
+    tick,
+)
 from hil.bench.figure import Figure
 from hil.runs.versions import versions
 from pkxyz_ctrl.config.files import ConfigError
@@ -35,6 +49,7 @@ MEASUREMENTS: dict[str, Measurement] = {
     "wire": parts.wire,
     "bus": limits.bus_cycle,
     "limits": limits.limits,
+    "operate": operate.operate,
 }
 """A measurement's name is what its figures' names begin with."""
 
