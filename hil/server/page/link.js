@@ -22,7 +22,7 @@ export class Link {
       if (data instanceof ArrayBuffer) return this.on.block(unpacked(data));
       for (const [kind, value] of Object.entries(JSON.parse(data))) this.on[kind]?.(value);
     };
-    this.socket.onclose = () => { this.on.gone(); setTimeout(() => this.open(), 1000); };
+    this.socket.onclose = ({ code, reason }) => { this.on.gone(`${code} ${reason}`.trim()); setTimeout(() => this.open(), 1000); };
   }
 
   say(message) {

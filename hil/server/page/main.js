@@ -48,7 +48,7 @@ const link = new Link({
     at("scan-words").textContent = `${value.duration_s.toFixed(2)} s; from (${um(value.low_m)}) to (${um(value.high_m)}) um; the combs can follow`;
   },
   body(value) { plane.body = value; },
-  gone() { mine = held = false; history.clear(); endJog(); showControl(); at("words").textContent = "no connection to the server"; document.querySelector(".state").dataset.activity = "gone"; },
+  gone(why) { if (mine) log("connection", why, "aborted"); mine = held = false; history.clear(); endJog(); showControl(); at("words").textContent = "no connection to the server"; document.querySelector(".state").dataset.activity = "gone"; },
 });
 
 function bodyOf() { link.say({ do: "body" }); }
