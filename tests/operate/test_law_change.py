@@ -75,12 +75,12 @@ def test_what_holds_is_changed_and_nothing_else():
         assert "did not come" in rig.words_of(command)
         rig.give(Verb.MOVE, target_m=(3e-6, NAN, NAN))
         yield from rig.wait_s(0.004)
-        yield from refused("lqg", "while the stage holds or is off, and it is MOVING")
+        yield from refused("lqg", "MOVE (command 9) is running: wait for it, or abort it first")
         yield from rig.wait_s(0.05)
         number = rig.give(Verb.PATH, path=7, rows=len(path), start_m=start)
         rig.every_tick.append(lambda: rig.session.wants_rows and feed())
         yield from rig.wait_s(0.08)
-        yield from refused("lqg", "and it is SCANNING")
+        yield from refused("lqg", "is running: wait for it")
         yield from rig.do(Verb.ABORT)
         assert rig.state_of(number) is State.ABORTED
         assert (yield from rig.do(Verb.LAW, law=offered(rig, "lqg"))) is State.DONE
