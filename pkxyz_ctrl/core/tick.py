@@ -105,6 +105,7 @@ MEMORY = np.dtype(
         ("solver_iterations", "i4"),  # of this tick's plan; 0 without one, negative if it was not used
         ("count", "i4", (DELAY_MAX + 1, 3)),  # counts commanded, newest first
         ("carry_v", "f8", (3,)),
+        ("error_v", "f8", (2, 3)),  # of the voltages of the last two ticks, by rounding
         ("demand_n", "f8", (3,)),
         ("slack_n", "f8", (3,)),
         ("force_n", "f8", (3,)),
@@ -200,6 +201,7 @@ def act(law: np.void, memory: np.void, now: Array, after: Array, later: Array) -
     lower, upper = scratch["lower_n"], scratch["upper_n"]
     memory["active_set_steps"] = allocation.allocate(j, inverse, demand, lower, upper, force, scratch["allocation"])
     voltage.counts_for_forces(drive, force, count[1], memory["carry_v"], count[0])
+    voltage.shape(drive, memory["carry_v"], memory["error_v"])
     multiply3_transposed(j, force, applied)
     for i in range(3):
         memory["slack_n"][i] = demand[i] - applied[i]
@@ -238,6 +240,8 @@ def release(law: np.void, memory: np.void) -> None:
     for i in range(3):
         memory["count"][0, i] = 0
         memory["carry_v"][i] = 0.0
+        memory["error_v"][0, i] = 0.0
+        memory["error_v"][1, i] = 0.0
         memory["demand_n"][i] = 0.0
         memory["slack_n"][i] = 0.0
         memory["force_n"][i] = 0.0

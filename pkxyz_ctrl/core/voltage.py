@@ -1,8 +1,9 @@
-"""Comb forces to amplifier counts: limits, the square-root law and first-order noise shaping, compiled.
+"""Comb forces to amplifier counts: limits, the square-root law and noise shaping, compiled.
 
 F = G V^2 (Eq. 33), each comb with its own G; V = scale x count. What a count cannot express is carried into the next
-tick, so the quantisation error of the voltage is pushed to high frequency, where the stage does not follow: its
-spectrum gains the factor |1 - z^-1|.
+ticks, so the quantisation error of the voltage is pushed to high frequency, where the stage does not follow: its
+spectrum gains the factor |1 - s_1 z^-1 - s_2 z^-2 - s_3 z^-3|. With (1, 0, 0) that is |1 - z^-1|, which a held voltage
+makes a tone of, and a mode of little damping may lie on it; with zeros at 0 Hz and at the modes nothing drives these.
 """
 
 import math
@@ -21,6 +22,7 @@ DRIVE = np.dtype(
         ("count_max", "i4"),
         ("count_slew_max", "i4"),  # most that a count may change in one tick
         ("noise_shaping", "i4"),  # 1: carry the quantisation error
+        ("shaping", "f8", (3,)),  # s_1, s_2, s_3
     ],
     align=True,
 )
@@ -46,7 +48,8 @@ def force_limits(drive: np.void, count_last: CountVector, lower_n: Array, upper_
 def counts_for_forces(
     drive: np.void, force_n: Array, count_last: CountVector, carry_v: Array, count: CountVector
 ) -> None:
-    """The counts (3,) for forces >= 0; ``carry_v`` (3,) holds the error from tick to tick, at most one count of it.
+    """The counts (3,) for forces >= 0; ``carry_v`` (3,) is added to them, and is their error afterwards, at most one
+    count of it.
 
     Whatever the forces are (NaN and infinity too), every count stays within 0..count_max and within the slew limit of
     the last one.
@@ -61,6 +64,18 @@ def counts_for_forces(
         nearest = np.int32(wanted / scale + 0.5) if wanted < scale * (high + 1) else high  # 0 for the least: -0.5
         count[i] = min(max(nearest, low), high)
         carry_v[i] = min(max(wanted - scale * count[i], -scale), scale)
+
+
+@njit(cache=True, error_model="numpy")
+def shape(drive: np.void, carry_v: Array, error_v: Array) -> None:
+    """What is to be carried into the next tick, in the place of this tick's error (3,); ``error_v`` (2,3) are those of
+    the last two."""
+    shaping = drive["shaping"]
+    for i in range(3):
+        error = carry_v[i]
+        carry_v[i] = shaping[0] * error + shaping[1] * error_v[0, i] + shaping[2] * error_v[1, i]
+        error_v[1, i] = error_v[0, i]
+        error_v[0, i] = error
 
 
 @njit(cache=True, error_model="numpy")

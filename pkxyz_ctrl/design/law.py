@@ -20,6 +20,7 @@ from pkxyz_ctrl.design.laws.regulator import cost_to_go, regulator_gain
 from pkxyz_ctrl.design.model.discrete_law import LawError
 from pkxyz_ctrl.design.model.loop_plant import held_force_softening, loop_plant
 from pkxyz_ctrl.design.model.plant_model import LinearStage, SampledStage, linearise, sample
+from pkxyz_ctrl.design.noise_shaping import FIRST_ORDER, shaping_between_modes
 from pkxyz_ctrl.loop import cycle
 from pkxyz_ctrl.stage import Stage
 
@@ -29,8 +30,11 @@ KINDS = {"open_loop": OPEN_LOOP, "lqg": STATE_FEEDBACK, "youla": STATE_FEEDBACK,
 """What the tick calls the laws that are not linear ones."""
 RECORDED = ("lqg", "mpc")
 """Laws that keep the bits of their recordings: a filter with K_0 alone, and the ripple of the smooth feed-forward."""
-LANDING_TICKS_LEAST = 10
-"""A way down in fewer steps would shake the stage."""
+LANDING_TICKS_LEAST = 12
+"""A way down in fewer steps shakes the stage: at 1 kHz under lqg 147 of 268 stops of a circle's sampled devices met
+their ends with 5, and 5 of 247 with 10. With 12 one does, on a device that lqg holds there with an Ms of 5. In 16 the
+speed of the circle carries it there: 142.
+"""
 
 
 def design_law(stage: Stage, controller: ControllerConfig, bus: BusConfig, *, autostart: bool) -> NDArray[np.void]:
@@ -47,7 +51,7 @@ def design_law(stage: Stage, controller: ControllerConfig, bus: BusConfig, *, au
     _fill_estimator(law["tick"]["estimator"], stage, controller, bus, model, sampled)
     _fill_feedback(law["tick"]["feedback"], stage, controller, bus, model, sampled)
     _fill_set_points(law["tick"]["set_points"], controller, sampled)
-    _fill_drive(law["tick"]["drive"], stage, controller, bus)
+    _fill_drive(law["tick"]["drive"], stage, controller, bus, model)
     fill_adaptation(law["tick"], stage, controller, bus, model, sampled)
     _fill_monitors(law["limits"], controller, bus)
     if controller.law in KINDS:
@@ -188,12 +192,14 @@ def _fill_predictive(law: Any, mpc: Mpc, regulator: RegulatorConfig) -> None:
         record[name] = value
 
 
-def _fill_drive(law: Any, stage: Stage, controller: ControllerConfig, bus: BusConfig) -> None:
+def _fill_drive(law: Any, stage: Stage, controller: ControllerConfig, bus: BusConfig, model: LinearStage) -> None:
     law["force_gain_n_per_v2"] = stage.force_gain_n_per_v2
     law["volt_per_count"] = bus.analog.drive_volt_per_count
     law["count_max"] = count_max(stage, controller, bus)
     law["count_slew_max"] = slew_counts(controller, bus)
     law["noise_shaping"] = controller.limits.noise_shaping
+    open_loop = controller.law == "open_loop"  # with feedback, sense noise leaves no tones, and less noise is better
+    law["shaping"] = shaping_between_modes(model, bus.period_s) if open_loop else FIRST_ORDER
 
 
 def _fill_monitors(limits: Any, controller: ControllerConfig, bus: BusConfig) -> None:

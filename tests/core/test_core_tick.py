@@ -78,12 +78,12 @@ def test_rest_and_release_are_0_v_and_the_history_moves_on():
     """``rest`` is a tick, ``release`` takes back the tick that was: the counts before it stay where they are."""
     law, memory = tick_law(), new_tick_memory()
     memory["count"][:] = [[30, 31, 32], [20, 21, 22], [10, 11, 12]]
-    for name in ("carry_v", "demand_n", "slack_n", "force_n"):
+    for name in ("carry_v", "error_v", "demand_n", "slack_n", "force_n"):
         memory[name][:] = 1.0
     memory["feedforward_known"] = memory["active_set_steps"] = 1
     tick.rest(law, memory)
     assert memory["count"].tolist() == [[0, 0, 0], [30, 31, 32], [20, 21, 22]]
-    assert not any(memory[name].any() for name in ("carry_v", "demand_n", "slack_n", "force_n"))
+    assert not any(memory[name].any() for name in ("carry_v", "error_v", "demand_n", "slack_n", "force_n"))
     assert memory["feedforward_known"] == memory["active_set_steps"] == 0
     memory["count"][0] = 5
     tick.release(law, memory)

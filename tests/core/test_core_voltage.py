@@ -4,10 +4,12 @@ import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
-from loop_rig import tick_law
+from loop_rig import MIDDLE, stage, tick_law
 from scipy import signal
 
-from pkxyz_ctrl.core.voltage import counts_for_forces, force_limits, forces_of_counts
+from pkxyz_ctrl.core.voltage import counts_for_forces, force_limits, forces_of_counts, shape
+from pkxyz_ctrl.design.model.plant_model import linearise
+from pkxyz_ctrl.design.noise_shaping import shaping_between_modes
 
 MOST = 32767
 HOSTILE = st.one_of(
@@ -176,3 +178,42 @@ def test_the_carry_does_not_wind_up_at_a_limit():
         last = convert(drive, low, last, carry)
         assert np.abs(last - 8_000).max() <= 1
     assert last.tolist() == [8_000] * 3
+
+
+# -- shaping with zeros at the stage's modes ---------------------------------------------------------------------------
+
+
+def held(shaping, count, ticks=1 << 14):
+    """Voltage error in counts (ticks, 3) of a voltage that is held between counts."""
+    drive, carry, errors, last = drive_with(), np.zeros(3), np.zeros((2, 3)), np.round(count).astype(np.int32)
+    drive["shaping"] = shaping
+    force, found = drive["force_gain_n_per_v2"] * (count * drive["volt_per_count"]) ** 2, np.zeros((ticks, 3))
+    for k in range(ticks):
+        last = convert(drive, force, last, carry)
+        shape(drive, carry, errors)
+        found[k] = last - count
+    return found
+
+
+def test_shaping_of_first_order_is_the_carry_itself_and_tones_are_its_price():
+    error = held((1.0, 0.0, 0.0), np.full(3, 20_000.128))
+    assert np.abs(np.cumsum(error, axis=0)).max() <= 0.5 + 1e-6
+    power = np.abs(np.fft.rfft(error[:, 0])) ** 2
+    assert np.sort(power)[-4:].sum() > 0.3 * power.sum()  # at 0.128 of the rate and its multiples: 640 Hz of 5 kHz
+
+
+@pytest.mark.parametrize("fraction", [0.128, 0.25, 0.5, 0.731])
+def test_between_the_modes_the_error_has_a_zero_and_is_no_tone(fraction):
+    """631 and 808 Hz are the lowest and the highest mode of the stage in the middle of its workspace."""
+    shaping = shaping_between_modes(linearise(stage(), MIDDLE), 200e-6)
+    error = held(shaping, 20_000 + np.array([fraction, fraction / 3, 0.9 * fraction]))
+    f, density = signal.welch(error[64:], fs=5000.0, nperseg=2048, axis=0, detrend=False)
+    z = np.exp(2j * np.pi * f / 5000.0)
+    shape = np.abs(1 - shaping[0] / z - shaping[1] / z**2 - shaping[2] / z**3) ** 2
+    for low, high in ((100, 300), (600, 850), (1200, 1600), (2000, 2400)):
+        band = (f >= low) & (f < high)
+        assert 0.5 < density[band].mean() / (WHITE / 5000.0 * shape[band].mean()) < 2.0
+    modes = (f >= 600) & (f < 850)
+    assert density[modes].mean() < 0.05 * WHITE / 5000.0  # of first order it would be 0.7
+    assert np.abs(error.mean(axis=0)).max() < 1e-3
+    assert np.abs(error).max() < 4.0
