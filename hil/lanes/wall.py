@@ -24,7 +24,7 @@ from pkxyz_ctrl.loop.reference import standing_still
 from pkxyz_ctrl.loop.row import TRUTH_FIELDS
 from pkxyz_ctrl.loop.runtime import Reference, run, start
 from pkxyz_ctrl.safety.gate import GateConfig
-from pkxyz_ctrl.safety.modes import Mode
+from pkxyz_ctrl.safety.modes import LOOP_CLOSED, Event, Mode
 
 COMPANY_S = 30.0
 """For which an empty bus is given time."""
@@ -32,6 +32,7 @@ _LOOK_S = 0.02
 _GUARDS_PER_PERIOD = 8
 _SILENT_US = 500_000  # after a fault, for so long without its heartbeat, the amplifier is gone
 _NO_END = 1 << 60  # ticks
+_LANDED_TICKS = 2  # that begin and end a way down
 _LAST_FRAMES_S = 0.02  # 0 V and pre-operational leave even a slow adapter before it is closed
 
 
@@ -126,7 +127,7 @@ class WallRig:
             latest_start_us=can_config.sense_deadline_us // 2,
             guard_us=self._guard_us,
             late_frames=self._take_late_frames,
-            leave=ending.check,
+            leave=self._leave,
         )
         self._started = False
 
@@ -165,32 +166,30 @@ class WallRig:
             say(f"this amplifier lacks a protection: {lacking}")
 
     def run(self) -> None:
-        """Run all ticks of an amplifier that is started. Raises ``AmplifierGoneError`` and ``Ended``."""
+        """Run all ticks of an amplifier that is started, and lead the stage down. Raises ``AmplifierGoneError`` and
+        ``Ended``.
+        """
         row, take = self.controller.row, self._recorder.row
         live, memory = self.live, self.controller.memory
-        setup = self.setup
+        setup, last = self.setup, self.setup.ticks - 1
         streamed = StreamedReference(setup.trajectory, setup.bus.period_us, memory, setup.excitation)
 
+        prepare = streamed.prepare if live is None else lambda: live.after(memory)
         controller, fault = self.controller, int(Mode.FAULT)
+        ticks = setup.ticks + int(setup.law["landing_ticks"][0]) + _LANDED_TICKS
 
         def record(tick: int) -> None:
-            take(row)
-            streamed.prepare()
+            if tick <= last:
+                take(row)
+                prepare()
+            if tick == last and LOOP_CLOSED[controller.mode]:
+                controller.request(Event.DISABLE)
             if controller.mode == fault:
                 self._require_amplifier()
 
-        def record_and_learn(tick: int) -> None:
-            take(row)
-            if live is not None:
-                live.after(memory)
-            if controller.mode == fault:
-                self._require_amplifier()
-
-        if live is None:
-            run(self.ticks, self.port, self.controller, streamed, self.setup.ticks, record)
-        else:
-            rows = live.rows
-            run(self.ticks, self.port, self.controller, lambda tick: rows, self.setup.ticks, record_and_learn)
+        rows = None if live is None else live.rows
+        reference: Reference = streamed if rows is None else lambda tick: rows
+        run(self.ticks, self.port, controller, reference, ticks, record)
 
     def operate(self, reference: Reference, after: Callable[[int], object]) -> None:
         """Run until somebody ends it: set-points are handed in, and ``after`` is called after each tick. Raises
@@ -207,6 +206,14 @@ class WallRig:
                 time.sleep(_LAST_FRAMES_S)
         finally:
             self._bus.shutdown()
+
+    def _leave(self) -> None:
+        """Between two ticks: raise ``Ended`` if somebody asked for the end, once the stage has been led down."""
+        mode = self.controller.mode
+        if self._ending.signal_number and LOOP_CLOSED[mode]:
+            self.controller.request(Event.DISABLE)
+        elif mode != Mode.LANDING:
+            self._ending.check()
 
     def _require_amplifier(self) -> None:
         if self.clock.now_us - self.port.heartbeat_us > _SILENT_US:

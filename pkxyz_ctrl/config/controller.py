@@ -14,6 +14,7 @@ from pkxyz_ctrl.safety.thresholds import (
     INNOVATION_MEMORY_S,
     INNOVATION_SHARE_M_PER_N,
     RESIDUAL_MAX_M,
+    SATURATION_SLACK_N,
     UNEXPLAINED_FORCE_MAX_N,
 )
 
@@ -83,6 +84,8 @@ class MonitorConfig(FrozenModel):
     """Most that what a force is off may change: so much, and this share of the change that was commanded."""
     force_trend_s: Positive = FORCE_TREND_S
     """Changes are counted from a mean over so long."""
+    saturation_slack_n: Annotated[float, Field(ge=0)] = SATURATION_SLACK_N
+    """Least force that is withheld by the limits for a tick to count as saturated."""
     stale_count: int
     sequence_count: int
     crc_count: int

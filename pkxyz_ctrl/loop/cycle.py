@@ -299,7 +299,8 @@ def _monitor(law: np.void, memory: np.void, saturated: int) -> int:
     seen, state, obs = memory["input"], memory["tick"], memory["observation"]
     obs["mode"], obs["sense_status"] = memory["mode"], seen["sense_status"]
     obs["node_events"], obs["overrun"] = seen["node_events"], seen["overrun"]
-    obs["saturated"] = saturated
+    slack_n = max(abs(state["slack_n"][0]), abs(state["slack_n"][1]), abs(state["slack_n"][2]))
+    obs["saturated"] = 1 if saturated != 0 and not slack_n < law["limits"]["saturation_slack_n"] else 0
     obs["solver_ok"] = 0 if law["tick"]["kind"] == demand.PREDICTIVE and state["plan_known"] == 0 else 1
     obs["finite"] = 1 if tick.is_finite(state) else 0
     obs["implausible_combs"] = memory["suspects"]

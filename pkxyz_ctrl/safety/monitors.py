@@ -58,6 +58,7 @@ LIMITS: Final = np.dtype(
         ("force_change_max_n", "f8"),  # of the unexplained force about its trend ...
         ("force_change_share", "f8"),  # ... and this much of the change of the commanded force
         ("force_trend_share", "f8"),  # of its way that a trend goes in a tick
+        ("saturation_slack_n", "f8"),  # least force withheld that counts
         ("voltage_step_max_v", "f8"),
         ("sense_count_min", "i4"),  # at or below is at the rail
         ("sense_count_max", "i4"),  # at or above is at the rail

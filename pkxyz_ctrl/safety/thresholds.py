@@ -28,6 +28,10 @@ UNEXPLAINED_FORCE_MAX_N: Final = 0.8e-3
 third more than the model says: at the end of the stroke all of the 2.55 mN that 200 V give, of which a quarter,
 0.64 mN, is not explained (measured: 0.65). ``harsh`` shows 0.26. A comb that is dead in mid-workspace lacks 1.1 mN."""
 
+SATURATION_SLACK_N: Final = 50e-9
+"""Least force that the limits have to withhold for a tick to count as saturated. At rest the combs have no force to
+take away, and what the law would push with there, for a tenth of a nanometre, is 8 nN."""
+
 FORCE_TREND_S: Final = 0.03
 """What changes more slowly than this is the business of ``UNEXPLAINED_FORCE_MAX_N``. Longer, and what is left of the
 way into a scan hides what happens in it."""

@@ -1,6 +1,6 @@
 """Sampled devices that are stopped in the middle of a scan: how often they meet their stops.
 
-python tests/loop/stopped.py circle youla 500
+python tests/loop/stopped.py circle youla 500 [unix_1k]
 """
 
 import dataclasses
@@ -27,20 +27,22 @@ SPREAD_S, AFTER_S = 0.015, 0.02
 
 
 @cache
-def study(scenario: str, law: str) -> Study:
-    return Study(load_scenario(scenario, controller=law), load("tolerances", "wide", Tolerances))
+def study(scenario: str, law: str, bus: str) -> Study:
+    return Study(load_scenario(scenario, controller=law, bus=bus), load("tolerances", "wide", Tolerances))
 
 
 @cache
-def designed(scenario: str, law: str) -> Setup:
-    return study(scenario, law).scenario.setup()
+def designed(scenario: str, law: str, bus: str) -> Setup:
+    return study(scenario, law, bus).scenario.setup()
 
 
-def stopped(scenario: str, law: str, seed: int, trip: Trip, instants: int = 4) -> list[tuple[int, float]]:
+def stopped(
+    scenario: str, law: str, seed: int, trip: Trip, instants: int = 4, bus: str = "fd_5k"
+) -> list[tuple[int, float]]:
     """Of each stop its hits and the lowest stroke in m; none where the device faults before."""
-    base = designed(scenario, law)
+    base = designed(scenario, law, bus)
     period_us = base.bus.period_us
-    setup = dataclasses.replace(base, plant=study(scenario, law).sampled(seed).plant, seed=seed)
+    setup = dataclasses.replace(base, plant=study(scenario, law, bus).sampled(seed).plant, seed=seed)
     segment = next(s for s in base.trajectory.segments if s.scan_us or s.jumps_us)
     begin = (segment.t_start_us + 40_000) // period_us
     at = np.linspace(begin, begin + round(SPREAD_S * 1e6) // period_us, instants).astype(int)
@@ -68,13 +70,13 @@ def stopped(scenario: str, law: str, seed: int, trip: Trip, instants: int = 4) -
     return found
 
 
-def main(scenario: str, law: str, devices: int) -> None:
+def main(scenario: str, law: str, devices: int, bus: str = "fd_5k") -> None:
     for trip in (Trip.OPERATOR, Trip.GATE_BLOCKED):
-        found = [stop for seed in range(devices) for stop in stopped(scenario, law, seed, trip, 8)]
+        found = [stop for seed in range(devices) for stop in stopped(scenario, law, seed, trip, 8, bus)]
         with_hits = sum(hits > 0 for hits, _ in found)
         lowest_um = min(low for _, low in found) * 1e6
         print(f"{trip.name}: {len(found)} stops, {with_hits} meet a mechanical stop, lowest stroke {lowest_um:.2f} um")
 
 
 if __name__ == "__main__":
-    main(sys.argv[1], sys.argv[2], int(sys.argv[3]))
+    main(sys.argv[1], sys.argv[2], int(sys.argv[3]), *sys.argv[4:])

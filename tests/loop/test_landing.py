@@ -2,7 +2,7 @@
 
 import numpy as np
 import pytest
-from cycle_rig import AT_REST, in_the_middle, noisy
+from cycle_rig import AT_REST, in_the_middle, noisy, tracking
 from loop_rig import MIDDLE, Cycle, counts_at
 from stopped import stopped
 
@@ -88,6 +88,16 @@ def test_nothing_that_is_asked_for_stops_or_prolongs_the_way_down(event):
     assert c.memory["homed"][0] == 1
 
 
+@pytest.mark.parametrize(("off_m", "stays"), [(0.1e-9, True), (20e-9, False)])
+def test_a_push_that_nobody_would_notice_is_no_saturation(off_m, stays):
+    """Where a move was stopped just before rest, a tenth of a nanometre beside it: combs can't push, and need not."""
+    c = tracking(np.tile(np.r_[0.0, off_m, np.zeros(7)], (16, 1)))
+    rows = [c.tick(noisy(AT_REST, k)) for k in range(400)]
+    assert rows[300]["saturated"] == 1 or not stays
+    assert (c.mode is Mode.TRACKING) == stays
+    assert any(r["trips"] & Trip.SATURATION for r in rows) != stays
+
+
 def test_what_is_measured_on_the_way_down_reaches_no_voltage():
     c, wild = in_the_middle(), in_the_middle()
     for one in (c, wild):
@@ -130,6 +140,15 @@ def test_no_sampled_device_meets_its_stops_when_it_is_led_down(scenario, law):
     hits = [hits for seed in range(3) for hits, _ in stopped(scenario, law, seed, Trip.OPERATOR)]
     assert max(hits) == 0
     assert -0.6e-6 < min(lowest) < 0.0
+
+
+@pytest.mark.parametrize(("bus", "law"), [("unix_1k", "lqg"), ("unix_1k", "youla"), ("unix_2k", "lqg")])
+def test_a_slow_bus_has_steps_enough_for_the_way_down(bus, law):
+    """A millisecond each, and the stage's modes are above half the rate: 5 steps shook more than half of them."""
+    found = [stop for seed in range(8) for stop in stopped("circle", law, seed, Trip.OPERATOR, 4, bus)]
+    assert len(found) >= 24
+    assert max(hits for hits, _ in found) == 0
+    assert -1.5e-6 < min(low for _, low in found) < 0.0
 
 
 def test_at_once_they_do():
