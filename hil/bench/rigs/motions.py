@@ -29,7 +29,6 @@ class Run(NamedTuple):
     segments: tuple[TimedSegment, ...]
     """those that were asked for"""
     period_us: int
-    faults: tuple[str, ...]
 
     def during(self, window_us: tuple[int, int]) -> NDArray[np.void]:
         """Rows of [begin, end) in us of the trajectory."""
@@ -63,13 +62,17 @@ def setup_of(segments: list[Any], controller: str, plant: str, height_m: float) 
 def run(segments: list[Any], controller: str = "lqg", plant: str = "nominal", height_m: float = MIDDLE_M) -> Run:
     """Move to a height on the axis and go through ``segments`` there. Raises ``ConfigError`` where that faults."""
     setup, first = setup_of(segments, controller, plant, height_m)
+    return Run(rows_of_setup(setup), setup.trajectory.segments[first:], setup.bus.period_us)
+
+
+def rows_of_setup(setup: Setup) -> NDArray[np.void]:
+    """Rows of a run while it tracks. Raises ``ConfigError`` where it faults."""
     blocks: list[NDArray[np.void]] = []
     result = lanes.run(setup, Lane.FAST, on_block=lambda block: blocks.append(block.copy()))
-    rows = np.concatenate(blocks)
-    rows = rows[rows["reference_tick"] >= 0]
     if result.faults:
-        raise ConfigError(f"{controller} on {plant}: {result.faults[0]}")
-    return Run(rows, setup.trajectory.segments[first:], setup.bus.period_us, result.faults)
+        raise ConfigError(f"{setup.controller.name} on {setup.plant.name}: {result.faults[0]}")
+    rows = np.concatenate(blocks)
+    return np.asarray(rows[rows["reference_tick"] >= 0])
 
 
 def error_m(rows: NDArray[np.void]) -> NDArray[np.float64]:

@@ -48,6 +48,8 @@ class TapBounds(FrozenModel):
     """|S| stays below half the power up to here, as drawn ..."""
     slope: Annotated[float, Field(ge=0, le=1)]
     """... and falls below with this power of the frequency"""
+    reject_db: tuple[tuple[Positive, Positive], ...] = ()
+    """besides, as drawn: [frequency in Hz, by how many dB a disturbance there is weaker than without feedback]"""
     peak_s_max: Annotated[float, Field(gt=1)]
     disk_margin_min: Annotated[float, Field(gt=0, lt=2)]
     effort_max: Positive
@@ -140,7 +142,8 @@ def _axis_taps(
         _shaken(model, asked, bus.period_s, axis),
     )
     bounds = Bounds(
-        asked.edge_hz, _EDGE, asked.slope, asked.peak_s_max, asked.disk_margin_min, asked.effort_max
+        asked.edge_hz, _EDGE, asked.slope, asked.peak_s_max, asked.disk_margin_min, asked.effort_max,
+        tuple((hz, 10.0 ** (-0.05 * db)) for hz, db in asked.reject_db),
     )  # fmt: skip
     return youla_taps(
         loop(Case("as drawn", middle, NOMINAL), asked.peak_s_max), changed, bounds, noise, search.taps, on_progress

@@ -53,6 +53,8 @@ class Bounds:
     disk_margin: float
     effort: float
     """|K S| over the stage's stiffness, as drawn: a mode that folds back from beyond the model meets this gain"""
+    below: tuple[tuple[float, float], ...] = ()
+    """(Hz, |S|) besides, as drawn: lines that have to be rejected further"""
 
 
 @dataclass(frozen=True)
@@ -211,6 +213,10 @@ def _ask_as_drawn(cones: "_Cones", drawn: InnovationLoop, f: Array, bounds: Boun
     (s, by_tap), _ = drawn.fraction(f, cones.taps)
     below = np.where(f <= bounds.edge_hz, bounds.edge * (f / bounds.edge_hz) ** bounds.slope, math.inf)
     cones.add(np.minimum(below, bounds.peak_s), None, s, by_tap)
+    if bounds.below:
+        hz, most = np.array(bounds.below).T
+        (at, at_by_tap), _ = drawn.fraction(hz, cones.taps)
+        cones.add(most, None, at, at_by_tap)
     cones.add(np.full(len(f), 1.0 / bounds.disk_margin), None, s - 0.5, by_tap)
     h, late = drawn.transfers(f), delays(f, drawn.period_s, cones.taps)
     k = drawn.stiffness_n_per_m

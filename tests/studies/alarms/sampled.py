@@ -13,6 +13,7 @@ from functools import cache
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 from test_false_alarms import circles, corner_to_corner
 
 from hil.lanes import in_process
@@ -23,6 +24,7 @@ from hil.studies.margins.loop import Loop
 from hil.studies.montecarlo import Study
 from pkxyz_ctrl.config.files import ConfigError, load
 from pkxyz_ctrl.design.margins.tolerances import Tolerances
+from pkxyz_ctrl.safety.modes import LOOP_CLOSED
 from pkxyz_ctrl.stage import Stage
 
 LAWS = (
@@ -32,6 +34,9 @@ SCENARIOS = (
     "raster", "steps", "circle", "lissajous", "path", "spiral", "sweep", "frames", "raster_mild", "raster_lab",
     "circle_lab", "raster_harsh", "frames_lab", "frames_harsh",
 )  # fmt: skip
+BEFORE_TICKS = 50
+STOP_M = 25e-6
+"""Of a slider, at either end of its stroke."""
 MOTIONS = {"moves": corner_to_corner, "circles": circles}
 """Beside the scenarios: 2 mm/s to every corner of the workspace, and circles of 4 um at 100 Hz at three heights."""
 
@@ -48,13 +53,25 @@ def designed(motion: str, law: str) -> tuple[Study, Setup]:
     return Study(scenario, load("tolerances", "wide", Tolerances)), setup
 
 
-def stopped(motion: str, law: str, seed: int) -> str | None:
-    """Why the device of a seed was stopped, None if it was not."""
+def stopped(motion: str, law: str, seed: int) -> tuple[str, bool] | None:
+    """Why the device of a seed was stopped, and whether it could not get where it was to be: it was at a stop of its
+    own, or its combs at their limits. None if it was not stopped.
+    """
     study, base = designed(motion, law)
     setup = dataclasses.replace(base, plant=study.sampled(seed).plant, seed=seed)
     vars(setup)["law"] = base.law
-    faults = in_process.run(setup, Lane.FAST, on_block=lambda block: None).faults
-    return faults[0] if faults else None
+    last: list[Any] = []
+
+    def on_block(block: Any) -> None:
+        driven = block[LOOP_CLOSED[block["mode"]] != 0]
+        last[:] = [driven[-BEFORE_TICKS:].copy()] if len(driven) else last
+
+    faults = in_process.run(setup, Lane.FAST, on_block=on_block).faults
+    if not faults:
+        return None
+    strokes = Stage(setup.stage).inverse_kinematics(last[0]["position_m"]) if last else np.zeros((1, 3))
+    at_limits = float(last[0]["saturated"].mean()) > 0.5 if last else False
+    return faults[0].splitlines()[0], bool(strokes.max() > STOP_M or strokes.min() < 0.0) or at_limits
 
 
 def is_stable(motion: str, law: str, seed: int) -> bool:
@@ -68,18 +85,23 @@ def is_stable(motion: str, law: str, seed: int) -> bool:
 
 
 def of_law(motion: str, law: str, devices: int) -> dict[str, Any]:
-    """How many were stopped, and why, and which of them have a stable loop: those are false alarms."""
-    found: dict[str, Any] = {"law": law, "motion": motion, "devices": devices, "stopped": {}, "false": []}
+    """How many were stopped, and why; which of them could not get there, and which have a stable loop and could: those
+    are false alarms.
+    """
+    found: dict[str, Any] = {"law": law, "motion": motion, "devices": devices, "stopped": {}, "beyond": [], "false": []}
     try:
         designed(motion, law)
     except ConfigError as error:
         return found | {"refused": str(error)}
     for seed in range(1, devices + 1):
         why = stopped(motion, law, seed)
-        if why is not None:
-            found["stopped"][seed] = why.splitlines()[0]
-            if is_stable(motion, law, seed):
-                found["false"].append(seed)
+        if why is None:
+            continue
+        found["stopped"][seed] = why[0]
+        if why[1]:
+            found["beyond"].append(seed)
+        elif is_stable(motion, law, seed):
+            found["false"].append(seed)
     return found
 
 
@@ -101,8 +123,8 @@ def main() -> None:
             with asked.results.open("a", encoding="utf-8") as file:
                 file.write(json.dumps(found) + "\n")
             print(
-                f"{law} in {motion}: {len(found['stopped'])} of {asked.devices} stopped, "
-                f"{len(found['false'])} of them with a stable loop {found['false'][:5]}", flush=True
+                f"{law} in {motion}: {len(found['stopped'])} of {asked.devices} stopped, {len(found['beyond'])} beyond "
+                f"what they reach, false alarms: {len(found['false'])} {found['false'][:5]}", flush=True
             )  # fmt: skip
 
 
