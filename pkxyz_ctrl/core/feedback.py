@@ -43,6 +43,15 @@ def jump(period_s: float, now: Array, after: Array, i: int) -> float:
 
 
 @njit(cache=True, error_model="numpy")
+def stands_still(here: Array, later: Array) -> bool:
+    """Whether the reference does, by two of its rows (9,)."""
+    still = True
+    for i in range(3):
+        still = still and here[i] == later[i] and here[3 + i] == 0.0 and later[3 + i] == 0.0
+    return still
+
+
+@njit(cache=True, error_model="numpy")
 def ahead(feedback: np.void, now: Array, after: Array, out: Array) -> None:
     """Reference row (9,) at ``lead_s`` past the row ``now``, on the quintic that joins it
     to the row ``after``, one period later.

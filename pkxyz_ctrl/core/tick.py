@@ -201,7 +201,7 @@ def act(law: np.void, memory: np.void, now: Array, after: Array, later: Array) -
     lower, upper = scratch["lower_n"], scratch["upper_n"]
     memory["active_set_steps"] = allocation.allocate(j, inverse, demand, lower, upper, force, scratch["allocation"])
     voltage.counts_for_forces(drive, force, count[1], memory["carry_v"], count[0])
-    voltage.shape(drive, memory["carry_v"], memory["error_v"])
+    voltage.shape(drive, feedback.stands_still(now, later), memory["carry_v"], memory["error_v"])
     multiply3_transposed(j, force, applied)
     for i in range(3):
         memory["slack_n"][i] = demand[i] - applied[i]

@@ -2,8 +2,8 @@
 
 F = G V^2 (Eq. 33), each comb with its own G; V = scale x count. What a count cannot express is carried into the next
 ticks, so the quantisation error of the voltage is pushed to high frequency, where the stage does not follow: its
-spectrum gains the factor |1 - s_1 z^-1 - s_2 z^-2 - s_3 z^-3|. With (1, 0, 0) that is |1 - z^-1|, which a held voltage
-makes a tone of, and a mode of little damping may lie on it; with zeros at 0 Hz and at the modes nothing drives these.
+spectrum gains the factor |1 - z^-1|. A voltage that stands still makes tones of it, and a mode of little damping may
+lie on one. Then the factor may be |1 - s_1 z^-1 - s_2 z^-2 - s_3 z^-3|, with zeros at 0 Hz and between the modes.
 """
 
 import math
@@ -22,7 +22,7 @@ DRIVE = np.dtype(
         ("count_max", "i4"),
         ("count_slew_max", "i4"),  # most that a count may change in one tick
         ("noise_shaping", "i4"),  # 1: carry the quantisation error
-        ("shaping", "f8", (3,)),  # s_1, s_2, s_3
+        ("shaping", "f8", (3,)),  # s_1, s_2, s_3 while the set-point stands still
     ],
     align=True,
 )
@@ -67,13 +67,14 @@ def counts_for_forces(
 
 
 @njit(cache=True, error_model="numpy")
-def shape(drive: np.void, carry_v: Array, error_v: Array) -> None:
+def shape(drive: np.void, stands_still: bool, carry_v: Array, error_v: Array) -> None:
     """What is to be carried into the next tick, in the place of this tick's error (3,); ``error_v`` (2,3) are those of
     the last two."""
     shaping = drive["shaping"]
     for i in range(3):
         error = carry_v[i]
-        carry_v[i] = shaping[0] * error + shaping[1] * error_v[0, i] + shaping[2] * error_v[1, i]
+        if stands_still:
+            carry_v[i] = shaping[0] * error + shaping[1] * error_v[0, i] + shaping[2] * error_v[1, i]
         error_v[1, i] = error_v[0, i]
         error_v[0, i] = error
 

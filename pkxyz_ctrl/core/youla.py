@@ -12,6 +12,8 @@ import numpy as np
 from numba import njit
 from numpy.typing import NDArray
 
+from pkxyz_ctrl.core.feedback import stands_still
+
 Array = NDArray[np.float64]
 
 TAPS_MAX = 40
@@ -40,9 +42,7 @@ YOULA_STATE = np.dtype(
 @njit(cache=True, error_model="numpy")
 def ask(state: np.void, wanted: bool, here: Array, later: Array) -> None:
     """Ask for a quiet hold, or no longer: only while the set-point stands still, by its rows (9,) here and later."""
-    for i in range(3):
-        wanted = wanted and here[i] == later[i] and here[3 + i] == 0.0 and later[3 + i] == 0.0
-    state["quiet"] = 1 if wanted else 0
+    state["quiet"] = 1 if wanted and stands_still(here, later) else 0
 
 
 @njit(cache=True, error_model="numpy")

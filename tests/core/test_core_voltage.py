@@ -190,9 +190,17 @@ def held(shaping, count, ticks=1 << 14):
     force, found = drive["force_gain_n_per_v2"] * (count * drive["volt_per_count"]) ** 2, np.zeros((ticks, 3))
     for k in range(ticks):
         last = convert(drive, force, last, carry)
-        shape(drive, carry, errors)
+        shape(drive, True, carry, errors)
         found[k] = last - count
     return found
+
+
+def test_while_the_voltages_move_the_shaping_is_of_first_order():
+    drive, carry, errors = drive_with(), np.array([1e-3, -2e-3, 0.0]), np.ones((2, 3))
+    drive["shaping"] = 2.0, -2.0, 1.0
+    shape(drive, False, carry, errors)
+    assert carry.tolist() == [1e-3, -2e-3, 0.0]
+    assert errors.tolist() == [[1e-3, -2e-3, 0.0], [1.0, 1.0, 1.0]]
 
 
 def test_shaping_of_first_order_is_the_carry_itself_and_tones_are_its_price():
