@@ -1,4 +1,4 @@
-"""How near the default law comes to what could be had at all: floors of a hold and of a step, computed, beside it."""
+"""Holds under what disturbs them, and the shortest step that anything could make: what limits are held against."""
 
 import dataclasses
 from typing import Any
@@ -7,27 +7,14 @@ import numpy as np
 import scipy.optimize
 from numpy.typing import NDArray
 
-from hil.bench.figure import Figure
 from hil.bench.rigs.motions import MIDDLE_M, error_m, rows_of_setup, setup_of
-from hil.studies.margins.loop import Loop
-from pkxyz_ctrl.config.bus import BusConfig
-from pkxyz_ctrl.config.files import load
 from pkxyz_ctrl.design.drive_limits import slew_counts
-from pkxyz_ctrl.design.hold_floor import hold_floor_m
 from pkxyz_ctrl.design.model.loop_plant import loop_plant
 from pkxyz_ctrl.stage import Stage
 from pkxyz_ctrl.trajectory import Hold
 
-LAW = "youla"
 STROKES_M = np.full(3, 12.5e-6)
-SHAKEN_M_PER_S2 = 98.1e-6
-"""10 ug/rtHz of the base, one-sided."""
 HOLD_S = 1.0
-
-
-def at_limits() -> list[Figure]:
-    """Quiet holds, a shaken base, disturbances at 10 and 50 Hz, idle tones, and the shortest step."""
-    return [_quiet(), *_shaken(), *_rejection(), _idle_tones(), _shortest_step()]
 
 
 def held_nm(controller: str, *, quiet: bool = False, shaken_m_per_s2: float = 0.0, quality: float | None = None) -> Any:
@@ -45,56 +32,11 @@ def held_nm(controller: str, *, quiet: bool = False, shaken_m_per_s2: float = 0.
     return np.stack([np.sqrt(np.mean(held**2, axis=0)), held.std(axis=0)]) * 1e9
 
 
-def _quiet() -> Figure:
-    ours, nothing = held_nm(LAW, quiet=True)[0], held_nm("open_loop")[0]
-    detail = f"hold about the set-point, quiet: {_three(ours)}; open loop {_three(nothing)}"
-    return Figure("control.hold_quiet", float(ours.max()), "nm rms", 0.8, "at most", None, detail)
-
-
-def _shaken() -> list[Figure]:
-    bus = load("buses", "fd_5k", BusConfig)
-    floor = 1e9 * hold_floor_m(Stage.load("reconstructed"), bus, STROKES_M, SHAKEN_M_PER_S2)
-    nothing, figures = held_nm("open_loop", shaken_m_per_s2=SHAKEN_M_PER_S2)[1], []
-    for name, quiet in (("shaken_quiet", True), ("shaken", False)):
-        ours = held_nm(LAW, quiet=quiet, shaken_m_per_s2=SHAKEN_M_PER_S2)[1]
-        detail = (
-            f"deviation on a base of 10 ug/rtHz{', quiet' if quiet else ''}: {_three(ours)} nm over the least of any "
-            f"linear law, {_three(floor)}; open loop {_three(nothing)}. Rejection to 200 Hz alone costs a factor of 1.9"
-        )
-        figures.append(
-            Figure(f"control.hold_{name}", float((ours / floor).max()), "x floor", 1.25, "at most", None, detail)
-        )
-    return figures
-
-
-def _rejection() -> list[Figure]:
-    setup, _ = setup_of([Hold(kind="hold", duration_s=HOLD_S)], LAW, "nominal", MIDDLE_M)
-    loop = Loop(Stage(setup.stage), setup.bus, setup.law)
-    hz, figures = np.array([10.0, 50.0]), []
-    s = np.abs(loop.response(STROKES_M, hz).s)
-    for at, target, of_axes in zip(hz, (34.0, 20.0), np.diagonal(s, axis1=1, axis2=2), strict=True):
-        down = -20.0 * np.log10(of_axes)
-        detail = f"a disturbance at {at:g} Hz is weaker than without feedback by {_three(down)} dB in x, y, z"
-        figures.append(Figure(f"control.reject_{at:g}", float(down.min()), "dB", target, "at least", None, detail))
-    return figures
-
-
-def _idle_tones() -> Figure:
-    ours, nothing = held_nm(LAW, quality=200.0)[0], held_nm("open_loop", quality=200.0)[0]
-    detail = f"open-loop hold at a quality factor of 200: {_three(nothing)}; the default law {_three(ours)}"
-    return Figure("control.idle_tones", float(nothing[2]), "nm rms", 1.0, "at most", None, detail)
-
-
-def _shortest_step() -> Figure:
-    detail = "from the jump of the set-point to within 10 nm of 1 um for good, whatever drove it: slew, voltage, delay"
-    return Figure("control.step_limit", shortest_step_s(1e-6, 10e-9) * 1e3, "ms", None, None, None, detail)
-
-
 def shortest_step_s(way_m: float, band_m: float) -> float:
     """The shortest time to a band about a point away, the longest of the axes: the fewest periods for which a linear
     programme finds comb forces that get there and stay, within voltage and slew, on the sampled stage with its delay.
     """
-    setup, _ = setup_of([Hold(kind="hold", duration_s=HOLD_S)], LAW, "nominal", MIDDLE_M)
+    setup, _ = setup_of([Hold(kind="hold", duration_s=HOLD_S)], "youla", "nominal", MIDDLE_M)
     stage, bus = Stage(setup.stage), setup.bus
     plant, position = loop_plant(stage, bus, STROKES_M), stage.forward_kinematics(STROKES_M)
     volts, gain = stage.holding_voltages(position), stage.force_gain_n_per_v2
@@ -142,7 +84,3 @@ def _reaches(
         bounds=list(zip(np.tile(least_n, total), np.tile(most_n, total), strict=True)), method="highs",
     )  # fmt: skip
     return bool(result.status == 0)
-
-
-def _three(values: NDArray[np.float64]) -> str:
-    return " / ".join(f"{v:.2f}" for v in values)
