@@ -30,8 +30,8 @@ class Feed(NamedTuple):
         """Row of the path at a row of the loop."""
         if self.direction == feed_hold.STEADY:
             return self.phase + (row - self.origin)
-        gone, _, _ = feed_hold.advance(self.direction, row - self.origin, self.ramp)
-        return self.phase + float(gone)
+        advanced, _, _ = feed_hold.advance(self.direction, row - self.origin, self.ramp)
+        return self.phase + float(advanced)
 
     def turned(self, direction: int, row: int) -> "Feed":
         """Slowing down or starting from ``row`` on; in the middle of the other, from the speed that there is."""
@@ -40,8 +40,8 @@ class Feed(NamedTuple):
         age = 0
         if self.direction != feed_hold.STEADY:
             age = max(0, self.ramp - (row - self.origin))  # where the mirrored ramp has this speed
-        gone, _, _ = feed_hold.advance(direction, age, self.ramp)
-        return Feed(row - age, self.at(row) - float(gone), direction, self.ramp)
+        advanced, _, _ = feed_hold.advance(direction, age, self.ramp)
+        return Feed(row - age, self.at(row) - float(advanced), direction, self.ramp)
 
     @property
     def is_plain(self) -> bool:
@@ -68,5 +68,5 @@ def fed_rows(
     ``motion`` from ``window_first`` on, as many as are needed.
     """
     for n in range(len(out)):
-        gone, speed, change = feed_hold.advance(direction, first_age + n, ramp)
-        feed_hold.sample(window, phase + gone - window_first, speed, change, period_s, out[n])
+        advanced, speed, change = feed_hold.advance(direction, first_age + n, ramp)
+        feed_hold.sample(window, phase + advanced - window_first, speed, change, period_s, out[n])
