@@ -39,7 +39,9 @@ def draw(path: Path) -> None:
             voltage.step(t_ms, rows["voltage_v"][:, 0], where="post", color=colour)
             if controller == "mpc":
                 solved = rows["solver_iterations"] > 0
-                voltage.plot(t_ms[solved], rows["voltage_v"][solved, 0], "o", color=colour, ms=4, label="OSQP solved")
+                voltage.plot(
+                    t_ms[solved], rows["voltage_v"][solved, 0], "o", color=colour, ms=4, label="a problem solved"
+                )
     for column, title in enumerate(("up", "down")):
         height, distance, voltage = axes[:, column]
         labels = ("height (um)", "distance from the target (nm)", "voltage of a comb (V)") if column == 0 else ("",) * 3

@@ -3,7 +3,6 @@
 The nominal plant, the fast lane (whose bits are those of the lockstep lane), true position against reference.
 """
 
-import time
 from typing import Any
 
 import numpy as np
@@ -12,16 +11,11 @@ from numpy.typing import NDArray
 from hil.bench.figure import Figure
 from hil.bench.rigs.held import HOLD_S, STROKES_M, held_nm, shortest_step_s
 from hil.bench.rigs.motions import MIDDLE_M, error_m, run, settled_s, setup_of
-from hil.lanes.fast import run_block_in_steps
+from hil.bench.rigs.predictive import LOW_M, TOLERANCE, WAY_M, mpc_ticks_us, osqp_us, solver_us
 from hil.studies.margins.loop import Loop
 from pkxyz_ctrl.config.bus import BusConfig
 from pkxyz_ctrl.config.files import load
 from pkxyz_ctrl.design.hold_floor import hold_floor_m
-from pkxyz_ctrl.loop.cycle import new_memory
-from pkxyz_ctrl.loop.period import period_of
-from pkxyz_ctrl.loop.reference import reference_rows
-from pkxyz_ctrl.loop.row import ROW
-from pkxyz_ctrl.safety.modes import Mode
 from pkxyz_ctrl.stage import Stage
 from pkxyz_ctrl.trajectory import Circle, Hold, Move, Raster, Sine, Steps
 
@@ -33,14 +27,12 @@ QUICK = {"velocity_max_m_per_s": 5e-3, "acceleration_max_m_per_s2": 12.0, "jerk_
 """Limits of a 1 um step: 0.8 ms on its way, with forces of some 60 uN and 4 V a tick."""
 SHAKEN_M_PER_S2 = 98.1e-6
 """10 ug/rtHz of the base, one-sided."""
-LOW_M, WAY_M = 4e-6, 31e-6
-"""The full range: a jump from 4 to 35 um of height, most strokes but the last um."""
 
 
 def control() -> list[Figure]:
     """All of it with the default law, and the far jump with mpc beside lqg."""
     motion = [*_bandwidth(), *_steps(), *_jumps(), _circle(), _raster(), _hold()]
-    return [*motion, *_at_limits(), *_far_jump(), _mpc_tick()]
+    return [*motion, *_at_limits(), *_far_jump(), *_mpc_ticks()]
 
 
 def response(axis: str, frequency_hz: float, controller: str = LAW) -> complex:
@@ -244,41 +236,21 @@ def _far_jump() -> list[Figure]:
     ]  # fmt: skip
 
 
-def _mpc_tick() -> Figure:
-    """Wall time of the ticks of the far jump that solve a problem, called as the fast lane calls them."""
-    taken = mpc_tick_us()
-    solved = taken["solved"]
+def _mpc_ticks(repeats: int = 15) -> list[Figure]:
+    """Others on the machine lengthen a tick, never shorten it."""
+    every, solved, posed, cycle = mpc_ticks_us(repeats)
     detail = (
-        f"the {len(solved)} ticks of a far jump that solve a problem, each whole, Python included, the least of "
-        f"{REPEATS} runs with the same bits: median {np.percentile(solved, 50):.0f} us, longest {solved.max():.0f} us; "
-        f"all ticks: median {np.percentile(taken['all'], 50):.1f} us, p99 {np.percentile(taken['all'], 99):.0f} us"
+        f"the {len(posed)} ticks of a far jump that solve a problem, each whole, Python included, the least of "
+        f"{repeats} runs with the same bits: median {np.percentile(solved, 50):.0f} us, longest {solved.max():.0f} us; "
+        f"all ticks: median {np.percentile(every, 50):.1f} us, p99 {np.percentile(every, 99):.0f} us"
     )
-    return Figure("control.mpc_tick", float(np.percentile(solved, 99)), "us at p99", 100.0, "at most", None, detail)
-
-
-REPEATS = 15
-"""Others on the machine lengthen a tick, never shorten it."""
-
-
-def mpc_tick_us(repeats: int = REPEATS) -> dict[str, NDArray[np.float64]]:
-    """Time of each tick of the far jump in us, the least of several runs, which have the same bits: ``all`` of them,
-    and those that ``solved`` a problem.
-    """
-    jump = Steps(kind="steps", by_m=(0.0, 0.0, WAY_M), count=1, dwell_s=0.04)
-    setup, _ = setup_of([jump], "mpc", "nominal", LOW_M)
-    reference = reference_rows(setup.trajectory.sample(0, setup.ticks + 25, setup.bus.period_us))
-    at_us = setup.bus.period_us * np.arange(setup.ticks, dtype=np.int64)
-    best = np.full(setup.ticks, np.inf)
-    rows = np.zeros(setup.ticks, ROW)
-    for _ in range(repeats):
-        period, plant, memory = period_of(setup.law, reference), setup.new_plant(), new_memory(Mode.IDLE)
-        taken: list[float] = []
-
-        def timed(*arguments: Any, period: Any = period, taken: list[float] = taken) -> None:
-            begin = time.perf_counter()
-            period(*arguments)
-            taken.append(time.perf_counter() - begin)
-
-        run_block_in_steps(timed, setup.law, memory, reference, plant.params, plant.state, at_us, rows, setup.ticks)
-        best = np.minimum(best, np.array(taken) * 1e6)
-    return {"all": best, "solved": best[rows["solver_iterations"] != 0]}
+    own, other = solver_us(cycle, posed, repeats), osqp_us(cycle, posed, repeats)
+    beside = (
+        f"OSQP's time for these problems to {TOLERANCE:g}, started from the one before, over ours for the exact "
+        f"solution: medians {np.median(other):.0f} and {np.median(own):.1f} us, "
+        f"p99 {np.percentile(other, 99):.0f} and {np.percentile(own, 99):.1f} us"
+    )
+    return [
+        Figure("control.mpc_tick", float(np.percentile(solved, 99)), "us at p99", 20.0, "at most", None, detail),
+        Figure("control.mpc_over_osqp", float(np.median(other) / np.median(own)), "times", None, None, None, beside),
+    ]

@@ -102,10 +102,8 @@ class Mpc(FrozenModel):
 
     horizon: Annotated[int, Field(ge=10, le=20)] = 12
     """periods that are planned"""
-    iterations_max: Annotated[int, Field(ge=1)] = 50
-    """of the solver in one tick; more, and the clipped answer of the regulator is used"""
-    rho: Positive = 0.3
-    """the solver's step, fixed: adapting it by measured time would end determinism"""
+    iterations_max: Annotated[int, Field(ge=1)] = 100
+    """rounds of the solver in one tick, one for each limit met or left; more, and the regulator answers, clipped"""
     stroke_min_m: float
     """beyond which no plan goes, unless the reference does"""
     stroke_max_m: float

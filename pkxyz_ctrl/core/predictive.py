@@ -36,9 +36,8 @@ PREDICTIVE = np.dtype(
         ("velocity_weight", "f8"),  # (N s/m)^2
         ("stroke_min_m", "f8"),
         ("stroke_max_m", "f8"),
-        ("rho", "f8"),  # step of the solver
         ("horizon", "i4"),  # intervals
-        ("iterations_max", "i4"),
+        ("iterations_max", "i4"),  # rounds of the solver in one tick
     ],
     align=True,
 )
@@ -154,17 +153,26 @@ def slope(law: np.void, pulls0: Array, e: Array, out: Array) -> None:
         adjoint[:] = before
 
 
+Scratch = tuple[Array, Array, Array, Array, Array, Array, Array]
+
+
+@njit(cache=True, error_model="numpy")
+def scratch() -> Scratch:
+    """Memory for ``comb_forces``, which would take longer to get it anew than to work in it."""
+    return np.empty(9), np.empty(6), np.empty(3), np.empty(3), np.empty(3), np.empty((3, 3)), np.empty((3, 3))
+
+
 @njit(cache=True, error_model="numpy")
 def comb_forces(
-    law: np.void, now: Array, after: Array, e: Array, nu_n: Array, disturbance_n: Array, comb_n: Array
+    law: np.void, now: Array, after: Array, e: Array, nu_n: Array, disturbance_n: Array, comb_n: Array, memory: Scratch
 ) -> bool:
     """F (3,) that gives nu (3,) in the interval between two rows (9,) of the reference, from deviation e (6,) at its
     start. False where the links do not reach.
     """
     gains, filter_ = law["feedback"], law["estimator"]
-    row, middle, force, end = np.empty(9), np.empty(3), np.empty(3), np.empty(6)
-    pulls, inverse, off = np.empty((3, 3)), np.empty((3, 3)), np.zeros(3)
+    row, end, off, middle, force, pulls, inverse = memory
     feedback.ahead(gains, now, after, row)
+    off[:] = 0.0
     _step(filter_, e, nu_n, off, end)
     for i in range(3):
         off[i] = 0.5 * (e[i] + end[i]) + 0.25 * filter_["half_period_s"] * (e[3 + i] - end[3 + i])
@@ -190,15 +198,52 @@ def forces_and_strokes(
     """Comb forces (n,3) that a plan nu (n,3) takes along rows (n+1, 9), with its e (n+1, 6), and strokes (n,3) at the
     ends of the intervals. False where the links do not reach.
     """
-    position = np.empty(3)
+    memory = scratch()
     for k in range(len(nu_n)):
-        if not comb_forces(law, rows[k], rows[k + 1], e[k], nu_n[k], disturbance_n, comb_n[k]):
+        if not _interval(law, rows, e, nu_n, disturbance_n, k, comb_n[k], stroke_m[k], memory):
+            return False
+    return True
+
+
+@njit(cache=True, error_model="numpy")
+def keeps_limits(
+    law: np.void, rows: Array, e: Array, nu_n: Array, disturbance_n: Array, count: Array, lower_m: Array,
+    upper_m: Array, comb_n: Array, stroke_m: Array,
+) -> bool:  # fmt: skip
+    """Whether forces and strokes of a plan, as above, keep voltage and slew after the last counts (3,) and limits (n,3)
+    of strokes. It ends at the first interval that does not.
+    """
+    drive, volt, memory = law["drive"], np.empty(3), scratch()
+    gain, most = drive["force_gain_n_per_v2"], drive["volt_per_count"] * drive["count_max"]
+    step = drive["volt_per_count"] * drive["count_slew_max"]
+    for i in range(3):
+        volt[i] = drive["volt_per_count"] * count[i]
+    for k in range(len(nu_n)):
+        if not _interval(law, rows, e, nu_n, disturbance_n, k, comb_n[k], stroke_m[k], memory):
             return False
         for i in range(3):
-            position[i] = rows[k + 1, i] + e[k + 1, i]
-        if kinematics.in_domain(law["geometry"], position) != 0:
-            return False
-        kinematics.strokes(law["geometry"], position, stroke_m[k])
+            if not 0.0 <= comb_n[k, i] <= gain[i] * most * most:
+                return False
+            before, volt[i] = volt[i], math.sqrt(comb_n[k, i] / gain[i])
+            if abs(volt[i] - before) > step or not lower_m[k, i] <= stroke_m[k, i] <= upper_m[k, i]:
+                return False
+    return True
+
+
+@njit(cache=True, error_model="numpy")
+def _interval(
+    law: np.void, rows: Array, e: Array, nu_n: Array, disturbance_n: Array, k: int, comb_n: Array, stroke_m: Array,
+    memory: Scratch,
+) -> bool:  # fmt: skip
+    """Comb forces (3,) in interval k, and strokes (3,) at its end. False where the links do not reach."""
+    if not comb_forces(law, rows[k], rows[k + 1], e[k], nu_n[k], disturbance_n, comb_n, memory):
+        return False
+    end = memory[2]
+    for i in range(3):
+        end[i] = rows[k + 1, i] + e[k + 1, i]
+    if kinematics.in_domain(law["geometry"], end) != 0:
+        return False
+    kinematics.strokes(law["geometry"], end, stroke_m)
     return True
 
 
@@ -212,26 +257,6 @@ def stroke_limits(law: np.void, rows: Array, lower_m: Array, upper_m: Array) -> 
         for i in range(3):
             lower_m[m, i] = min(low, asked[i])
             upper_m[m, i] = max(high, asked[i])
-
-
-@njit(cache=True, error_model="numpy")
-def is_inside(drive: np.void, count: Array, comb_n: Array, stroke_m: Array, lower_m: Array, upper_m: Array) -> bool:
-    """Whether comb forces (n,3) after the last counts (3,) keep voltage and slew, and strokes (n,3) their limits."""
-    gain, most = drive["force_gain_n_per_v2"], drive["volt_per_count"] * drive["count_max"]
-    step = drive["volt_per_count"] * drive["count_slew_max"]
-    for i in range(3):
-        before = drive["volt_per_count"] * count[i]
-        for k in range(len(comb_n)):
-            if not 0.0 <= comb_n[k, i] <= gain[i] * most * most:
-                return False
-            volt = math.sqrt(comb_n[k, i] / gain[i])
-            if abs(volt - before) > step:
-                return False
-            before = volt
-        for m in range(len(stroke_m)):
-            if not lower_m[m, i] <= stroke_m[m, i] <= upper_m[m, i]:
-                return False
-    return True
 
 
 @njit(cache=True, error_model="numpy")

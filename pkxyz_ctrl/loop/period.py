@@ -35,6 +35,6 @@ def period_on(law: Records, reference: Records) -> Period:
 
 
 def _planning(law: Records) -> Any:
-    from pkxyz_ctrl.loop.predictive_cycle import PredictiveCycle  # brings OSQP and scipy's solvers
+    from pkxyz_ctrl.loop.predictive_cycle import PredictiveCycle  # brings scipy
 
     return PredictiveCycle(law)

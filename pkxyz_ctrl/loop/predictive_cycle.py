@@ -1,14 +1,13 @@
 """One period of the controller with the predictive law: the cycle, with a plan made between its two parts.
 
 The plan without limits is a matter of a recursion and mostly keeps all limits; then it is the solution. Where it does
-not, OSQP solves the problem, from where it stood, with a fixed step and a bounded number of iterations. Where it
-doesn't come to an end the regulator's clipped answer stands, and the record says so.
+not, the problem is solved exactly, in a bounded number of rounds. Where that doesn't come to an end the regulator's
+clipped answer stands, and the record says so.
 """
 
 from typing import Any
 
 import numpy as np
-import osqp
 from numba import njit
 from numpy.typing import NDArray
 
@@ -17,6 +16,7 @@ from pkxyz_ctrl.core import feedback, predictive
 from pkxyz_ctrl.core.demand import feedforward
 from pkxyz_ctrl.core.kinematics import pulls
 from pkxyz_ctrl.core.linear3 import multiply3, multiply3_transposed
+from pkxyz_ctrl.loop import active_set
 from pkxyz_ctrl.loop import cycle as cycling
 from pkxyz_ctrl.loop.predictive_problem import FORCE_UNIT_N, STROKE_UNIT_M, Problem
 from pkxyz_ctrl.loop.reference import standing_still
@@ -26,12 +26,9 @@ from pkxyz_ctrl.safety.modes import LOOP_CLOSED
 Array = NDArray[np.float64]
 Records = NDArray[np.void]
 
-TOLERANCE = 5e-3
-"""Of the solver, relative and in the problem's units. It matters at limits only: a plan that meets none is exact."""
-
 REHEARSAL_TICKS = 10
 """Every so many ticks without a problem the last one is solved again, for nothing but that code and data stay in the
-caches: a problem after a long time without one takes 50 to 90 us more."""
+caches: a problem after a long time without one takes tens of microseconds more."""
 
 
 class PredictiveCycle:
@@ -39,33 +36,28 @@ class PredictiveCycle:
 
     def __init__(self, law: NDArray[np.void]) -> None:
         self.problem = problem = Problem(law)
-        n = problem.horizon
-        self._q, self._lower, self._upper = np.zeros(3 * n + 1), np.zeros(9 * n - 3), np.zeros(9 * n - 3)
-        self._v = np.zeros(3 * n)
-        self._fixed = problem.pulls, np.linalg.inv(problem.pulls), problem.jacobian, problem.slope_scale
-        self._tried = np.zeros((n + 2, 9)), np.zeros(6), np.zeros((n, 3))
-        self._vectors = self._q, self._lower, self._upper
-        self._solver = _solver(problem, law["tick"]["predictive"][0])
-        self._cold = np.zeros(3 * n + 1), np.zeros(9 * n - 3)
-        self._is_cold, self._free_ticks = True, 0
-        self._solution()
+        n, (hessian, rows) = problem.horizon, problem.matrices()
+        fixed = problem.pulls, np.linalg.inv(problem.pulls), problem.jacobian, problem.slope_scale
+        tried = np.zeros((n + 2, 9)), np.zeros(6), np.zeros((n, 3))
+        self.vectors = np.zeros(3 * n), np.zeros(9 * n - 3), np.zeros(9 * n - 3), np.zeros(3 * n)
+        """of the last problem: q, lower and upper limits, and its solution"""
+        solver = active_set.between(hessian, rows), active_set.work(3 * n + 1, 9 * n - 3)
         memory, reference = cycling.new_memory(), standing_still()
+        self._own = fixed, tried, self.vectors, solver
+        self._again = *solver, *self.vectors[:3], int(law["tick"]["predictive"]["iterations_max"][0]), self.vectors[3]
+        self._free_ticks = 0
         self._observe = direct(cycling.observe, law, memory, reference)
         self._respond = direct(cycling.respond, law, memory)
-        self._plan = direct(plan, law, memory, reference, self._fixed, self._tried, self._vectors)
-        self._adopt = direct(adopt, law, memory, self._fixed, self._tried, self._v, 1)
+        self._plan = direct(plan, law, memory, reference, *self._own)
+        self._rehearse = direct(active_set.solve, *self._again)
 
     def __call__(self, law: Records, memory: Records, reference: Records) -> None:
         """One period."""
         self._observe(law, memory, reference)
-        found = self._plan(law, memory, reference, self._fixed, self._tried, self._vectors)
-        if found == predictive.LIMITED:
-            self._solve(law, memory)
-        else:
-            self._is_cold = True
+        if self._plan(law, memory, reference, *self._own) == predictive.FREE:
             self._free_ticks += 1
             if self._free_ticks % REHEARSAL_TICKS == 0:
-                self._solution()
+                self._rehearse(*self._again)
         self._respond(law, memory)
 
     def on(
@@ -78,48 +70,13 @@ class PredictiveCycle:
         seen["overrun"], seen["sense_count"] = overrun, (count_1, count_2, count_3)
         self(law, memory, reference)
 
-    def _solve(self, law: Records, memory: Records) -> None:
-        if self._is_cold:
-            self._solver.warm_start(*self._cold)
-            self._is_cold = False
-        iterations = self._solution()
-        if iterations > 0:
-            self._adopt(law, memory, self._fixed, self._tried, self._v, iterations)
-        else:
-            memory["tick"]["solver_iterations"] = iterations
-            self._is_cold = True
-
-    def _solution(self) -> int:
-        """Solve for the vectors as they stand; returns the iterations, less than 0 without a solution."""
-        solver = self._solver
-        solver.update_data_vec(q=self._q, l=self._lower, u=self._upper)
-        solver.solve()
-        info = solver.info
-        self._v[:] = solver.solution.x[:-1]
-        iterations: int = info.iter
-        return iterations if info.status_val == _SOLVED else -iterations
-
-
-_SOLVED = int(osqp.SolverStatus.OSQP_SOLVED)
-
-
-def _solver(problem: Problem, numbers: np.void) -> Any:
-    """OSQP's own object, below its Python layer: 10 us a call less."""
-    hessian, rows = problem.matrices()
-    m, n = rows.shape
-    solver = osqp.OSQP()
-    solver.setup(
-        hessian, np.zeros(n), rows, np.full(m, -1.0), np.full(m, 1.0),
-        rho=float(numbers["rho"]), adaptive_rho=False, max_iter=int(numbers["iterations_max"]), check_termination=5,
-        eps_abs=TOLERANCE, eps_rel=TOLERANCE, polishing=False, warm_starting=True, verbose=False,
-    )  # fmt: skip
-    return solver._solver
-
 
 @njit(cache=True, error_model="numpy")
-def plan(law_array: Records, memory_array: Records, reference: Records, fixed: Any, tried: Any, vectors: Any) -> int:
-    """The plan without limits, which is adopted if it keeps them, else the vectors of the problem of this tick:
-    ``predictive.FREE`` or ``LIMITED``, or ``NO_PLAN`` with an open loop or where the links do not reach.
+def plan(
+    law_array: Records, memory_array: Records, reference: Records, fixed: Any, tried: Any, vectors: Any, solver: Any
+) -> int:
+    """The plan without limits, which is adopted if it keeps them, else that of the problem of this tick if there is a
+    solution: ``predictive.FREE`` or ``LIMITED``, or ``NO_PLAN`` with an open loop or where the links do not reach.
     """
     law, memory = law_array[0], memory_array[0]
     rows, error, planned = tried
@@ -137,8 +94,7 @@ def plan(law_array: Records, memory_array: Records, reference: Records, fixed: A
     disturbance, count = state["estimate"]["ahead"][6:9], state["count"][0]
     predictive.stroke_limits(tick, rows, low, high)
     predictive.free_plan(tick, error, jump, jumps, e, nu)
-    reaches = predictive.forces_and_strokes(tick, rows, e, nu, disturbance, comb, stroke)
-    if reaches and predictive.is_inside(tick["drive"], count, comb, stroke, low, high):
+    if predictive.keeps_limits(tick, rows, e, nu, disturbance, count, low, high, comb, stroke):
         planned[:] = nu
         _hand_over(tick, state, rows, comb[0], 0)
         return predictive.FREE
@@ -149,18 +105,23 @@ def plan(law_array: Records, memory_array: Records, reference: Records, fixed: A
     if not predictive.forces_and_strokes(tick, rows, e, planned, disturbance, comb, stroke):
         planned[:] = 0.0
         return predictive.NO_PLAN
-    _pose(tick, count, error, jump, comb, stroke, low, high, e, planned, fixed, vectors)
+    (q, lower, upper, v), (between, work) = vectors, solver
+    _pose(tick, count, error, jump, comb, stroke, low, high, e, planned, fixed, q, lower, upper)
+    rounds = active_set.solve(between, work, q, lower, upper, tick["predictive"]["iterations_max"], v)
+    if rounds > 0:
+        _adopt(tick, state, fixed[0], rows, error, v, planned, rounds)
+    else:
+        state["solver_iterations"] = rounds
     return predictive.LIMITED
 
 
 @njit(cache=True, error_model="numpy")
 def _pose(
     law: np.void, count: Array, error: Array, jump: Array, comb: Array, stroke: Array, low: Array, high: Array,
-    e: Array, nu: Array, fixed: Any, vectors: Any,
+    e: Array, nu: Array, fixed: Any, q: Array, lower: Array, upper: Array,
 ) -> None:  # fmt: skip
     """Vectors of the problem about a plan nu (n,3) that leads to e (n+1, 6) and takes comb forces (n,3)."""
     pulls0, inverse0, jacobian0, scale = fixed
-    q, lower, upper = vectors
     n = len(nu)
     v, about, added, own = np.empty(3), np.empty((n, 3)), np.empty(3), np.empty((n + 1, 6))
     predictive.predict(law, error, jump, np.zeros((n, 3)), own)
@@ -185,17 +146,18 @@ def _pose(
 
 
 @njit(cache=True, error_model="numpy")
-def adopt(law_array: Records, memory_array: Records, fixed: Any, tried: Any, v: Array, iterations: int) -> None:
+def _adopt(
+    tick: np.void, state: np.void, pulls0: Array, rows: Array, error: Array, v: Array, planned: Array, rounds: int
+) -> None:
     """Make a solution v (3n,) this tick's plan."""
-    tick, state = law_array[0]["tick"], memory_array[0]["tick"]
-    rows, error, planned = tried
     part, comb = np.empty(3), np.empty(3)
     for k in range(len(planned)):
         for i in range(3):
             part[i] = v[3 * k + i] * FORCE_UNIT_N
-        multiply3_transposed(fixed[0], part, planned[k])
-    predictive.comb_forces(tick, rows[0], rows[1], error, planned[0], state["estimate"]["ahead"][6:9], comb)
-    _hand_over(tick, state, rows, comb, iterations)
+        multiply3_transposed(pulls0, part, planned[k])
+    disturbance = state["estimate"]["ahead"][6:9]
+    predictive.comb_forces(tick, rows[0], rows[1], error, planned[0], disturbance, comb, predictive.scratch())
+    _hand_over(tick, state, rows, comb, rounds)
 
 
 @njit(cache=True, error_model="numpy")

@@ -2,7 +2,6 @@
 
 import numpy as np
 import scipy.linalg
-import scipy.sparse
 from numpy.typing import NDArray
 
 from pkxyz_ctrl.core.kinematics import jacobian, pulls
@@ -48,11 +47,10 @@ class Problem:
         self.stroke = at_combs @ forced / STROKE_UNIT_M
         self.slack_cost = SOFTNESS * float(predictive["position_weight"]) * STROKE_UNIT_M**2 / unit
 
-    def matrices(self) -> tuple[scipy.sparse.csc_matrix, scipy.sparse.csc_matrix]:
-        """H, its upper triangle, and A, both with the slack."""
+    def matrices(self) -> tuple[Array, Array]:
+        """H and A, both with the slack."""
         n = self.horizon
         hessian = scipy.linalg.block_diag(self.hessian, [[self.slack_cost]])
         slew = np.eye(3 * n)[3:] - np.eye(3 * n)[:-3]
         hard = np.hstack([np.vstack([np.eye(3 * n), slew]), np.zeros((6 * n - 3, 1))])
-        rows = np.vstack([hard, np.hstack([self.stroke, -np.ones((3 * n, 1))])])
-        return scipy.sparse.csc_matrix(np.triu(hessian)), scipy.sparse.csc_matrix(rows)
+        return hessian, np.vstack([hard, np.hstack([self.stroke, -np.ones((3 * n, 1))])])
