@@ -183,6 +183,13 @@ def test_words_of_a_refused_write_name_the_object_and_what_is_permitted() -> Non
     assert told.startswith("frame 0x60A [23 44 64 01 05 00 00 00] blocked in PRE_OPERATIONAL: SDO write")
 
 
+def test_nobody_changes_the_limits_of_a_gate() -> None:
+    gate = TransmitGate(CONFIG)
+    with pytest.raises(ValueError, match="read-only"):
+        gate.record["count_max"] = 32767
+    assert gate.config is CONFIG
+
+
 def test_only_a_reason_of_a_mode_names_a_kind_of_frame() -> None:
     assert min(Reason.NOT_NOW + kind for kind in FrameKind) > max(kind for kind in Reason if kind != Reason.NOT_NOW)
 
