@@ -30,7 +30,7 @@ FEW = 8  # mutants, for which it does not pay to measure the tests beforehand
 
 # The modules, and the tests that are about them. Before each come numbers that are contracts: fast, and soon imported.
 PINNED = "safety/test_safety_pinned.py"
-_GATE = tuple(f"safety/test_safety_gate{part}.py" for part in ("_reasons", "", "_traffic"))
+_GATE = tuple(f"safety/test_safety_gate{part}.py" for part in ("_reasons", "", "_traffic", "_sweep"))
 _NODE_PARTS = ("pdo", "conditions", "release", "sync", "nmt", "heartbeat", "emergency")
 _NODE = tuple(f"node/test_node_{part}.py" for part in _NODE_PARTS)
 TARGETS = {

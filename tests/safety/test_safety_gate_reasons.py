@@ -183,10 +183,34 @@ def test_words_of_a_refused_write_name_the_object_and_what_is_permitted() -> Non
     assert told.startswith("frame 0x60A [23 44 64 01 05 00 00 00] blocked in PRE_OPERATIONAL: SDO write")
 
 
+@pytest.mark.parametrize("count", [-32768, -32767])
+@pytest.mark.parametrize("comb", range(3))
+def test_the_lowest_counts_are_no_small_ones(comb: int, count: int) -> None:
+    counts = [0, 0, 0]
+    counts[comb] = count
+    assert "not all in 0.." in (reason(drive(*counts, 0), gate=holding((0, 0, 0))) or "")
+
+
+def test_our_heartbeat_passes_and_a_read_where_reads_do() -> None:
+    assert reason(of(0x77F, b"\5")) is None
+    read = of(0x60A, bytes.fromhex("40 00 10 00 00 00 00 00"))
+    assert reason(read, Mode.PRE_OPERATIONAL) is None
+    unpermitted = [mode for mode in Mode if not gate_rules.PERMITTED[mode] & FrameKind.SDO_READ]
+    for mode in unpermitted:
+        assert "SDO_READ is not permitted now" in (reason(read, mode) or "")
+
+
+def test_reasons_are_counted_through() -> None:
+    """The exported gate answers with these numbers."""
+    assert [int(kind) for kind in Reason] == [*range(20), 1 << 16]
+
+
 def test_nobody_changes_the_limits_of_a_gate() -> None:
     gate = TransmitGate(CONFIG)
     with pytest.raises(ValueError, match="read-only"):
         gate.record["count_max"] = 32767
+    with pytest.raises(ValueError, match="read-only"):
+        gate_rules._ROWS[0] = 0
     assert gate.config is CONFIG
 
 
