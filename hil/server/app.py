@@ -17,10 +17,13 @@ from starlette.websockets import WebSocket, WebSocketDisconnect
 
 from hil.server.client import Client
 from hil.server.desk import Desk
+from hil.server.messages import is_urgent
 from pkxyz_ctrl.client.protocol import SUBPROTOCOL, TEXT_MAX_BYTES, TOKEN_PREFIX
 
 PAGE = Path(__file__).parent / "page"
 CLIENTS_MOST = 32
+_ASKED_MOST = 1000
+"""Messages of a client that wait for those before them."""
 _LOOK_S, _SHOW_S, _STATUS_S = 0.01, 1 / 30, 0.1
 _HEADERS = [
     (b"content-security-policy", b"default-src 'self'; style-src 'self' 'unsafe-inline'; img-src 'self' data: blob:"),
@@ -76,7 +79,8 @@ def app_of(desk: Desk, token: str, hosts: frozenset[str]) -> Starlette:
             return
         await socket.accept(SUBPROTOCOL)
         client = desk.enter()
-        speaking = asyncio.create_task(_speak(socket, client))
+        asked: asyncio.Queue[tuple[str, int]] = asyncio.Queue(_ASKED_MOST)
+        tasks = [asyncio.create_task(_speak(socket, client)), asyncio.create_task(_serve(desk, client, asked))]
         try:
             while not client.is_hopeless:
                 message = await socket.receive()
@@ -85,11 +89,17 @@ def app_of(desk: Desk, token: str, hosts: frozenset[str]) -> Starlette:
                 text = message.get("text")
                 if text is None or len(text) > TEXT_MAX_BYTES:
                     break
-                await desk.ask(client, text)
+                if is_urgent(text):
+                    await desk.ask(client, text)
+                elif asked.full():
+                    break
+                else:
+                    asked.put_nowait((text, desk.stops))
         except (WebSocketDisconnect, RuntimeError):
             pass
         finally:
-            speaking.cancel()
+            for task in tasks:
+                task.cancel()
             desk.leave(client)
             with contextlib.suppress(Exception):
                 await socket.close()
@@ -109,6 +119,17 @@ def app_of(desk: Desk, token: str, hosts: frozenset[str]) -> Starlette:
         middleware=[Middleware(OnlyOurHost, hosts=hosts)],
         lifespan=lifespan,
     )
+
+
+async def _serve(desk: Desk, client: Client, asked: asyncio.Queue[tuple[str, int]]) -> None:
+    """One after another: some take seconds, and a stop does not wait for them."""
+    try:
+        while True:
+            text, stops = await asked.get()
+            await desk.ask(client, text, stops)
+    except Exception:
+        client.is_hopeless = True
+        raise
 
 
 async def _speak(socket: WebSocket, client: Client) -> None:

@@ -31,6 +31,7 @@ _LIMITS = ("velocity_m_per_s", "acceleration_m_per_s2", "jerk_m_per_s3")
 _LOOKS = frozenset({"settings", "values", "parameters", "recordings", "open_recording"})
 _FREE = _LOOKS | {"stop", "release", "subscribe", "take_control", "give_control", "preview", "body", "save"}
 """What needs no control: nothing of it moves anything, or it stops what moves."""
+_STOPPED = "the stage was stopped after this was asked, and before it began: ask again"
 
 
 class Desk:
@@ -50,6 +51,8 @@ class Desk:
         """where the last fault is kept, or why it isn't"""
         self._saves, self._fault_us = saves, -1
         self.clients: list[Client] = []
+        self.stops = 0
+        """how often somebody has stopped the stage"""
         self.holder: Client | None = None
         self.last_fault = ""
         self._planner, self._plan = planner, plan
@@ -87,28 +90,33 @@ class Desk:
         if self.holder is client:
             self._end_control()
 
-    async def ask(self, client: Client, text: str) -> None:
-        """A message from a client. What is wrong with it, it is told."""
+    async def ask(self, client: Client, text: str, stops: int | None = None) -> None:
+        """A message from a client, that came when ``stops`` was so. What is wrong with it, it is told."""
+        stops = self.stops if stops is None else stops
         tag = None
         try:
             message = json.loads(text)
             if not isinstance(message, dict) or not isinstance(message.get("do"), str):
                 raise AskedWrongError('a message is {"do": what, ...}')
             tag = tag_of(message.get("tag"))
-            await self._do(client, message["do"], message, tag)
+            await self._do(client, message["do"], message, tag, stops)
         except (AskedWrongError, BusyError, ConfigError, RecursionError, ValueError, TypeError) as error:
             ours = isinstance(error, AskedWrongError | BusyError | ConfigError)
             words = str(error) if ours else f"not understood: {error}"
             client.tell({"answer": {"tag": tag, "id": None, "verb": "", "state": "refused", "words": words}})
 
-    async def _do(self, client: Client, what: str, message: dict[str, Any], tag: Any) -> None:
+    async def _do(self, client: Client, what: str, message: dict[str, Any], tag: Any, stops: int) -> None:
         if what not in _FREE and self.holder is not client:
             raise AskedWrongError(
                 "take control first: " + ("nobody has it" if self.holder is None else "another client has it")
             )
+        if what not in _FREE and stops != self.stops:
+            raise AskedWrongError(_STOPPED)
         if what == "release":
+            self.stops += 1
             self._command(client, what, message, tag)
         elif what == "stop":
+            self.stops += 1
             self.link.stop()
             self._feeding = self._asked_for = None
             client.tell(answer_of(tag, "stop", "done", "the loop was told to stop"))
@@ -134,9 +142,9 @@ class Desk:
             await self._look_at(client, what, message)
             client.tell(answer_of(tag, what, "done", ""))
         elif what == "path":
-            await self._send_path(client, message, tag)
+            await self._send_path(client, message, tag, stops)
         elif what == "law":
-            await self._change_law(client, message, tag)
+            await self._change_law(client, message, tag, stops)
         elif what in ASKED:
             command_id, words = self._setting.ask(what, message)
             if command_id is None:
@@ -235,23 +243,33 @@ class Desk:
             return await self._plan(self._planner.of_table, str(message["table"]), limits)
         return await self._plan(self._planner.of_segments, message.get("segments"))
 
-    async def _send_path(self, client: Client, message: dict[str, Any], tag: Any) -> None:
+    async def _send_path(self, client: Client, message: dict[str, Any], tag: Any, stops: int) -> None:
         path = await self._planned(message)
+        self._require_still_wanted(client, stops)
         command_id = self.link.next_id()
         self.link.command(Verb.PATH, command_id, path=command_id, rows=path.rows, start_m=path.start_m)
         client.tags[command_id] = tag
         self._asked_for = Feeding(self.link, command_id, path)
         self._tell("path", command_id, State.ACCEPTED, f"{path.name}: {path.duration_s:.3g} s")
 
-    async def _change_law(self, client: Client, message: dict[str, Any], tag: Any) -> None:
+    async def _change_law(self, client: Client, message: dict[str, Any], tag: Any, stops: int) -> None:
         name, text = str(message.get("controller", "")), message.get("toml")
         command_id = self.link.next_id()
         files = self._planner.files
         text = None if text is None else str(text)
-        self.link.offer(await self._plan(offer_of, files["stage"], files["bus"], name, text, command_id))
+        offered = await self._plan(offer_of, files["stage"], files["bus"], name, text, command_id)
+        self._require_still_wanted(client, stops)
+        self.link.offer(offered)
         self.link.command(Verb.LAW, command_id, law=command_id)
         client.tags[command_id] = tag
         self._tell("law", command_id, State.ACCEPTED, "")
+
+    def _require_still_wanted(self, client: Client, stops: int) -> None:
+        """Of what took its time: nobody has stopped the stage meanwhile, and the client still has control."""
+        if stops != self.stops:
+            raise AskedWrongError(_STOPPED)
+        if self.holder is not client:
+            raise AskedWrongError("control was given away while it was prepared")
 
     def _settings_changed(self) -> None:
         self._ranges = ([], [])

@@ -1,5 +1,6 @@
 """Parts of the messages between a client and the desk."""
 
+import json
 from typing import Any
 
 import numpy as np
@@ -14,6 +15,7 @@ Array = NDArray[np.float64]
 _OF_SESSION = {"path_row": "path_row", "in_position": "in_position"}
 FIELDS = frozenset({*(name for name in ROW.names or () if ROW[name].base.kind in "fi"), *_OF_SESSION})
 """Of telemetry."""
+_URGENT_MOST = 300
 _PLACES = frozenset({"reference_m", "measurement_m", "estimate_m", "position_m"})
 _WAYS = frozenset({"estimate_m_per_s", "innovation_m"})
 
@@ -25,6 +27,17 @@ class AskedWrongError(ValueError):
 def answer(tag: Any, verb: str, state: str, words: str, command_id: int | None = None) -> dict[str, Any]:
     """What became of something that was asked."""
     return {"answer": {"tag": tag, "id": command_id, "verb": verb, "state": state, "words": words}}
+
+
+def is_urgent(text: str) -> bool:
+    """Whether a message stops the stage, so that it must not wait for those before it."""
+    if len(text) > _URGENT_MOST:
+        return False
+    try:
+        message = json.loads(text)
+    except ValueError:
+        return False
+    return isinstance(message, dict) and message.get("do") in ("stop", "release")
 
 
 def tag_of(value: Any) -> str | int | None:
