@@ -1,11 +1,13 @@
 """The page of ``pkxyz serve``, driven by a headless Chromium as a person would: ``make test-page``.
 
-It fetches Debian's package (100 MB, once) where the system has no Chromium. Pictures of it go to a folder.
+It fetches Debian's package (100 MB, once) where the system has no Chromium. Pictures of it go to a folder; with
+``--docs`` those of docs/do/operate.md are drawn anew, too.
 """
 
 import faulthandler
 import json
 import os
+import shutil
 import signal
 import subprocess
 import sys
@@ -22,6 +24,7 @@ import pkxyz_ctrl
 from pkxyz_ctrl.client.reply import RefusedError
 
 _STUCK_S = 240.0
+DOCS_FIGURES = Path(__file__).parents[2] / "docs" / "figures"
 
 
 def activity(browser: Browser, *wanted: str, timeout_s: float = 60.0) -> None:
@@ -146,6 +149,7 @@ def look_back(browser: Browser, pictures: Path) -> None:
     browser.until("document.querySelector('#recordings').innerText.includes('fault-')")
     browser.click("#recordings button")
     browser.until("!document.querySelector('#opened').hidden")
+    browser.run("document.querySelector('#span').value = '0.5'; document.querySelector('#span').onchange()")
     assert "Stopped by hand" in browser.text("#opened-words")
     time.sleep(0.5)
     browser.picture(pictures / "recording.png")
@@ -154,7 +158,8 @@ def look_back(browser: Browser, pictures: Path) -> None:
 
 
 def main() -> None:
-    pictures = Path(sys.argv[1]) if len(sys.argv) > 1 else Path(tempfile.mkdtemp(prefix="pkxyz-page-"))
+    words = [word for word in sys.argv[1:] if word != "--docs"]
+    pictures = Path(words[0]) if words else Path(tempfile.mkdtemp(prefix="pkxyz-page-"))
     pictures.mkdir(parents=True, exist_ok=True)
     begin_s = time.monotonic()
     faulthandler.dump_traceback_later(_STUCK_S, exit=False)
@@ -185,6 +190,9 @@ def main() -> None:
     finally:
         serving.send_signal(signal.SIGINT)
         serving.wait(20)
+    if "--docs" in sys.argv:
+        for name, theme in (("scan", "light"), ("scan-dark", "dark")):
+            shutil.copyfile(pictures / f"{name}.png", DOCS_FIGURES / f"page-{theme}.png")
     print(f"the page does what it should, in {time.monotonic() - begin_s:.0f} s; pictures are in {pictures}{os.sep}")
 
 

@@ -136,6 +136,8 @@ function showOpened() {
   scope.events = opened?.events ?? [];
   if (!opened) { scope.end = null; return; }
   scope.periodS = opened.period_us * 1e-6;
+  if (scope.inSpectrum) at("spectrum").click();
+  scrollTo(0, 0);
   at("opened-name").textContent = opened.name;
   const faults = opened.events.filter((event) => event.kind === "fault").map((event) => event.words.split(":")[0]);
   at("opened-words").textContent = `${(opened.ticks * scope.periodS).toFixed(1)} s, ${opened.events.length} events${faults.length ? `: ${[...new Set(faults)].join("; ")}` : ""}`;
@@ -258,4 +260,12 @@ const clock = (s) => (s < 60 ? `${s.toFixed(1)} s` : `${Math.floor(s / 60)} min 
 jogLabels();
 showControl();
 paint(localStorage.getItem("theme") ?? (matchMedia("(prefers-color-scheme: dark)").matches ? "dark" : "light"));
-setInterval(() => { scope.draw(); plane.draw(); }, 1000 / 30);
+/** 30 times a second, or as often as leaves a slow machine time for what comes in. */
+async function drawAgain() {
+  const begin = performance.now();
+  scope.draw(); plane.draw();
+  await null; await null;  // the plot draws behind us
+  const took = performance.now() - begin;
+  setTimeout(drawAgain, Math.max(1000 / 30 - took, 2 * took));
+}
+drawAgain();

@@ -44,13 +44,15 @@ export class Space {
     }
     line(ghost, colour("--soft"), 1, 0.7);
     line(trail, colour("--accent"), 1.6);
-    const span = radius * 0.35, corner = [centre[0] - radius, centre[1] - radius, centre[2] - radius];
+    const span = Number((radius * 0.4e6).toPrecision(1)) * 1e-6, [cx, cy] = at(centre);
     g.font = "11px system-ui";
     for (const [n, axis] of ["x", "y", "z"].entries()) {
-      const end = corner.map((v, k) => v + (k === n ? span : 0)), [px, py] = at(end);
-      line([corner, end], colour(`--${axis}`), 2);
-      g.fillStyle = colour(`--${axis}`); g.fillText(`${axis} ${(span * 1e6).toFixed(0)} um`, px + 4, py);
+      const [px, py] = at(centre.map((v, k) => v + (k === n ? span : 0))), [left, low] = [46, height - 40];
+      g.strokeStyle = g.fillStyle = colour(`--${axis}`); g.lineWidth = 2;
+      g.beginPath(); g.moveTo(left, low); g.lineTo(left + px - cx, low + py - cy); g.stroke();
+      g.fillText(axis, left + (px - cx) * 1.15 + 2, low + (py - cy) * 1.15 + 4);
     }
+    g.fillStyle = colour("--soft"); g.fillText(`axes: ${+(span * 1e6).toPrecision(2)} um`, 8, height - 6);
     if (status?.position_m) {
       const [tx, ty] = at(status.target_m), [px, py] = at(status.position_m);
       g.strokeStyle = colour("--warn"); g.lineWidth = 1.5; g.beginPath(); g.arc(tx, ty, 8, 0, 7); g.stroke();
