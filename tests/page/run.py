@@ -74,6 +74,7 @@ def operate(browser: Browser, url: str, pictures: Path) -> None:
     fill(browser, "#shown", "position")
     browser.run("document.querySelector('#shown').onchange()")
     time.sleep(0.5)
+    browser.run("scrollTo(0, 0)")
     browser.picture(pictures / "scan.png")
     fill(browser, "#view", "3d")
     browser.run("document.querySelector('#view').onchange()")
