@@ -54,6 +54,12 @@ class ProcessCodec:
 
         Raises CountsOutOfRangeError; nothing is wrapped or clamped here.
         """
+        first, second, third = self.require(counts, counter)
+        word = int(self._encode(self.record, first, second, third, counter))
+        return (word & _WORD).to_bytes(self.length, "little")
+
+    def require(self, counts: Counts, counter: int = 0) -> Counts:
+        """Counts that fit. Raises CountsOutOfRangeError."""
         first, second, third = map(index, counts)  # no fractions
         if not (
             COUNTS_MIN <= first <= COUNTS_MAX
@@ -65,8 +71,7 @@ class ProcessCodec:
                 f"process PDO 0x{self.cob_id:03X} cannot carry counts {counts!r} with alive counter {counter!r}: "
                 f"counts are {COUNTS_MIN}..{COUNTS_MAX}, the counter 0..255"
             )
-        word = int(self._encode(self.record, first, second, third, counter))
-        return (word & _WORD).to_bytes(self.length, "little")
+        return first, second, third
 
     def decode(self, data: bytes) -> tuple[int, int, int, int, bool]:
         """``(counts 1, counts 2, counts 3, alive counter, CRC right)``; counter 0 and True if not protected.

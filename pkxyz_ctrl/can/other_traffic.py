@@ -1,45 +1,65 @@
 """Frames on the bus that are not the amplifier's: counted, so that a fault which they cause can name them."""
 
-from collections import Counter
+from typing import Final
 
-from . import cob_id
-from .driver_config import DriverConfig
-from .frame import Frame
+import numpy as np
+from numba import njit
+from numpy.typing import NDArray
 
-_FLOOD_FRAMES = 5  # fewer say nothing
-_FLOOD_PER_S = 2000  # more than this, on average, since the amplifier was last heard; a full classic bus carries 9000
+from pkxyz_ctrl.can import cob_id
+
+Records = NDArray[np.void]
+
+_FLOOD_FRAMES: Final = 5  # fewer say nothing
+_FLOOD_PER_S: Final = (
+    2000  # more than this, on average, since the amplifier was last heard; a full classic bus has 9000
+)
+_COUNTABLE: Final = 1 << 30
+_EMCY, _SDO, _HEARTBEAT = cob_id.EMCY_BASE, cob_id.SDO_RESPONSE_BASE, cob_id.HEARTBEAT_BASE
+
+TRAFFIC = np.dtype(
+    [
+        ("since_us", "i8"),  # all was well
+        ("last_us", "i8"),  # the last one came
+        ("frames", "i4"),  # so many since then
+        ("can_id", "i4"),  # which most of them have, if one has most
+        ("lead", "i4"),  # of that one over all others, in frames
+    ],
+    align=True,
+)
 
 
-class OtherTraffic:
-    """Who else talks, since the amplifier's last sense frame or since the start-up began."""
+@njit(cache=True, error_model="numpy")
+def note(traffic: Records, node_id: int, sense_id: int, can_id: int, t_us: int) -> None:
+    """A frame that was read at ``t_us`` and was not a sense frame. Which identifier has the majority follows from one
+    counter (Boyer and Moore, 1981).
+    """
+    if can_id == sense_id or can_id == _EMCY + node_id:
+        return
+    if can_id == _SDO + node_id or can_id == _HEARTBEAT + node_id:
+        return
+    seen = traffic[0]
+    if seen["lead"] == 0:
+        seen["can_id"] = can_id
+    seen["lead"] += 1 if seen["can_id"] == can_id else -1
+    if seen["frames"] < _COUNTABLE:
+        seen["frames"] += 1
+    seen["last_us"] = t_us
 
-    def __init__(self, config: DriverConfig) -> None:
-        node_id = config.node_id
-        services = (base + node_id for base in (cob_id.EMCY_BASE, cob_id.SDO_RESPONSE_BASE, cob_id.HEARTBEAT_BASE))
-        self._of_the_amplifier = frozenset((cob_id.sense(node_id, config.sense_pdo), *services))
-        self._frames: Counter[int] = Counter()
-        self._since_us = self._last_us = 0
 
-    def note(self, frame: Frame, t_us: int) -> None:
-        """A frame that was read at ``t_us`` and was not a sense frame."""
-        if frame.can_id not in self._of_the_amplifier:
-            self._frames[frame.can_id] += 1
-            self._last_us = t_us
+@njit(cache=True, error_model="numpy")
+def forget(traffic: Records, t_us: int) -> None:
+    """All is well at ``t_us``."""
+    traffic[0]["frames"] = traffic[0]["lead"] = 0
+    traffic[0]["since_us"] = t_us
 
-    def forget(self, t_us: int) -> None:
-        """All is well at ``t_us``."""
-        if self._frames:
-            self._frames.clear()
-        self._since_us = t_us
 
-    @property
-    def complaint(self) -> str:
-        """``; the bus is flooded: ...`` where others send so much that the amplifier may go unheard, else empty."""
-        count, time_us = self._frames.total(), self._last_us - self._since_us
-        if count < _FLOOD_FRAMES or count * 1_000_000 < _FLOOD_PER_S * time_us:
-            return ""
-        busiest, _ = self._frames.most_common(1)[0]
-        return (
-            f"; the bus is flooded: {count} frames that are not the amplifier's in {time_us / 1000:.3g} ms, most of "
-            f"them 0x{busiest:03X}: silence their sender"
-        )
+def complaint(traffic: np.void) -> str:
+    """``; the bus is flooded: ...`` where others send so much that the amplifier may go unheard, else empty."""
+    count, time_us = int(traffic["frames"]), int(traffic["last_us"]) - int(traffic["since_us"])
+    if count < _FLOOD_FRAMES or count * 1_000_000 < _FLOOD_PER_S * time_us:
+        return ""
+    return (
+        f"; the bus is flooded: {count} frames that are not the amplifier's in {time_us / 1000:.3g} ms, most of "
+        f"them 0x{int(traffic['can_id']):03X}: silence their sender"
+    )

@@ -114,11 +114,18 @@ class SenseInput:
     that is remembered.
     """
 
-    def __init__(self, codec: ProcessCodec, syncs_uncountable: int = SYNCS_UNCOUNTABLE) -> None:
-        self.record = np.zeros(1, SENSE)
+    def __init__(
+        self,
+        codec: ProcessCodec,
+        syncs_uncountable: int = SYNCS_UNCOUNTABLE,
+        record: Records | None = None,
+        memory: Records | None = None,
+    ) -> None:
+        """``record`` and ``memory``: where they are to stand."""
+        self.record = np.zeros(1, SENSE) if record is None else record
         self.record["pdo"][0] = codec.record
         self.record["syncs_uncountable"] = syncs_uncountable
-        self.memory = np.zeros(1, SENSE_MEMORY)
+        self.memory = np.zeros(1, SENSE_MEMORY) if memory is None else memory
         self._fresh = self.memory["fresh"].data  # 40 ns for a look
         self._count = self.memory["count"][0].data
         self._on_sync = direct(on_sync, self.record, self.memory)

@@ -4,11 +4,11 @@ No clock, no socket: messages in, messages out, time passed in. ``AmplifierDrive
 """
 
 from collections.abc import Callable
-from enum import Enum, auto
 
 from . import cob_id, startup
 from .cob_id import NmtCommand, NmtState
 from .driver_config import DriverConfig
+from .driver_rules import DriverState
 from .sdo import SdoDialogue, SdoStep
 from .startup import Found, Key, Plan, identity_steps
 
@@ -17,21 +17,6 @@ Messages = tuple[Message, ...]
 
 _NOTHING: Messages = ()
 _NEVER_US = 1 << 62
-
-
-class DriverState(Enum):
-    """Where the connection to the amplifier is."""
-
-    OFF = auto()
-    RESETTING = auto()
-    IDENTIFYING = auto()
-    CONFIGURING = auto()
-    STARTING = auto()
-    TRYING = auto()
-    OPERATIONAL = auto()
-    FAILED = auto()
-    RELEASING = auto()
-    RELEASED = auto()
 
 
 class StartSequence:

@@ -16,7 +16,7 @@ from numba import njit
 from numpy.typing import NDArray
 
 from pkxyz_ctrl.core.elasticity import energy_gradient
-from pkxyz_ctrl.core.kinematics import platform_force
+from pkxyz_ctrl.core.kinematics import platform_forces
 
 Array = NDArray[np.float64]
 
@@ -94,18 +94,15 @@ def net_input(
     before; ``apart_n`` (3,) and ``apart_old_n`` of them, at the platform, do not count.
     """
     stiffness, origin = estimator["stiffness_n_per_m"], estimator["operating_point_m"]
-    energy_gradient(geometry, elasticity, position_m, w_change)
-    platform_force(geometry, position_m, force_n, w)
+    energy_gradient(geometry, elasticity, position_m, w)
+    internal = (w[0], w[1], w[2])
+    platform_forces(geometry, position_m, force_n, force_old_n, w, w_change)
     for i in range(3):
-        internal = w_change[i]
+        inside = internal[i]
         for k in range(3):
-            internal -= stiffness[i, k] * (position_m[k] - origin[k])
-        w_change[i] = apart_n[i] - apart_old_n[i] - w[i]
-        w[i] -= internal + apart_n[i]
-    acted = (w_change[0], w_change[1], w_change[2])
-    platform_force(geometry, position_m, force_old_n, w_change)
-    for i in range(3):
-        w_change[i] += acted[i]
+            inside -= stiffness[i, k] * (position_m[k] - origin[k])
+        w_change[i] += apart_n[i] - apart_old_n[i] - w[i]
+        w[i] -= inside + apart_n[i]
 
 
 @njit(cache=True, error_model="numpy")

@@ -127,18 +127,29 @@ def pulls(geometry: np.void, position_m: Array, out: Array) -> None:
 @njit(cache=True, error_model="numpy")
 def platform_force(geometry: np.void, position_m: Array, comb_force_n: Array, out: Array) -> None:
     """What comb forces (3,) do to the platform at ``position_m``, (3,) in N: J^T F (Eq. 23), and their lift."""
+    platform_forces(geometry, position_m, comb_force_n, comb_force_n, out, out)
+
+
+@njit(cache=True, error_model="numpy")
+def platform_forces(
+    geometry: np.void, position_m: Array, comb_force_n: Array, other_n: Array, out: Array, other_out: Array
+) -> None:
+    """``platform_force`` of two sets of comb forces at one position."""
     e, n = geometry["e"], geometry["n"]
     z, delta, _ = link(geometry, position_m[2])
-    fx = fy = pull = 0.0
+    fx = fy = pull = gx = gy = other_pull = 0.0
     for i in range(3):
         s, c = crank(geometry, i, position_m[0], position_m[1])
-        across = comb_force_n[i] * s / c
+        across, other_across = comb_force_n[i] * s / c, other_n[i] * s / c
         fx += comb_force_n[i] * e[i, 0] + across * n[i, 0]
         fy += comb_force_n[i] * e[i, 1] + across * n[i, 1]
         pull += comb_force_n[i]
-    out[0] = fx
-    out[1] = fy
-    out[2] = pull * z / delta + geometry["lift"] * pull
+        gx += other_n[i] * e[i, 0] + other_across * n[i, 0]
+        gy += other_n[i] * e[i, 1] + other_across * n[i, 1]
+        other_pull += other_n[i]
+    out[0], out[1], out[2] = fx, fy, pull * z / delta + geometry["lift"] * pull
+    other_out[0], other_out[1] = gx, gy
+    other_out[2] = other_pull * z / delta + geometry["lift"] * other_pull
 
 
 @njit(cache=True, error_model="numpy")

@@ -1,29 +1,41 @@
 """The controller of one stage: driver, cycle and gate around one law. Frames in, frames out; time is handed in.
 
-It owns no clock and no bus. ``runtime`` drives it, whoever owns the time.
+It owns no clock and no bus. ``runtime`` drives it, whoever owns the time. What it does in a period is compiled, in
+``exchange``; here are the way to the start-up, and the words.
 """
 
 from collections.abc import Callable
+from struct import Struct
+from typing import Any, Final
 
 import numpy as np
 from numpy.typing import NDArray
 
-from pkxyz_ctrl.can.driver import AmplifierDriver
+from pkxyz_ctrl.can.driver import AmplifierDriver, word_of
+from pkxyz_ctrl.can.driver_rules import FRESH, OUTGOING, OUTGOING_MOST, DriverState
 from pkxyz_ctrl.can.frame import Frame
-from pkxyz_ctrl.can.other_traffic import OtherTraffic
-from pkxyz_ctrl.can.start_sequence import DriverState
+from pkxyz_ctrl.can.other_traffic import complaint, forget
+from pkxyz_ctrl.can.start_sequence import StartSequence
+from pkxyz_ctrl.compiled.direct_call import direct
 from pkxyz_ctrl.config.bus import BusConfig, CanConfig
-from pkxyz_ctrl.loop import cycle as cycling
-from pkxyz_ctrl.loop.period import period_on
+from pkxyz_ctrl.core.demand import PREDICTIVE
+from pkxyz_ctrl.loop import exchange
+from pkxyz_ctrl.loop.exchange import BLOCKED, EXCHANGE, EXCHANGE_MEMORY
+from pkxyz_ctrl.loop.period import period_of
 from pkxyz_ctrl.loop.reference import REFERENCE, standing_still
-from pkxyz_ctrl.loop.row import ROW
 from pkxyz_ctrl.safety.gate import GateConfig, TransmitGate
-from pkxyz_ctrl.safety.modes import NODE_EXPECTED, Event, Mode, next_mode
-from pkxyz_ctrl.safety.trips import Trip, explain
+from pkxyz_ctrl.safety.modes import Event, Mode, next_mode
+from pkxyz_ctrl.safety.trips import explain
 
 Send = Callable[[Frame], object]
+Records = NDArray[np.void]
 
 _IDLE, _FAULT = int(Mode.IDLE), int(Mode.FAULT)
+_OUTGOING: Final = Struct("<8siiii")
+_PLACES: Final = tuple(place * OUTGOING.itemsize for place in range(OUTGOING_MOST))
+_unpack = _OUTGOING.unpack_from
+_word = Struct("<q").unpack
+_new_tuple = tuple.__new__  # a Frame without its keyword defaults: 0.2 us less in every tick
 
 
 class StartUpError(RuntimeError):
@@ -35,61 +47,85 @@ class Controller:
 
     ``send`` takes every frame that may go out; ``discard_unsent`` drops those that still wait, so that no voltage of
     before follows a fault decision; ``port_complaint`` says, as ``; ...``, what stands in the way of frames.
-    ``faults`` collects a sentence for each fault decision. ``memory`` is the (1,) array of ``cycle.MEMORY`` that the
-    cycle works on, ``row`` the bytes of its latest record.
+    ``faults`` collects a sentence for each fault decision. ``record`` (1,) of ``exchange.EXCHANGE`` is all that it goes
+    by, ``exchange`` (1,) of ``EXCHANGE_MEMORY`` all that it remembers; ``memory`` (1,) of ``cycle.MEMORY`` is the
+    cycle's part of that, ``row`` the bytes of its latest record. ``start_up`` in place of the driver's own.
     """
 
     def __init__(
         self,
-        law: NDArray[np.void],
+        law: Records,
         bus: BusConfig,
         gate: GateConfig,
         send: Send,
         discard_unsent: Callable[[], object] = lambda: None,
         port_complaint: Callable[[], str] = lambda: "",
-        driver: AmplifierDriver | None = None,
+        start_up: StartSequence | None = None,
     ) -> None:
         if bus.can is None:
             raise ValueError(f"bus {bus.name!r} has no [can]: nothing to control over")
         self.can: CanConfig = bus.can
-        self.driver = driver or AmplifierDriver(bus.can.driver, gate.count_slew_max)
-        self.gate = TransmitGate(gate)
+        self.record, self.exchange = np.zeros(1, EXCHANGE), np.zeros(1, EXCHANGE_MEMORY)
+        self.law, self.memory = part(self.record, "law"), part(self.exchange, "cycle")
+        self.law[0] = law[0]
+        self.driver = AmplifierDriver(
+            bus.can.driver, gate.count_slew_max, start_up, part(self.record, "driver"), part(self.exchange, "driver")
+        )
+        self.gate = TransmitGate(gate, part(self.record, "gate"), part(self.exchange, "gate"))
+        exchange.switch_on(self.exchange)
         self.faults: list[str] = []
-        self.missed_ticks = 0
-        """skipped, late on the wire, or without the sample that the node owed"""
-        self.law = law
-        self.memory = cycling.new_memory(Mode.BOOT)
         self._send = send
         self._discard_unsent = discard_unsent
         self._port_complaint = port_complaint
-        row_at = dict(cycling.MEMORY.fields or {})["row"][1]
-        self.row = self.memory.view(np.uint8).data[row_at : row_at + ROW.itemsize]
-        # The cycle's memory holds mode and counts; looking at them there takes 40 ns this way.
-        self._mode = self.memory["mode"].data
-        self._count = self.memory["tick"]["count"][0, 0].data
+        self.row = part(self.memory, "row").view(np.uint8).data
+        self._mode = self.memory["mode"].data  # 40 ns for a look
+        self._out = part(self.exchange, "driver", "out").view(np.uint8).data
         self.period_us = bus.period_us
-        self._event = int(Event.NONE)
-        self._clearing = False  # a clear was asked for, and is not done yet
-        self._restart_due = False
         self._restarting = False
-        self._blocked = 0
-        self._sense = self.driver.sense
-        self._others = OtherTraffic(bus.can.driver)
-        self._begun_us = 0
         self._reference = standing_still()  # the latest that was handed in
-        self._cycle = period_on(law, self._reference)
-        self._cycle(law, cycling.new_memory(Mode.BOOT), self._reference, *[0] * 7)  # loaded now, not in the first tick
+        config, memory = self.record, self.exchange
+        self._begin = direct(exchange.begin, config, memory, 0)
+        self._on_frame = direct(exchange.on_frame, config, memory, *[0] * 5)
+        self._finish = direct(exchange.finish, config, memory, 0, 0)
+        self._period = self._period_of()
+        self._period(config, memory.copy(), self._reference, 0)  # loaded now, not in the first tick
+
+    def _period_of(self) -> Callable[..., Any]:
+        """The compiled period, or the one that plans between its two parts."""
+        if self.law["tick"]["kind"][0] != PREDICTIVE:
+            return direct(exchange.period, self.record, self.exchange, self._reference, 0)
+        cycle = period_of(self.law, self._reference)
+        hand_over, take_over = (
+            direct(exchange.hand_over, self.exchange, 0),
+            direct(exchange.take_over, self.exchange, 0),
+        )
+
+        def planning(config: Records, memory: Records, reference: Records, overrun: int) -> Any:
+            was = hand_over(memory, overrun)
+            cycle(part(config, "law"), part(memory, "cycle"), reference)
+            return take_over(memory, was)
+
+        return planning
 
     @property
     def mode(self) -> int:
         """The mode after the last tick, a ``Mode``."""
         return self._mode[0]
 
+    @property
+    def missed_ticks(self) -> int:
+        """Skipped, late on the wire, or without the sample that the node owed."""
+        return int(self.exchange["missed_ticks"][0])
+
+    @missed_ticks.setter
+    def missed_ticks(self, count: int) -> None:
+        self.exchange["missed_ticks"] = count
+
     # -- start and stop ---------------------------------------------------------------------------------------------
 
     def start(self, t_us: int) -> None:
         """Begin the start-up dialogue with the amplifier."""
-        self._others.forget(t_us)
+        forget(self.exchange["others"][0], t_us)
         for frame in self.driver.start(t_us):
             self.send(frame, t_us)
 
@@ -101,10 +137,11 @@ class Controller:
         """
         driver = self.driver
         if frame is not None:
-            self._others.note(frame, t_us)
-        for reply in driver.poll(t_us) if frame is None else driver.receive(frame, t_us):
-            self.send(reply, t_us)
-        if self._blocked:
+            self.receive(frame, t_us)
+        else:
+            for each in driver.poll(t_us):
+                self.send(each, t_us)
+        if self.exchange["blocked"][0]:
             raise StartUpError(self.faults[-1])
         if driver.state is DriverState.FAILED:
             raise StartUpError(f"{driver.failure}{self._complaints}")
@@ -117,12 +154,11 @@ class Controller:
 
     def stop(self, t_us: int) -> None:
         """0 V and pre-operational, whatever the mode."""
-        for frame in self.driver.stop(t_us):
-            self.send(frame, t_us)
+        self._pass_on(exchange.stop(self.record, self.exchange, t_us), t_us)
 
     def request(self, event: Event) -> None:
         """Ask for an event at the next tick: HOME, ENABLE, TRACK, HOLD, DISABLE."""
-        self._event = int(event)
+        self.exchange["event"] = event
 
     def hold_quietly(self, quiet: bool) -> None:
         """Ask for quiet holds, or no longer: less noise and less rejection while the set-point stands still."""
@@ -132,7 +168,9 @@ class Controller:
         """Ask to forget the fault. Once the combs have been at 0 V for long enough, gate, driver and node start anew,
         tick by tick, while the loop goes on; where that failed, it is tried again. Without a fault nothing happens.
         """
-        self._clearing = self.mode == Mode.FAULT or (self.mode < _IDLE and self.driver.state is DriverState.FAILED)
+        self.exchange["clearing"] = self.mode == _FAULT or (
+            self.mode < _IDLE and self.driver.state is DriverState.FAILED
+        )
 
     # -- one tick ---------------------------------------------------------------------------------------------------
 
@@ -142,79 +180,67 @@ class Controller:
         """
         if self._mode[0] < _IDLE:
             self._go_on_starting(t_us)
-        self._begun_us = t_us
-        self.send(self.driver.sync(t_us), t_us)
-        if self._mode[0] == _FAULT:  # 0 V in a drive frame acts at a SYNC only
-            for frame in self.driver.release(t_us):
-                self.send(frame, t_us)
+        self._pass_on(self._begin(self.record, self.exchange, t_us), t_us)
 
     def receive(self, frame: Frame, t_us: int) -> bool:
         """Take a frame from the bus; True once this tick's sense values are there."""
-        for reply in self.driver.receive(frame, t_us):
-            self.send(reply, t_us)
-        if self._sense.fresh:
-            return True
-        self._others.note(frame, t_us)
-        return False
+        can_id, data, flags = frame
+        length = len(data)
+        word = _word(data)[0] if length == 8 else word_of(data)
+        told = self._on_frame(self.record, self.exchange, can_id, flags, length, word, t_us)
+        if told > FRESH:
+            for reply in self.driver.told(frame, told, t_us):
+                self.send(reply, t_us)
+        return bool(told & FRESH)
 
-    def compute(self, reference: NDArray[np.void], overrun: int) -> None:
+    def compute(self, reference: Records, overrun: int) -> None:
         """Run the cycle on what has come since the SYNC. ``reference`` (n,) of ``REFERENCE``;
         ``overrun`` ticks skipped before this one. Raises ValueError for another reference.
         """
-        mode = self._mode
-        was = mode[0]
-        if self._clearing:
-            self._event = int(Event.CLEAR) if was == _FAULT else self._event
-        self.missed_ticks += overrun
-        c1, c2, c3, status = self._sense.take()
-        if status & 1:
-            self.missed_ticks += int(NODE_EXPECTED[was])  # a node that we took out of operation owes none
-        else:
-            self._others.forget(self._begun_us)
-        if self._blocked:
-            self.memory["input"]["trips"] = self._blocked
-            self._blocked = 0
         if reference is not self._reference:
             _require_rows(reference)
             self._reference = reference
-        self._cycle(self.law, self.memory, reference, self._event, status, self.driver.node_events, overrun, c1, c2, c3)
-        self._event = 0
-        if mode[0] != was:
-            self._enter(was)
+        left = self._period(self.record, self.exchange, reference, overrun)
+        if left >= 0:
+            self._enter()
 
     def finish(self, t_us: int, heartbeat_until_us: int) -> None:
         """Send the voltages of this tick, and our heartbeat behind them if it is due
         and still fits before the next SYNC.
         """
-        driver = self.driver
-        a, b, c = self._count
-        self.send(driver.drive((a, b, c), t_us), t_us)
-        heartbeat = driver.heartbeat_due(t_us)
-        if heartbeat is not None and t_us <= heartbeat_until_us:
-            self.send(heartbeat, t_us)
-            driver.heartbeat_sent(t_us)
+        self._pass_on(self._finish(self.record, self.exchange, t_us, heartbeat_until_us), t_us)
 
     def send(self, frame: Frame, t_us: int) -> None:
-        """Send a frame, if the gate lets it pass; a voltage that it blocks becomes 0 V, and the next tick a fault."""
+        """Send a frame of the start-up, if the gate lets it pass; else the next tick is a fault."""
         reason = self.gate.check(frame, self._mode[0], t_us)
         if reason is None:
             self._send(frame)
             return
         self.faults.append(reason)
-        self._blocked = int(Trip.GATE_BLOCKED)
-        if frame.can_id == self.driver.drive_id:
-            self.driver.revoke_drive()
-            discharged = self.driver.drive((0, 0, 0), t_us)
-            if self.gate.check(discharged, self._mode[0], t_us) is None:
-                self._send(discharged)
+        self.exchange["blocked"] = 1
+
+    def _pass_on(self, told: int, t_us: int) -> None:
+        """Send what the compiled part wants to send and may; a voltage that may not be sent is 0 V in the next."""
+        if told == 1:  # the short way, for speed
+            data, can_id, flags, length, _ = _unpack(self._out, 0)
+            self._send(_new_tuple(Frame, (can_id, data if length == 8 else data[:length], flags)))
+            return
+        for at in _PLACES[: told & BLOCKED - 1]:
+            data, can_id, flags, length, reason = _unpack(self._out, at)
+            frame = _new_tuple(Frame, (can_id, data[:length], flags))
+            if reason == 0:
+                self._send(frame)
+            else:
+                held = self.exchange["held_against"][0] if can_id == self.driver.drive_id else self.gate.memory
+                self.faults.append(self.gate.blocked(frame, self._mode[0], reason, held[0], t_us))
 
     # -- modes ------------------------------------------------------------------------------------------------------
 
     def _go_on_starting(self, t_us: int) -> None:
         """After a clear: one step of the start-up at the beginning of a tick, without waiting for anything."""
-        driver = self.driver
-        if self._restart_due or (self._clearing and driver.state is DriverState.FAILED):
-            self._restart_due = self._clearing = False
+        driver, asked = self.driver, self.exchange[0]
+        if asked["restart_due"] or (asked["clearing"] and driver.state is DriverState.FAILED):
+            asked["restart_due"] = asked["clearing"] = 0
             self._restarting = True
             self.gate.clear()
             frames = driver.start(t_us)
@@ -225,32 +251,40 @@ class Controller:
         if driver.state is DriverState.FAILED and self._restarting:
             self._restarting = False
             self.faults.append(f"start-up after a clear: {driver.failure}{self._complaints}")
-            self._event = int(Event.NODE_LOST)
+            asked["event"] = int(Event.NODE_LOST)
         elif driver.state is DriverState.CONFIGURING or (
             driver.state is DriverState.OPERATIONAL and self.mode == Mode.BOOT  # found and configured within one tick
         ):
-            self._event = int(Event.NODE_FOUND)
+            asked["event"] = int(Event.NODE_FOUND)
         elif driver.state is DriverState.OPERATIONAL:
-            self._event = int(Event.NODE_READY)
+            asked["event"] = int(Event.NODE_READY)
 
     def _apply(self, event: Event) -> None:
         """Let an event of the start-up act on the mode, before there are ticks."""
         self._mode[0] = next_mode(self.mode, int(event))
 
-    def _enter(self, was: int) -> None:
-        if was == Mode.FAULT:
-            self._restart_due = True
+    def _enter(self) -> None:
         if self.mode == Mode.FAULT:
             self._discard_unsent()
-            row = self.memory["row"][0]
+            row, begun_us = self.memory["row"][0], int(self.exchange["begun_us"][0])
             reason = explain(int(row["trips"]))
-            emergencies = "".join(f"\n{e.told_at(self._begun_us)}." for e in self.driver.emergencies)
+            emergencies = "".join(f"\n{e.told_at(begun_us)}." for e in self.driver.emergencies)
             detail = "".join(f" [{words}]" for words in (self.driver.failure, self.driver.foreign) if words)
             self.faults.append(f"at {row['t_us'] * 1e-6:.4f} s: {reason}{detail}{emergencies}{self._complaints}")
 
     @property
     def _complaints(self) -> str:
-        return f"{self._others.complaint}{self._port_complaint()}"
+        return f"{complaint(self.exchange['others'][0, 0])}{self._port_complaint()}"
+
+
+def part(records: Records, *names: str) -> Records:
+    """The records of a field, in the place where they stand in ``records`` (1,); (1,) for one that is no array."""
+    dtype, at = records.dtype, 0
+    for name in names:
+        inner, offset = dict(dtype.fields or {})[name][:2]
+        dtype, at, shape = inner.base, at + offset, inner.shape or (1,)
+    found: Records = np.ndarray(shape, dtype, records.data, at)
+    return found
 
 
 def _require_rows(reference: NDArray[np.void]) -> None:

@@ -190,19 +190,6 @@ def respond(law_array: Records, memory_array: Records) -> None:
 
 
 @njit(cache=True, error_model="numpy")
-def cycle_on(
-    law_array: Records, memory_array: Records, reference: Records,
-    event: int, sense_status: int, node_events: int, overrun: int, count_1: int, count_2: int, count_3: int,
-) -> None:  # fmt: skip
-    """``cycle`` with its ``INPUT`` handed in, trips excepted: each number costs less than its way into the memory."""
-    seen = memory_array[0]["input"]
-    seen["event"], seen["sense_status"] = event, sense_status
-    seen["node_events"], seen["overrun"] = node_events, overrun
-    seen["sense_count"][0], seen["sense_count"][1], seen["sense_count"][2] = count_1, count_2, count_3
-    cycle(law_array, memory_array, reference)
-
-
-@njit(cache=True, error_model="numpy")
 def _asked(law: np.void, memory: np.void) -> int:
     """The event of this tick: what came in, else the next step of the automatic start. Nobody enables before homing."""
     event = memory["input"]["event"]

@@ -13,7 +13,7 @@ from pkxyz_ctrl.loop import cycle as cycling
 Records = NDArray[np.void]
 Array = NDArray[np.float64]
 Period = Callable[..., Any]
-"""Called as ``cycle.cycle`` is, or as ``cycle.cycle_on``."""
+"""Called as ``cycle.cycle`` is."""
 
 
 def period_of(law: Records, reference: Records) -> Period:
@@ -24,14 +24,6 @@ def period_of(law: Records, reference: Records) -> Period:
     if law["tick"]["kind"][0] == PREDICTIVE:
         return _planning(law)
     return direct(cycling.cycle, law, cycling.new_memory(), reference)
-
-
-def period_on(law: Records, reference: Records) -> Period:
-    """``cycle.cycle_on`` for a law, as ``period_of``."""
-    if law["tick"]["kind"][0] == PREDICTIVE:
-        on: Period = _planning(law).on
-        return on
-    return direct(cycling.cycle_on, law, cycling.new_memory(), reference, *[0] * 7)
 
 
 def _planning(law: Records) -> Any:

@@ -60,16 +60,6 @@ class PredictiveCycle:
                 self._rehearse(*self._again)
         self._respond(law, memory)
 
-    def on(
-        self, law: Records, memory: Records, reference: Records, event: int, sense_status: int, node_events: int,
-        overrun: int, count_1: int, count_2: int, count_3: int,
-    ) -> None:  # fmt: skip
-        """One period with its input handed in, as ``cycle.cycle_on``."""
-        seen = memory["input"][0]
-        seen["event"], seen["sense_status"], seen["node_events"] = event, sense_status, node_events
-        seen["overrun"], seen["sense_count"] = overrun, (count_1, count_2, count_3)
-        self(law, memory, reference)
-
 
 @njit(cache=True, error_model="numpy")
 def plan(

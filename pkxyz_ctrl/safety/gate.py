@@ -100,11 +100,18 @@ class TransmitGate:
     ``memory`` (1,) of ``gate_rules.GATE_MEMORY`` is all that it remembers.
     """
 
-    def __init__(self, config: GateConfig) -> None:
+    def __init__(
+        self, config: GateConfig, record: NDArray[np.void] | None = None, memory: NDArray[np.void] | None = None
+    ) -> None:
+        """``record`` and ``memory``: where they are to stand."""
         self.config = config
         self.latched = ""
         self.record = config.record
-        self.memory = new_gate_memory()
+        if record is not None:
+            record[0] = self.record[0]
+            self.record = record
+            self.record.setflags(write=False)
+        self.memory = new_gate_memory() if memory is None else memory
         self._check = direct(gate_rules.check, self.record, self.memory, *[0] * 6)
 
     @property
@@ -118,16 +125,18 @@ class TransmitGate:
         length = len(data)
         word = int.from_bytes(data if length <= _HEAD else data[:_HEAD], "little", signed=True)
         reason = self._check(self.record, self.memory, can_id, flags, length, word, mode, t_us)
-        return None if reason == 0 else self._blocked(frame, mode, reason, word, t_us)
+        return None if reason == 0 else self.blocked(frame, mode, reason, self.memory[0], t_us)
 
     def clear(self) -> None:
         """Let the mode's frames pass again. What was sent last stays remembered, so the slew limit holds across it."""
         self.latched = ""
         gate_rules.clear(self.memory)
 
-    def _blocked(self, frame: Frame, mode: int, reason: int, word: int, t_us: int) -> str:
+    def blocked(self, frame: Frame, mode: int, reason: int, held: np.void, t_us: int) -> str:
+        """The words for a frame that was not let through; ``held``: the memory that it was held against."""
+        word = int.from_bytes(frame.data[:_HEAD], "little", signed=True)
         known_mode = Mode(mode).name if mode in list(Mode) else f"unknown mode {mode}"
-        words = _words(reason, self.record[0], self.memory[0], len(frame.data), word, t_us)
+        words = _words(reason, self.record[0], held, len(frame.data), word, t_us)
         told = f"frame 0x{frame.can_id:03X} [{bytes(frame.data).hex(' ')}] blocked in {known_mode}: {words}"
         self.latched = self.latched or told
         return told

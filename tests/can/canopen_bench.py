@@ -7,8 +7,8 @@ import canopen
 
 from pkxyz_ctrl.can.driver import AmplifierDriver
 from pkxyz_ctrl.can.driver_config import DriverConfig
+from pkxyz_ctrl.can.driver_rules import DriverState
 from pkxyz_ctrl.can.frame import Frame
-from pkxyz_ctrl.can.start_sequence import DriverState
 
 EDS = str(Path(__file__).resolve().parents[2] / "configs" / "comb_amplifier.eds")
 FRAME_US = 100

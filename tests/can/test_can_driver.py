@@ -30,9 +30,9 @@ from pkxyz_ctrl.can.driver import (
     AmplifierDriver,
 )
 from pkxyz_ctrl.can.driver_config import DriverConfig
+from pkxyz_ctrl.can.driver_rules import DriverState
 from pkxyz_ctrl.can.frame import Frame
 from pkxyz_ctrl.can.sense_input import SENSE_MISSING
-from pkxyz_ctrl.can.start_sequence import DriverState
 
 # -- the loop ---------------------------------------------------------------------------------------------------------
 

@@ -13,10 +13,10 @@ from canopen_bench import FRAME_US, Bench
 
 from pkxyz_ctrl.can.driver import NODE_REBOOTED
 from pkxyz_ctrl.can.driver_config import DriverConfig, ProvenModule
+from pkxyz_ctrl.can.driver_rules import DriverState
 from pkxyz_ctrl.can.frame import Frame
 from pkxyz_ctrl.can.process_pdo import crc8
 from pkxyz_ctrl.can.sense_input import SENSE_COUNTER, SENSE_MISSING
-from pkxyz_ctrl.can.start_sequence import DriverState
 from pkxyz_ctrl.can.startup import settings
 
 

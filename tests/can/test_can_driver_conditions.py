@@ -18,7 +18,8 @@ from scripted_node import (
 from pkxyz_ctrl.can.codec import CountsOutOfRangeError, ProcessCodec
 from pkxyz_ctrl.can.driver import FOREIGN_FRAME, NODE_EMERGENCY, NODE_REBOOTED, AmplifierDriver
 from pkxyz_ctrl.can.driver_config import DriverConfig
-from pkxyz_ctrl.can.start_sequence import DriverState, StartSequence
+from pkxyz_ctrl.can.driver_rules import DriverState
+from pkxyz_ctrl.can.start_sequence import StartSequence
 
 HEARTBEAT_ERROR, OTHER_ERROR, RESET_ERROR = "30 81 11", "00 10 01", "00 00 00"
 

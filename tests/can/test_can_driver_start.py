@@ -25,9 +25,9 @@ from pkxyz_ctrl.can.driver import (
     AmplifierDriver,
 )
 from pkxyz_ctrl.can.driver_config import DriverConfig
+from pkxyz_ctrl.can.driver_rules import DriverState
 from pkxyz_ctrl.can.frame import Frame
 from pkxyz_ctrl.can.sense_input import SENSE_MISSING
-from pkxyz_ctrl.can.start_sequence import DriverState
 
 
 def test_start_up_word_for_word():

@@ -20,10 +20,10 @@ from hil.node.amplifier import AmplifierNode, NmtState
 from pkxyz_ctrl.can.codec import ProcessCodec
 from pkxyz_ctrl.can.driver import AmplifierDriver
 from pkxyz_ctrl.can.driver_config import DriverConfig
+from pkxyz_ctrl.can.driver_rules import DriverState
 from pkxyz_ctrl.can.emergency import decode_emergency
 from pkxyz_ctrl.can.frame import ERROR, EXTENDED, FD_FAST, REMOTE, UNUSUAL, Frame
 from pkxyz_ctrl.can.sdo import parse_reply
-from pkxyz_ctrl.can.start_sequence import DriverState
 from pkxyz_ctrl.can.startup import configuration_steps, identity_steps
 from pkxyz_ctrl.safety.gate import GateConfig, TransmitGate
 from pkxyz_ctrl.safety.modes import Mode

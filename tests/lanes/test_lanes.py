@@ -19,7 +19,6 @@ from pkxyz_ctrl.config.controller import ControllerConfig
 from pkxyz_ctrl.config.files import ConfigError, load
 from pkxyz_ctrl.loop.controller import StartUpError
 from pkxyz_ctrl.loop.row import ROW
-from pkxyz_ctrl.safety.gate import TransmitGate
 from pkxyz_ctrl.safety.modes import Mode
 
 PLANTS = ("nominal", "mild", "harsh", "lab")
@@ -173,7 +172,7 @@ def test_a_frame_that_our_own_gate_blocks_ends_the_start_up_with_its_reason():
     """Nobody would ever answer it: saying that the amplifier doesn't would send people to the wiring."""
     short = shortened(setup(), 10)
     rig = LockstepRig(short)
-    rig.controller.gate = TransmitGate(dataclasses.replace(short.gate, heartbeat_timeout_max_ms=40))
+    rig.controller.record["gate"]["writes"]["timeout_max_ms"] = 40
     blocks = Blocks(short.trajectory, short.bus.period_us, 10, lambda _: None, lambda *_: None)
     with pytest.raises(StartUpError, match=r"consumer of our heartbeat\): 0x7F0032 is not permitted"):
         rig.run(blocks)

@@ -13,8 +13,8 @@ from hil.faults.fault import parse
 from hil.lanes.blocks import Blocks
 from hil.lanes.lockstep import LockstepRig
 from hil.studies.faults.outcome import setup_for
+from pkxyz_ctrl.can.driver_rules import DriverState
 from pkxyz_ctrl.can.frame import Frame
-from pkxyz_ctrl.can.start_sequence import DriverState
 from pkxyz_ctrl.loop.controller import Controller
 from pkxyz_ctrl.safety.modes import Mode
 
@@ -117,13 +117,14 @@ def test_a_voltage_that_the_gate_holds_back_becomes_0_v_under_the_same_alive_cou
 
     def each_tick(controller, tick):
         if tick == 1100:  # a law whose numbers run away, behind all that looks at it
-            encode = controller.driver.drive
+            finish = controller._finish
 
-            def runaway(counts, t_us):
-                controller.driver.drive = encode
-                return encode((32767, 32767, 32767), t_us)
+            def runaway(config, memory, t_us, until_us):
+                controller._finish = finish
+                controller.memory["tick"]["count"][0, 0] = 32767
+                return finish(config, memory, t_us, until_us)
 
-            controller.driver.drive = runaway
+            controller._finish = runaway
 
     watched = Watched(each_tick)
     (told,) = [words for words in watched.rig.controller.faults if "GATE_BLOCKED" in words]

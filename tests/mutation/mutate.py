@@ -52,6 +52,8 @@ TARGETS = {
         "can/test_can_sdo.py",
         "loop/test_overrun.py",
     ),
+    "pkxyz_ctrl.can.driver_rules": ("can/test_can_driver.py", "can/test_can_driver_start.py", "loop/test_overrun.py"),
+    "pkxyz_ctrl.loop.exchange": ("loop/test_controller.py", "loop/test_overrun.py", "loop/test_flood.py"),
     "pkxyz_ctrl.loop.controller": ("loop/test_controller.py", "loop/test_overrun.py", "loop/test_flood.py"),
     "pkxyz_ctrl.learning.store": ("learning/test_learning_store.py", "learning/test_learning.py"),
     "hil.node.drive": _NODE,

@@ -12,8 +12,8 @@ from hil.node.sense import Plant
 from hil.plant.on_bus import PlantOnBus
 from pkxyz_ctrl.can.driver import AmplifierDriver
 from pkxyz_ctrl.can.driver_config import DriverConfig
+from pkxyz_ctrl.can.driver_rules import DriverState
 from pkxyz_ctrl.can.frame import Frame
-from pkxyz_ctrl.can.start_sequence import DriverState
 from sim.config import PlantConfig
 from sim.config.device import Device
 from sim.plant import Plant as SimPlant

@@ -13,8 +13,8 @@ from hil.conformance.verdict import Verdict
 from hil.node.amplifier import AmplifierNode
 from pkxyz_ctrl.can.driver import AmplifierDriver
 from pkxyz_ctrl.can.driver_config import DriverConfig
+from pkxyz_ctrl.can.driver_rules import DriverState
 from pkxyz_ctrl.can.frame import Frame
-from pkxyz_ctrl.can.start_sequence import DriverState
 from pkxyz_ctrl.config.bus import BusConfig
 from pkxyz_ctrl.config.files import load
 

@@ -8,8 +8,8 @@ from configurations import HARD, LEVELS, MAXIMUM, SOFT, STEP, TOO_FAR
 
 from hil.node.amplifier import NmtState
 from pkxyz_ctrl.can.codec import Counts
+from pkxyz_ctrl.can.driver_rules import DriverState
 from pkxyz_ctrl.can.frame import Frame
-from pkxyz_ctrl.can.start_sequence import DriverState
 from pkxyz_ctrl.loop.controller import Controller
 from pkxyz_ctrl.safety.modes import Event, Mode
 

@@ -31,6 +31,7 @@ MODULES = (
     "pkxyz_ctrl.can.codec",
     "pkxyz_ctrl.can.process_pdo",
     "pkxyz_ctrl.can.driver",
+    "pkxyz_ctrl.can.driver_rules",
     "pkxyz_ctrl.can.sense_input",
     "hil.node.drive",
     "hil.node.amplifier",

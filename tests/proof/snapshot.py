@@ -28,22 +28,29 @@ import numpy as np
 
 from hil.node.amplifier import AmplifierNode
 from hil.node.object_dictionary import ObjectDictionary
+from pkxyz_ctrl.can.driver_rules import DriverState
 from pkxyz_ctrl.can.sdo import SdoDialogue
-from pkxyz_ctrl.can.start_sequence import DriverState, StartSequence
+from pkxyz_ctrl.can.start_sequence import StartSequence
 from pkxyz_ctrl.loop.controller import Controller
 
 DRIVE_ID = 0x30A
 LONG_US = 60_000  # three ticks
 _NEVER_US = 1 << 61
 
+# Words; and frames, which are gone before anything else happens.
+_DRIVER_WORDS = (
+    "silent_us", "failed_state", "foreign_id", "foreign_length", "foreign_data",
+    "emergency", "emergency_us", "outgoing",
+)  # fmt: skip
+
 # What nothing that decides reads: words, statistics, copies for SDO.
 UNREAD = {
     ("Controller", "faults"),
-    ("Controller", "missed_ticks"),
     ("Controller", "_reference"),
     ("TransmitGate", "memory.blocked_frames"),
     ("AmplifierDriver", "emergencies"),
     ("AmplifierDriver", "lost"),
+    *(("AmplifierDriver", f"memory.{name}") for name in _DRIVER_WORDS),
     ("StartSequence", "lost"),
     ("StartSequence", "_never_booted"),  # words
     ("DriveReceiver", "crc"),
@@ -62,23 +69,20 @@ UNREAD = {
     *(("SenseInput", f"memory.count[{place}]") for place in range(3)),
 }
 TEXTS = {
-    ("Controller", "_blocked"),
     ("TransmitGate", "latched"),
     ("TransmitGate", "memory.latched"),
-    ("AmplifierDriver", "failure"),
+    ("AmplifierDriver", "memory.failure"),
     ("StartSequence", "failure"),
     ("SdoDialogue", "failure"),
 }
 INSTANTS = {("TransmitGate", "memory.time_us"), ("Alarm", "due_us")}
-AGES = {("TransmitGate", "memory.time_us"), ("AmplifierDriver", "_node_heartbeat_us"), ("SenseTransmitter", "_sync_us")}
+AGES = {("TransmitGate", "memory.time_us"), ("SenseTransmitter", "_sync_us")}
+AGES.add(("AmplifierDriver", "memory.node_heartbeat_us"))
 DURATIONS = {"_cycle_us", "_period_us", "_time_us", "_event_us", "_drive_timeout_us"}
 DRIVE_COUNTERS = {("TransmitGate", "memory.counter"), ("TransmitGate", "memory.counter_next")}
 SENSE_COUNTERS = {("SenseInput", "memory.counter")}
-SENT_COUNTERS = {
-    ("AmplifierDriver", "_drive_counter"),
-    ("SenseTransmitter", "counter"),
-    ("AmplifierDriver", "_sync_index"),
-}
+SENT_COUNTERS = {("AmplifierDriver", f"memory.{name}") for name in ("drive_counter", "sync_count")}
+SENT_COUNTERS.add(("SenseTransmitter", "counter"))
 SATURATED = {("TransmitGate", "memory.syncs"): 2, ("AmplifierNode", "_silent_syncs"): 4}
 DICTIONARY_UNREAD = {0x1001, 0x1003, 0x2000, 0x2001, 0x6401, 0x6411}
 
@@ -87,7 +91,7 @@ _MONITORS_UNREAD = (
     "unexplained_trend_n", "commanded_trend_n", "commanded_n", "moved_n", "frozen", "frozen_sense_count",
 )  # fmt: skip
 
-CONSTANT_KINDS = {"OtherTraffic", "PdoParameters", "ProcessCodec", "NodeObjects", "ObjectDictionary"}
+CONSTANT_KINDS = {"PdoParameters", "ProcessCodec", "NodeObjects", "ObjectDictionary"}
 CONSTANT = {
     "_w0", "_w1", "_w2", "_heartbeat_frame", "_sense_id", "_drive_id", "_sdo_request_id", "_sdo_response_id",
     "_emergency_id", "_node_heartbeat_id", "_flags_sent", "period_us", "_heartbeat_period_us", "_node_timeout_us",
@@ -95,9 +99,10 @@ CONSTANT = {
     "_protected", "_limit", "config", "_config", "_heartbeat", "can", "law", "row", "_consumers", "_plant",
 }  # fmt: skip
 
-RECORDS = {"TransmitGate", "SenseInput"}
+RECORDS = {"AmplifierDriver", "TransmitGate", "SenseInput"}
 """Whose ``memory`` is a record of integers: each field is an attribute, ``memory.counter``."""
 
+_NOT_CONSTANT = {("StartSequence", "_dialogue"), ("DriveReceiver", "receive"), ("AmplifierNode", "_receivers")}
 _MUTABLE = {list, dict, set, deque, bytearray}
 
 
@@ -124,11 +129,7 @@ def _is_constant(kind: str, name: str, value: object) -> bool:
         return True
     if name == "memory":
         return kind not in RECORDS
-    if (kind, name) in {
-        ("StartSequence", "_dialogue"),
-        ("DriveReceiver", "receive"),
-        ("AmplifierNode", "_receivers"),
-    }:
+    if (kind, name) in _NOT_CONSTANT:
         return False
     return callable(value) or _is_ours(value) or isinstance(value, np.ndarray | memoryview)
 
@@ -154,10 +155,8 @@ def _rule(kind: str, name: str, x: str) -> str | None:
 
 RULES = {
     # any counter may come first once drive frames are let in again
-    (
-        "DriveReceiver",
-        "counter",
-    ): f"None if {{x}} is None or {DRIVE_ID} not in node._receivers else {{x}} - drive & 255",
+    ("DriveReceiver", "counter"): f"None if {{x}} is None or {DRIVE_ID} not in node._receivers"
+    " else {x} - drive & 255",
     # measured anew at the next SYNC, read in the turn-around behind it
     ("SenseTransmitter", "_cycle_us"): "{x} if node._sense._due_us is not None else 0",
     ("", "_sync_expected"): "{x} and ({x}[0] - sync) % 240",
@@ -243,7 +242,8 @@ class Snapshot:
         self._start_up = controller.driver._start_up
         self._memory = controller.memory
         self._safe_cycles = int(controller.law["limits"]["safe_cycles"][0])
-        self._bytes = controller.memory.view(np.uint8)
+        self._exchange, self._bytes = controller.exchange, controller.exchange.view(np.uint8)
+        self._cycle = controller.memory.view(np.uint8)
         self._entries = [entry for entry in node.od if entry.access != "const"]
         self._named = [i for i, e in enumerate(self._entries) if e.index not in DICTIONARY_UNREAD]
         self._mask = _mask_of(controller.memory.dtype)
@@ -303,9 +303,10 @@ class Snapshot:
         record = self._memory[0]
         homing = int(record["homing_count"]) if record["mode"] == 3 else 0
         named = self._name(held, bases.now_us, bases.drive, bases.sense, bases.sync)
-        memory = (self._bytes & self._mask).tobytes()
+        memory = (self._cycle & self._mask).tobytes()
+        asked = tuple(int(self._exchange[name][0]) for name in ("blocked", "event", "clearing", "restart_due"))
         dialogue = _dialogue(self._start_up, bases.now_us) if self._driver.state in _IN_DIALOGUE else None
-        parts = (more, named, homing, dialogue, min(int(record["safe_cycles"]), self._safe_cycles), memory)
+        parts = (more, named, homing, asked, dialogue, min(int(record["safe_cycles"]), self._safe_cycles), memory)
         digest = hashlib.blake2b(marshal.dumps(parts, 2), digest_size=12)
         digest.update(dictionary[1])
         return digest.digest()
@@ -323,7 +324,7 @@ class Snapshot:
         for i in self._named:
             entry = self._entries[i]
             found[f"{entry.index:04X}:{entry.subindex}"] = taken[2][0][i]
-        record = np.frombuffer(taken[3], self._memory.dtype)[0]
+        record = np.frombuffer(taken[3], self._exchange.dtype)[0]["cycle"][0]
         for name in ("input", "monitors", "mode", "homed", "homing_count", "safe_cycles"):
             found[f"memory.{name}"] = str(record[name])
         found["memory.count"] = str(record["tick"]["count"][0])
@@ -364,10 +365,12 @@ def _mask_of(dtype: np.dtype[Any]) -> np.ndarray[Any, Any]:
 
 
 def _layout_of(dtype: np.dtype[Any]) -> tuple[list[str], str]:
-    """Names of all numbers in a record, and its bytes as ``struct`` reads them."""
+    """Names of all numbers in a record itself, and its bytes as ``struct`` reads them."""
     names, layout, end = [], "<", 0
     assert dtype.fields is not None
     for name, (inner, offset) in ((name, dtype.fields[name][:2]) for name in dtype.names or ()):
+        if inner.base.fields:  # somebody else's
+            continue
         count = int(np.prod(inner.shape, dtype=int))
         layout += f"{offset - end}x{count}{inner.base.char}"
         names += [name] if count == 1 else [f"{name}[{place}]" for place in range(count)]

@@ -11,6 +11,7 @@ from typing import Any
 
 import pytest
 from configurations import CONFIGURATIONS, LEVELS, Configuration
+from defective.kernels import drives_always, without_gate
 from explore import Explored, explore, settle
 from story import as_text, from_text, tell
 from world import World, learnt
@@ -18,9 +19,8 @@ from world import World, learnt
 from hil.node.amplifier import AmplifierNode
 from hil.node.drive import DriveReceiver
 from hil.node.heartbeat import HeartbeatConsumer
-from pkxyz_ctrl.can.driver import AmplifierDriver
-from pkxyz_ctrl.can.frame import Frame
-from pkxyz_ctrl.can.start_sequence import DriverState, StartSequence
+from pkxyz_ctrl.can.driver_rules import DriverState
+from pkxyz_ctrl.can.start_sequence import StartSequence
 from pkxyz_ctrl.loop.controller import Controller
 from pkxyz_ctrl.safety.gate import TransmitGate
 from pkxyz_ctrl.safety.modes import Event, Mode
@@ -122,7 +122,7 @@ def _old_start_up(patch: pytest.MonkeyPatch) -> None:
     def go_on(controller: Controller, t_us: int) -> None:
         shipped(controller, t_us)
         if controller.mode == Mode.BOOT and controller.driver.state is DriverState.OPERATIONAL:
-            controller._event = int(Event.NODE_READY)
+            controller.exchange["event"] = Event.NODE_READY
 
     patch.setattr(Controller, "_go_on_starting", go_on)
 
@@ -164,12 +164,7 @@ def _deaf_to_silence(patch: pytest.MonkeyPatch) -> None:
 def _unhomed(patch: pytest.MonkeyPatch) -> None:
     """A gate that knows no modes, behind a controller that sends a voltage in all of them."""
     patch.setattr(TransmitGate, "check", lambda gate, frame, mode, t_us: None)
-    shipped = AmplifierDriver.drive
-
-    def drive(driver: AmplifierDriver, counts: tuple[int, int, int], t_us: int) -> Frame:
-        return shipped(driver, (10, 10, 0), t_us)
-
-    patch.setattr(AmplifierDriver, "drive", drive)
+    without_gate(patch, drive=drives_always)
 
 
 def _no_way_back(patch: pytest.MonkeyPatch) -> None:
@@ -180,6 +175,7 @@ def _no_way_back(patch: pytest.MonkeyPatch) -> None:
 def _no_gate(patch: pytest.MonkeyPatch) -> None:
     """No gate at all: the law's 21 counts reach a node whose own limit is far away."""
     patch.setattr(TransmitGate, "check", lambda gate, frame, mode, t_us: None)
+    without_gate(patch)
     _no_step_limit(patch)
 
 

@@ -47,9 +47,9 @@ from snapshot import Attributes, Bases, Snapshot
 from hil.bus.clock import Lockstep
 from hil.node.amplifier import AmplifierNode
 from pkxyz_ctrl.can.codec import Counts, ProcessCodec
-from pkxyz_ctrl.can.driver import AmplifierDriver
+from pkxyz_ctrl.can.driver_rules import DriverState
 from pkxyz_ctrl.can.frame import Frame
-from pkxyz_ctrl.can.start_sequence import DriverState, StartSequence
+from pkxyz_ctrl.can.start_sequence import StartSequence
 from pkxyz_ctrl.loop.controller import Controller, StartUpError
 from pkxyz_ctrl.safety.gate import GateConfig
 from pkxyz_ctrl.safety.modes import MAY_ENERGISE, Event, Mode
@@ -75,9 +75,9 @@ class World:
         self.held: tuple[Held, ...] = ()
         self.plant = Plant(lambda: self.node.state)
         few = {} if configuration.whole_dialogue else {"survey": few_questions, "plan": few_writes}
-        amplifier = AmplifierDriver(driver, STEP, StartSequence(driver, STEP, **few))
-        amplifier.sense.record["syncs_uncountable"] = 4
-        self.controller = Controller(self.law, bus, gate, self._from_controller, driver=amplifier)
+        start_up = StartSequence(driver, STEP, **few)
+        self.controller = Controller(self.law, bus, gate, self._from_controller, start_up=start_up)
+        self.controller.driver.sense.record["syncs_uncountable"] = 4
         self.node = AmplifierNode(
             NODE_ID, self.clock, self.wire.append, self.plant, EDS,
             turnaround_us=TURNAROUND_US, fd=driver.fd, protection=driver.protection, error_hold_us=30_000,
@@ -128,8 +128,9 @@ class World:
         self._snapshot.put(rest)
 
     def bases(self) -> Bases:
-        driver = self.controller.driver
-        return Bases(self.clock.now_us, driver._drive_counter, self.node._sense.counter, driver._sync_index)
+        driver: Any = self.controller.driver.memory[0]
+        counters = int(driver["drive_counter"]), self.node._sense.counter, int(driver["sync_count"])
+        return Bases(self.clock.now_us, *counters)
 
     def key(self, state: tuple[Any, ...]) -> bytes:
         mine, rest = state
@@ -317,7 +318,7 @@ class World:
         self.skipped = 0
         if MAY_ENERGISE[controller.mode] and not MAY_ENERGISE[was] and self.quiet < SETTLED:
             raise ViolationError(f"the loop is closed after {self.quiet} quiet ticks, {SETTLED} are asked for")
-        is_quiet = fresh and not any(controller._count)
+        is_quiet = fresh and not controller.memory["tick"]["count"][0, 0].any()
         self.quiet = min(self.quiet + 1, SETTLED) if is_quiet else 0
         self.phase = "finish"
 

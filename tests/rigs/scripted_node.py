@@ -2,8 +2,8 @@
 
 from pkxyz_ctrl.can.driver import AmplifierDriver
 from pkxyz_ctrl.can.driver_config import DriverConfig
+from pkxyz_ctrl.can.driver_rules import DriverState
 from pkxyz_ctrl.can.frame import Frame
-from pkxyz_ctrl.can.start_sequence import DriverState
 
 BOOT_UP, OPERATIONAL, PRE_OPERATIONAL, STOPPED = "00", "05", "7f", "04"
 RESET, START = "000 81 0a", "000 01 0a"

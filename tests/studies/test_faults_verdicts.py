@@ -5,13 +5,13 @@ from functools import cache
 
 import numpy as np
 import pytest
+from defective.kernels import planted, says_nothing
 
 from hil.node.amplifier import AmplifierNode
 from hil.studies.faults.matrix import CASES
 from hil.studies.faults.outcome import RISE_V, largest_rise_v, largest_step_v, run_case, setup_for
-from pkxyz_ctrl.can.driver import AmplifierDriver
-from pkxyz_ctrl.can.sense_input import SenseInput
 from pkxyz_ctrl.config.controller import ControllerConfig
+from pkxyz_ctrl.loop import exchange
 from pkxyz_ctrl.loop.controller import Controller
 
 
@@ -46,14 +46,14 @@ def exceeds(self, counts, t_us):
     [
         (AmplifierNode, "_apply", steps, "sense.1:off", "a step of 25"),
         (AmplifierNode, "_apply", exceeds, "sense.1:off", "beyond 200 V"),
-        (AmplifierDriver, "release", lambda self, t_us: (), "bus.sync:drop", "not within 0.4 ms"),
-        (SenseInput, "take", None, "bus.sense:drop", "instead of 5"),
+        (exchange, "begin", planted(exchange.begin, release=says_nothing), "bus.sync:drop", "not within 0.4 ms"),
+        (Controller, "__init__", None, "bus.sense:drop", "instead of 5"),
         (Controller, "_enter", None, "bus.sync:drop", "a voltage was commanded in a mode that allows none"),
     ],
 )
 def test_what_is_a_little_beyond_a_bound_is_told(monkeypatch, owner, part, defect, fault, words):
-    if part == "take":
-        defect = forgiving(SenseInput.take)
+    if part == "__init__":
+        defect = forgiving(Controller.__init__)
     if part == "_enter":
         defect = commanding(Controller._enter)
     monkeypatch.setattr(owner, part, defect)
@@ -61,23 +61,19 @@ def test_what_is_a_little_beyond_a_bound_is_told(monkeypatch, owner, part, defec
     assert any(words in problem for problem in problems), problems
 
 
-def forgiving(take):
-    """The first three ticks without a frame pass for ones with the last: the decision comes as much later."""
-    missing = []
+def forgiving(made):
+    """Three more ticks without a frame are forgiven: the decision comes as much later."""
 
-    def forgiven(self):
-        a, b, c, status = take(self)
-        if status & 1 and len(missing) < 3:
-            missing.append(status)
-            return a, b, c, 0
-        return a, b, c, status
+    def forgiving_made(self, *arguments, **named):
+        made(self, *arguments, **named)
+        self.law["limits"]["stale_count"] += 3
 
-    return forgiven
+    return forgiving_made
 
 
 def commanding(enter):
-    def entered(self, mode):
-        enter(self, mode)
+    def entered(self):
+        enter(self)
         self.memory["row"]["drive_count"][0, 1] = 7
 
     return entered
