@@ -77,9 +77,9 @@ def _exported(loaded: "Scenario", ticks: int | None) -> "Exported":
     from hil.runs.scenario import resolve
     from pkxyz_ctrl.can.driver_config import DriverConfig
     from pkxyz_ctrl.export.folder import Exported
+    from pkxyz_ctrl.export.wire import wire_record
     from pkxyz_ctrl.loop.cycle import INPUT
     from pkxyz_ctrl.loop.reference import reference_rows
-    from pkxyz_ctrl.loop.wire import wire_record
 
     setup = loaded.setup()
     rows = (setup.ticks if ticks is None else ticks) + PREVIEW_ROWS

@@ -4,8 +4,8 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
+from pkxyz_ctrl.export import wire as wiring
 from pkxyz_ctrl.loop import cycle as cycling
-from pkxyz_ctrl.loop import wire as wiring
 from pkxyz_ctrl.loop.reference import REFERENCE
 
 

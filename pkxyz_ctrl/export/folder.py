@@ -15,6 +15,7 @@ from numpy.typing import NDArray
 
 from pkxyz_ctrl.compiled.kernel_cache import digest_of_kernels
 from pkxyz_ctrl.core.demand import PREDICTIVE
+from pkxyz_ctrl.export import wire as wiring
 from pkxyz_ctrl.export.elf import loaded_bytes
 from pkxyz_ctrl.export.kernels import ExportError, kernels
 from pkxyz_ctrl.export.lowering import Lowered, lower
@@ -23,7 +24,6 @@ from pkxyz_ctrl.export.structs import header, struct_name
 from pkxyz_ctrl.export.targets import TARGETS, Target
 from pkxyz_ctrl.export.words import CANONICAL_NAN, FNV_OFFSET, FNV_PRIME, c_words, double_words, words_of
 from pkxyz_ctrl.loop import cycle as cycling
-from pkxyz_ctrl.loop import wire as wiring
 from pkxyz_ctrl.loop.row import ROW
 
 Records = NDArray[np.void]

@@ -7,9 +7,9 @@ from numpy.typing import NDArray
 
 from pkxyz_ctrl.can.process_pdo import encode
 from pkxyz_ctrl.compiled.direct_call import direct
+from pkxyz_ctrl.export import wire as wiring
 from pkxyz_ctrl.export.words import FNV_OFFSET, canonical, digest
 from pkxyz_ctrl.loop import cycle as cycling
-from pkxyz_ctrl.loop import wire as wiring
 from pkxyz_ctrl.loop.period import period_of
 from pkxyz_ctrl.safety.modes import Mode
 

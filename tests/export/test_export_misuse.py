@@ -8,8 +8,8 @@ from hil import cli
 from hil.runs.scenario import load_scenario
 from pkxyz_ctrl.export.folder import Exported, write
 from pkxyz_ctrl.export.kernels import ExportError
+from pkxyz_ctrl.export.wire import WIRE
 from pkxyz_ctrl.loop.cycle import INPUT
-from pkxyz_ctrl.loop.wire import WIRE
 
 
 def refused(capsys, monkeypatch, *words):

@@ -6,9 +6,9 @@ import pytest
 from hil.runs.scenario import load_scenario
 from pkxyz_ctrl.can.driver_config import DriverConfig
 from pkxyz_ctrl.export.selftest import Board, self_test
+from pkxyz_ctrl.export.wire import wire_record
 from pkxyz_ctrl.loop.cycle import INPUT
 from pkxyz_ctrl.loop.reference import reference_rows
-from pkxyz_ctrl.loop.wire import wire_record
 from pkxyz_ctrl.safety.gate_rules import Reason
 from pkxyz_ctrl.safety.monitors import SenseStatus
 

@@ -8,7 +8,7 @@ from numpy.typing import NDArray
 
 from pkxyz_ctrl.can.process_pdo import encode
 from pkxyz_ctrl.compiled.direct_call import direct
-from pkxyz_ctrl.loop import wire as wiring
+from pkxyz_ctrl.export import wire as wiring
 from pkxyz_ctrl.safety.gate_rules import Reason
 from pkxyz_ctrl.safety.modes import Mode
 

@@ -39,11 +39,11 @@ from pkxyz_ctrl.export.folder import Exported, write
 from pkxyz_ctrl.export.kernels import Kernels, kernels
 from pkxyz_ctrl.export.lowering import lower
 from pkxyz_ctrl.export.targets import TARGETS
+from pkxyz_ctrl.export.wire import new_wire_memory, wire_record
 from pkxyz_ctrl.export.words import FNV_OFFSET, FNV_PRIME, canonical
 from pkxyz_ctrl.loop import cycle as cycling
 from pkxyz_ctrl.loop.reference import reference_rows
 from pkxyz_ctrl.loop.row import ROW
-from pkxyz_ctrl.loop.wire import new_wire_memory, wire_record
 from pkxyz_ctrl.safety.modes import Mode
 from pkxyz_ctrl.safety.trips import Trip
 
