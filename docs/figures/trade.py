@@ -62,7 +62,7 @@ def draw() -> Figure:
     left.axvline(200.0, color=MUTED, lw=0.8, ls="--")
     bound(left, 1.0, "1 nm", 22, style="--")
     dress(left, "rejection up to (Hz)", "deviation at hold (nm)", "sense noise alone")
-    left.legend(fontsize=8, frameon=False)
+    left.legend(frameon=False)
     right.plot(EDGES_HZ, [least_nm(f, moved) / floor_nm for f in EDGES_HZ], color=BLUE)
     right.plot([203, 30], [1.165 / floor_nm, 0.703 / floor_nm], "o", color=GREEN)
     bound(right, 1.25, "1.25", 150, style="--")

@@ -29,15 +29,15 @@ _GIVES_LEAST = 0.99
 def objection(present: Records, new: Records) -> str | None:
     """Why a stage that works with one law (1,) of ``cycle.LAW`` can't be given another."""
     ours, theirs = present["tick"][0], new["tick"][0]
-    different = [name for name in _SAME if not _alike(present["tick"][name], new["tick"][name])]
-    if different or present["period_us"][0] != new["period_us"][0]:
-        named = ", ".join(different) or "period_us"
-        return f"it is meant for another stage, bus or voltage limit ({named}): end, and serve with it"
     kinds = {int(ours["kind"]), int(theirs["kind"])}
     if PREDICTIVE in kinds:
         return "a predictive law plans beside the tick and is begun with it: end, and serve with it"
     if OPEN_LOOP in kinds and len(kinds) > 1:
         return "open loop has no feedback that could take over the force: end, and serve with it"
+    different = [name for name in _SAME if not _alike(present["tick"][name], new["tick"][name])]
+    if different or present["period_us"][0] != new["period_us"][0]:
+        named = ", ".join(different) or "period_us"
+        return f"it is meant for another stage, bus or voltage limit ({named}): end, and serve with it"
     if theirs["kind"] == LINEAR and _gives_at_rest(theirs["linear"]) < _GIVES_LEAST:
         return "it has no integral action, so it can't take over the force that holds the stage"
     return None

@@ -12,6 +12,7 @@ ALLOWED = {
     ("hil/pictures/aside.py", "pickle"): "from this program to that process, by a pipe of their own",
     ("hil/studies/latency.py", "subprocess"): "cyclictest: from PATH, or the path that was given on the command line",
     ("hil/bench/startup.py", "subprocess"): "this program, timed",
+    ("hil/bench/operate.py", "subprocess"): "this program: what it serves, timed",
     ("hil/server/serving.py", "subprocess"): "this program: the loop and the plant, in processes of their own",
     ("pkxyz_ctrl/export/kernels.py", "subprocess"): "this program, where numba leaves what it compiles unoptimised",
 }
