@@ -282,7 +282,8 @@ def test_start_up_and_scan(bench, plant):
     assert result.differences == []
     assert result.ticks == recording.ticks
     frames = list(can.LogReader(bench / "scan" / "frames.log"))
-    assert sum(frame.arbitration_id == SYNC for frame in frames) == recording.ticks
+    way_down = 12 + 2  # ticks that lead the stage down, and those that begin and end them: no part of the scenario
+    assert sum(frame.arbitration_id == SYNC for frame in frames) == recording.ticks + way_down
 
 
 def test_killed_controller_leaves_0_v_in_the_time_of_its_drive_frames_and_then_no_node_in_operational(bench, plant):
