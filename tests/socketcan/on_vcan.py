@@ -349,7 +349,7 @@ def test_someone_else_who_sends_damaged_sense_frames_is_a_fault(bench, plant):
     plant.seen("pre-operational", False)
 
 
-def test_sigterm_ends_at_0_v_by_the_controller(bench, plant):
+def test_sigterm_leads_down_and_ends_at_0_v_by_the_controller(bench, plant):
     with driving(bench, plant, "--out", "ended", "--replace", "--seconds", "60") as (run, _, _):
         run.signal(signal.SIGTERM)
         code, _, err = run.wait()
@@ -357,7 +357,9 @@ def test_sigterm_ends_at_0_v_by_the_controller(bench, plant):
     assert plant.seen("pre-operational", False)[-2]["driven"]
     log = list(can.LogReader(bench / "ended" / "frames.log"))
     drives = [message for message in log if message.arbitration_id == DRIVE]
-    assert any(drives[-2].data[:6])
-    assert not any(drives[-1].data[:6])
+    highest = [max(struct.unpack_from("<3h", message.data)) for message in drives]
+    last = max(n for n, count in enumerate(highest) if count > 0)
+    assert last < len(highest) - 1
+    assert highest[last] < 0.5 * max(highest)  # led down to rest, not dropped
     first = next(i for i, message in enumerate(log) if message.arbitration_id == DRIVE and any(message.data[:6]))
     assert not any(message.arbitration_id == EMCY for message in log[first:])
