@@ -106,8 +106,9 @@ def operate(browser: Browser, url: str, pictures: Path) -> None:
     activity(browser, "off")
     for verb in ("home", "enable"):
         browser.click(f"[data-do={verb}]")
-        activity(browser, "off" if verb == "home" else "holding")
-    browser.until("document.body.innerText.includes('enable done')")
+        newest = f"document.querySelector('#log').innerText.trim().startsWith('{verb} done')"  # there are older ones
+        browser.until(newest)
+    activity(browser, "holding")
 
 
 def set_up(browser: Browser, pictures: Path) -> None:
