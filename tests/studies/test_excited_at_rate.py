@@ -103,6 +103,19 @@ def test_a_loop_settles_as_fast_as_what_a_pulse_leaves_of_itself_says():
         settling_ticks(loop_plant(stage(), bus(), MIDDLE, Perturbation(comb_gain=(3.0, 3.0, 3.0))), about)
 
 
+def test_where_the_model_would_not_be_stable_a_whole_period_has_to_be_undisturbed(monkeypatch):
+    """A slow loop whose stage the file describes badly: it was closed, so it is measured."""
+    run, plant_of = five_periods(), excited.loop_plant
+    too_strong = Perturbation(comb_gain=(3.0, 3.0, 3.0))
+    monkeypatch.setattr(excited, "loop_plant", lambda stage, bus, strokes, _: plant_of(stage, bus, strokes, too_strong))
+
+    def miss(rows):
+        second = run.excitation.measured_from(0) + PERIOD_TICKS
+        rows["overrun"][np.flatnonzero(rows["reference_tick"] == second + 100)[0]] = 1
+
+    assert played_back(run, monkeypatch, miss).periods == 3
+
+
 def test_a_machine_that_misses_too_many_measures_nothing(monkeypatch):
     run = five_periods()
 

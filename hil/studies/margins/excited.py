@@ -18,6 +18,7 @@ from hil.lanes.lane import Lane
 from hil.lanes.setup import Setup
 from pkxyz_ctrl.design.law_about import law_about
 from pkxyz_ctrl.design.margins.settling import settling_ticks
+from pkxyz_ctrl.design.model.discrete_law import LawError
 from pkxyz_ctrl.design.model.loop_plant import NOMINAL, Perturbation, loop_plant
 from pkxyz_ctrl.safety.modes import Mode
 from pkxyz_ctrl.safety.monitors import UNUSABLE
@@ -134,20 +135,25 @@ def excite(
     if not closed.all():
         raise MeasurementError(f"the loop was closed for {closed.sum()} of {len(closed)} ticks only")
     missed = int(spoilt[excitation.first_tick :].sum())
-    settling = _settling_ticks(setup, last[0]["reference_m"]) if missed else 0
+    settling = _settling_ticks(setup, last[0]["reference_m"], excitation.period_ticks) if missed else 0
     periods = _periods(excitation, spoilt, settling, missed)
     return Excited(excitation, seen, periods, np.concatenate(homing), last[0], missed)
 
 
-def _settling_ticks(setup: Setup, position_m: Array) -> int:
-    """Until nothing is left of what a missed tick stirred up: of the loop as drawn, or of the same hardly damped."""
+def _settling_ticks(setup: Setup, position_m: Array, else_ticks: int) -> int:
+    """Until nothing is left of what a missed tick stirred up: of the loop as drawn, or of the same hardly damped. Where
+    one of these would not be stable, ``else_ticks``: the stage is another, since its loop was closed.
+    """
     stage = Stage(setup.stage)
     strokes = stage.inverse_kinematics(position_m)
     law = law_about(stage, setup.law, strokes)
-    return max(
-        settling_ticks(loop_plant(stage, setup.bus, strokes, change), law)
-        for change in (NOMINAL, Perturbation(quality_factor=HARDLY_DAMPED))
-    )
+    try:
+        return max(
+            settling_ticks(loop_plant(stage, setup.bus, strokes, change), law)
+            for change in (NOMINAL, Perturbation(quality_factor=HARDLY_DAMPED))
+        )
+    except LawError:
+        return else_ticks
 
 
 def _periods(
