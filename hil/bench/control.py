@@ -237,7 +237,7 @@ def _far_jump() -> list[Figure]:
 
 
 def _mpc_ticks(repeats: int = 15) -> list[Figure]:
-    """Others on the machine lengthen a tick, never shorten it."""
+    """Ticks that solve a problem, and the solver beside OSQP: the least of several runs, as others only lengthen it."""
     every, solved, posed, cycle = mpc_ticks_us(repeats)
     detail = (
         f"the {len(posed)} ticks of a far jump that solve a problem, each whole, Python included, the least of "
