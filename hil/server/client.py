@@ -35,16 +35,32 @@ class Client:
 
     def show(self, block: Block) -> None:
         """Queue a block of telemetry, or leave it out and count its rows."""
-        if self._blocks >= _BLOCKS_MOST or self.said.full():
+        if not self.has_room:
             self.lost += len(block)
             return
-        self._blocks += 1
-        self.said.put_nowait(packed(Block(block.first_tick, block.columns, self.lost), self.precision))
+        self._give(packed(Block(block.first_tick, block.columns, self.lost), self.precision))
         self.lost = 0
+
+    @property
+    def has_room(self) -> bool:
+        """Whether another block may wait for its socket."""
+        return self._blocks < _BLOCKS_MOST and not self.said.full()
+
+    def show_opened(self, about: dict[str, Any], block: Block) -> None:
+        """Queue a recording: what it is, and its rows. Only where it ``has_room``."""
+        self.tell({"recording": about})
+        self._give(packed(block, "f4"))
+
+    def _give(self, block: bytes) -> None:
+        try:
+            self.said.put_nowait(block)
+            self._blocks += 1
+        except asyncio.QueueFull:
+            self.is_hopeless = True
 
     async def next_said(self) -> str | bytes:
         """What comes next."""
         said = await self.said.get()
         if isinstance(said, bytes):
-            self._blocks = max(0, self._blocks - 1)
+            self._blocks -= 1
         return said

@@ -23,7 +23,7 @@ from hil.server.saving import AFTER_S, BEFORE_S, NotSavedError, save
 from hil.server.setting import ASKED, Setting
 from hil.server.status import status_of
 from hil.server.stored_settings import SettingsStore
-from pkxyz_ctrl.client.protocol import Block, packed
+from pkxyz_ctrl.client.protocol import Block
 from pkxyz_ctrl.config.files import ConfigError
 
 _AXES = ("x", "y", "z")
@@ -164,8 +164,9 @@ class Desk:
             client.tell({"recordings": await self._plan(listed, self._saves)})
         elif what == "open_recording":
             about, block = await self._plan(opened, self._saves, message.get("name"), client.fields)
-            client.tell({"recording": about})
-            client.said.put_nowait(packed(block, "f4"))
+            if not client.has_room:
+                raise AskedWrongError("blocks that were asked for before still wait: take them, and open it again")
+            client.show_opened(about, block)
         elif (newest := self.link.newest()) is not None:
             client.tell({"values": values_of(of_sample(np.array([newest])))})
 
