@@ -47,7 +47,7 @@ def export(
 
         loaded = load_scenario(scenario, stage=stage, controller=controller, bus=bus)
         require_exportable(loaded.setup().law, loaded.controller.name, target)
-        manifest = write(path, target, _exported(loaded, ticks))
+        manifest = write(path, target, exported_of(loaded, ticks))
     except ExportError as error:
         raise ConfigError(str(error)) from None
     except OSError as error:
@@ -65,32 +65,29 @@ def _refuse_foreign(path: Path) -> None:
         raise ConfigError(f"--out: {path}: is not empty, and nothing is overwritten; give a new folder, or empty it")
 
 
-def _exported(loaded: "Scenario", ticks: int | None) -> "Exported":
-    """The law, as many rows of its path, and what a closed loop measured in its first ticks."""
+def exported_of(loaded: "Scenario", ticks: int | None) -> "Exported":
+    """What the controller goes by, so many rows of its path or all, and the calls of its first ticks in lockstep.
+
+    Raises ``ConfigError`` for a bus without CAN.
+    """
     import dataclasses
 
-    import numpy as np
-
-    from hil.lanes.blocks import PREVIEW_ROWS
-    from hil.lanes.in_process import run
-    from hil.lanes.lane import Lane
+    from hil.lanes.blocks import PREVIEW_ROWS, Blocks
+    from hil.lanes.lockstep import LockstepRig
     from hil.runs.scenario import resolve
-    from pkxyz_ctrl.can.driver_config import DriverConfig
+    from pkxyz_ctrl.export.calls import RecordedController
     from pkxyz_ctrl.export.folder import Exported
-    from pkxyz_ctrl.export.wire import wire_record
-    from pkxyz_ctrl.loop.cycle import INPUT
     from pkxyz_ctrl.loop.reference import reference_rows
 
     setup = loaded.setup()
+    if setup.bus.can is None:
+        raise ConfigError(f"bus {setup.bus.name!r} has no [can], and all of an exported controller is about frames")
     rows = (setup.ticks if ticks is None else ticks) + PREVIEW_ROWS
     period_us = setup.bus.period_us
     reference = reference_rows(setup.trajectory.sample(0, rows, period_us))
-    counts: list[np.ndarray] = []
-    short = dataclasses.replace(setup, duration_s=TEST_TICKS * setup.bus.period_s)
-    run(short, Lane.FAST, on_block=lambda block: counts.append(block["sense_count"].copy()))
-    inputs = np.zeros(TEST_TICKS, INPUT)
-    inputs["sense_count"] = np.concatenate(counts)
+    short = dataclasses.replace(setup, duration_s=TEST_TICKS * setup.bus.period_s, faults=())
+    rig = LockstepRig(short, whole_ticks=False, controller=RecordedController)
+    rig.run(Blocks(short.trajectory, period_us, short.ticks, lambda _: None, lambda *_: None, short.excitation))
+    assert isinstance(rig.controller, RecordedController)
     names = loaded.config.name, loaded.controller.name
-    can = setup.bus.can
-    wire = wire_record(setup.gate, DriverConfig() if can is None else can.driver)
-    return Exported(setup.law, wire, reference, inputs, *names, resolve(loaded)["digest"])
+    return Exported(rig.controller.record, reference, rig.controller.calls, *names, resolve(loaded)["digest"])

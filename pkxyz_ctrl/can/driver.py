@@ -2,7 +2,7 @@
 
 No clock, no socket, no thread. The start-up dialogue is driven by ``start``, ``receive`` and ``poll``; once
 ``state`` is OPERATIONAL the loop calls ``sync``, ``receive``, ``sense.take``, ``drive`` and ``heartbeat_due``. What
-happens then is compiled, in ``driver_rules``; here are its settings, its words, and the way to the start-up.
+happens is compiled, in ``start_sequence`` and ``driver_rules``; here are its settings and its words.
 """
 
 from collections import deque
@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 
 from pkxyz_ctrl.compiled.direct_call import direct
 
-from . import cob_id, driver_rules
+from . import cob_id, driver_rules, start_sequence
 from .codec import Counts, ProcessCodec
 from .driver_config import DriverConfig
 from .driver_rules import (
@@ -31,7 +31,7 @@ from .emergency import Emergency, decode_emergency
 from .frame import FD_FAST, Frame
 from .process_pdo import pdo_record
 from .sense_input import SenseInput
-from .start_sequence import Messages, StartSequence, state_name
+from .startup import Setting, failure_words, lost, never_booted, start_record, state_name, table
 
 __all__ = [
     "FOREIGN_FRAME", "NODE_EMERGENCY", "NODE_HEARTBEAT_LOST", "NODE_NOT_OPERATIONAL", "NODE_REBOOTED",
@@ -64,9 +64,8 @@ class AmplifierDriver:
     ``node_events`` (NODE_... bits) are latched: EMERGENCY until ``acknowledge``, the others until ``start``, because a
     node that was silent, left the operational state or restarted has to be configured again, and so has one to which
     somebody else spoke in our name (FOREIGN_FRAME; ``foreign`` tells the first such frame). ``emergencies`` holds
-    the last 64. ``lost`` tells which protections this node does not give, and what stands in for them. ``sense`` holds
-    this tick's sense values. ``count_step_max``: the node's own limit of a step at a SYNC, in drive counts. All times
-    are integer microseconds of the caller's one clock and never run backwards.
+    the last 64. ``sense`` holds this tick's sense values. ``count_step_max``: the node's own limit of a step at a SYNC,
+    in drive counts. All times are integer microseconds of the caller's one clock and never run backwards.
 
     ``record`` (1,) of ``driver_rules.DRIVER`` is what the rules go by, ``memory`` (1,) of ``DRIVER_MEMORY`` all that
     they remember.
@@ -76,16 +75,15 @@ class AmplifierDriver:
         self,
         config: DriverConfig,
         count_step_max: int = 32767,
-        start_up: StartSequence | None = None,
+        settings: tuple[Setting, ...] = (),
         record: Records | None = None,
         memory: Records | None = None,
     ) -> None:
-        """``start_up`` in place of the one that follows from the others; ``record`` and ``memory``: where they are to
-        stand.
+        """``settings``: what the start-up goes by, in place of ``startup.table``; ``record`` and ``memory``: where they
+        are to stand.
         """
         self.config = config
-        self._start_up = start_up or StartSequence(config, count_step_max)
-        self.lost: tuple[str, ...] = ()
+        self._settings = settings if settings else table(config, count_step_max)
         self.emergencies: deque[Emergency] = deque(maxlen=_EMERGENCIES_KEPT)
         self.drive_id = cob_id.drive(config.node_id, config.drive_pdo)
         self.record = np.zeros(1, DRIVER) if record is None else record
@@ -104,14 +102,16 @@ class AmplifierDriver:
         self._configure()
         driver_rules.switch_on(self.memory)
         c, m = self.record, self.memory
-        self._start = direct(driver_rules.start, m)
+        self._start = direct(start_sequence.begin, c, m, 0)
+        self._poll = direct(start_sequence.poll, c, m, 0)
         self._sync, self._heartbeat = direct(driver_rules.sync, c, m, 0), direct(driver_rules.heartbeat, c, m, 0)
-        self._receive = direct(driver_rules.receive, c, m, *[0] * 5)
+        self._receive = direct(start_sequence.on_frame, c, m, *[0] * 5)
         self._drive = direct(driver_rules.drive, c, m, *[0] * 3)
 
     def _configure(self) -> None:
         config, to = self.config, self.record[0]
         to["drive"] = pdo_record(self.drive_id, config.protection)
+        to["start"] = start_record(config, self._settings)
         to["node_id"], to["flags"] = config.node_id, self._flags
         to["our_heartbeat_id"] = cob_id.HEARTBEAT_BASE + config.controller_node_id
         to["heartbeat_period_us"] = 1000 * config.controller_heartbeat_period_ms
@@ -160,7 +160,17 @@ class AmplifierDriver:
                     f"{name} restarted by itself (boot-up message while operational); check its power supply, then "
                     "start it again"
                 )
-        return self._start_up.failure
+        return failure_words(config, self._settings, m["start"][0], int(m["failed_state"]), self.foreign)
+
+    @property
+    def lost(self) -> tuple[str, ...]:
+        """Protections that this node does not give, and what stands in for them."""
+        memory = self.memory["start"][0, 0]
+        if not memory["is_surveyed"]:
+            return ()
+        missed = (f"{never_booted(self.config)}: that it answers, and what it holds, was seen instead",)
+        told = lost(self.config, self._settings, self.record["start"][0, 0], memory)
+        return (*missed, *told) if memory["never_booted"] else told
 
     @property
     def foreign(self) -> str:
@@ -180,8 +190,8 @@ class AmplifierDriver:
     def start(self, t_us: int) -> Frames:
         """Resets the node and begins the start-up dialogue, from any state; counters, events and failure start anew."""
         self.emergencies.clear()
-        self._start(self.memory)
-        return self._go_on(self._start_up.begin(t_us), t_us)
+        self._start(self.record, self.memory, t_us)
+        return self._sent()
 
     def poll(self, t_us: int) -> Frames:
         """Time-outs and repetitions of the start-up dialogue; our heartbeat while no loop sends it.
@@ -189,15 +199,8 @@ class AmplifierDriver:
         To be called at least every few milliseconds until OPERATIONAL. The loop needs it no longer: ``sync``
         supervises the node, and ``heartbeat_due`` lets the loop choose the place of the heartbeat.
         """
-        frames = _NOTHING
-        if driver_rules.is_starting_up(self.memory["state"][0]):
-            frames = self._go_on(self._start_up.poll(t_us), t_us)
-        driver_rules.look_after(self.memory, t_us)
-        heartbeat = self.heartbeat_due(t_us)
-        if heartbeat is not None:
-            self.heartbeat_sent(t_us)
-            frames = (*frames, heartbeat)
-        return frames
+        self._poll(self.record, self.memory, t_us)
+        return self._sent()
 
     def stop(self, t_us: int) -> Frames:
         """0 V, then NMT pre-operational, where the node's outputs take their error value (0 V). State OFF."""
@@ -229,25 +232,15 @@ class AmplifierDriver:
         """Takes any frame from the bus and returns what is to be sent at once (SDO requests during the start)."""
         can_id, data, flags = frame
         told = self._receive(self.record, self.memory, can_id, flags, len(data), word_of(data), t_us)
-        return self.told(frame, told, t_us) if told > driver_rules.FRESH else _NOTHING
+        self.told(frame, told, t_us)
+        return self._sent() if told & driver_rules.START_UP else _NOTHING
 
-    def told(self, frame: Frame, told: int, t_us: int) -> Frames:
-        """What follows from what ``driver_rules.receive`` said of a frame."""
-        can_id, data, _ = frame
+    def told(self, frame: Frame, told: int, t_us: int) -> None:
+        """Keeps an emergency, if ``told``, of ``driver_rules.receive``, says that ``frame`` is one."""
         if told & driver_rules.EMERGENCY:
-            emergency = decode_emergency(data, t_us)
+            emergency = decode_emergency(frame.data, t_us)
             assert emergency is not None
             self.emergencies.append(emergency)
-        if not told & driver_rules.START_UP:
-            return _NOTHING
-        if can_id == cob_id.HEARTBEAT_BASE + self.config.node_id:
-            frames = self._go_on(self._start_up.heartbeat(int(self.memory["node_state"][0]), t_us), t_us)
-            if self.memory["state"][0] == driver_rules.RUNNING:
-                driver_rules.heard_first(self.record, self.memory, t_us)
-            return frames
-        if can_id == cob_id.SDO_RESPONSE_BASE + self.config.node_id:
-            return self._go_on(self._start_up.answer(data, t_us), t_us)
-        return self._go_on(self._start_up.disturbed(self.foreign), t_us)
 
     def drive(self, counts: Counts, t_us: int) -> Frame:
         """The drive PDO, 0..32767 counts for 0..200 V. It is applied at the end of the next SYNC.
@@ -271,27 +264,6 @@ class AmplifierDriver:
     def heartbeat_sent(self, t_us: int) -> None:
         """The next one is due a period after this one was due; periods that were missed are skipped whole."""
         driver_rules.heartbeat_sent(self.record, self.memory, t_us)
-
-    # -- the way to the start-up ------------------------------------------------------------------------------------
-
-    def _go_on(self, messages: Messages, t_us: int) -> Frames:
-        """Send what the start-up says, and take over where it stands: our heartbeat runs while the node is starting,
-        and stays away while its loss is tried.
-        """
-        start_up, m, state = self._start_up, self.memory[0], self._start_up.state
-        self.lost = start_up.lost
-        if state.value != m["state"]:
-            m["state"] = state.value
-            m["node_deadline_us"] = m["heartbeat_next_us"] = driver_rules.NEVER_US
-            if state is DriverState.STARTING:
-                m["heartbeat_next_us"] = t_us + self.record["heartbeat_period_us"][0]
-                if m["sync_overflow"] != start_up.sync_overflow:
-                    m["sync_overflow"], m["sync_count"] = start_up.sync_overflow, 0
-            elif state is DriverState.OPERATIONAL:  # the loop's first tick has the node's heartbeat in it
-                m["heartbeat_next_us"] = t_us + 2000
-            elif state is DriverState.FAILED and m["failure"] == 0:
-                m["failure"] = Failure.START_UP
-        return tuple(Frame._make((*message, self._flags)) for message in messages)
 
     def _sent(self) -> Frames:
         """Take what the rules want to send."""

@@ -14,6 +14,7 @@ from numpy.typing import NDArray
 from pkxyz_ctrl.can import cob_id, process_pdo, sense_input
 from pkxyz_ctrl.can.cob_id import NmtCommand, NmtState
 from pkxyz_ctrl.can.frame import UNUSUAL
+from pkxyz_ctrl.can.start_plan import START, START_MEMORY
 
 Records = NDArray[np.void]
 
@@ -72,6 +73,7 @@ DRIVER = np.dtype(
     [
         ("sense", sense_input.SENSE, (1,)),
         ("drive", process_pdo.PDO, (1,)),
+        ("start", START, (1,)),
         ("node_id", "i4"),
         ("flags", "i4"),  # of the frames that we send
         ("our_heartbeat_id", "i4"),
@@ -85,6 +87,7 @@ DRIVER = np.dtype(
 DRIVER_MEMORY = np.dtype(
     [
         ("sense", sense_input.SENSE_MEMORY, (1,)),
+        ("start", START_MEMORY, (1,)),
         ("out", OUTGOING, (OUTGOING_MOST,)),
         ("node_heartbeat_us", "i8"),  # when the node's last one came
         ("node_deadline_us", "i8"),  # of the next; far away while nobody is watched
@@ -167,7 +170,7 @@ def stop(config_array: Records, memory_array: Records) -> None:
     fall_silent(memory)
     memory["state"] = OFF
     drive(config_array, memory_array, 0, 0, 0)
-    _put_nmt(config, memory, _PRE_OPERATIONAL)
+    put_nmt(config, memory, _PRE_OPERATIONAL)
 
 
 @njit(cache=True, error_model="numpy")
@@ -182,7 +185,7 @@ def release(config_array: Records, memory_array: Records, t_us: int) -> None:
         return
     fall_silent(memory)
     memory["state"] = RELEASING
-    _put_nmt(config, memory, _PRE_OPERATIONAL)
+    put_nmt(config, memory, _PRE_OPERATIONAL)
 
 
 @njit(cache=True, error_model="numpy")
@@ -249,12 +252,6 @@ def _keep_away(config: np.void, memory: np.void, t_us: int) -> None:
         is_near = after_us < 2 * _APART_US < period_us
         if is_near and memory["heartbeat_next_us"] - after_us > t_us:
             memory["heartbeat_next_us"] -= after_us
-
-
-@njit(cache=True, error_model="numpy")
-def look_after(memory_array: Records, t_us: int) -> None:
-    """``watch``, without a SYNC."""
-    watch(memory_array[0], t_us)
 
 
 @njit(cache=True, error_model="numpy")
@@ -326,12 +323,6 @@ def _on_heartbeat(config: np.void, memory: np.void, node_state: int, t_us: int) 
 
 
 @njit(cache=True, error_model="numpy")
-def heard_first(config_array: Records, memory_array: Records, t_us: int) -> None:
-    """The heartbeat that ended the start-up."""
-    heard(config_array[0], memory_array[0], memory_array[0]["node_state"], t_us)
-
-
-@njit(cache=True, error_model="numpy")
 def heard(config: np.void, memory: np.void, node_state: int, t_us: int) -> None:
     """A heartbeat of the node's while it ought to be operational."""
     memory["node_deadline_us"] = t_us + config["node_timeout_us"]
@@ -381,5 +372,6 @@ def _fail(memory: np.void, failure: int) -> None:
 
 
 @njit(cache=True, error_model="numpy")
-def _put_nmt(config: np.void, memory: np.void, command: int) -> None:
+def put_nmt(config: np.void, memory: np.void, command: int) -> None:
+    """An NMT command to the node."""
     put(config, memory, _NMT, 2, command | config["node_id"] << 8)

@@ -1,12 +1,14 @@
-"""Expedited SDO, client side: requests, replies and a dialogue of steps with time-outs (CiA 301, 7.2.4).
+"""Expedited SDO, client side: requests and replies, compiled, and their words (CiA 301, 7.2.4).
 
-Every object that the driver needs has at most four bytes, so expedited transfers are enough.
+A message is its eight bytes as an integer, the first one lowest. Every object that the driver needs has at most four
+bytes, so expedited transfers are enough.
 """
 
-import struct
 from dataclasses import dataclass
-from enum import Enum, auto
-from typing import NamedTuple
+from enum import IntEnum
+from typing import Final
+
+from numba import njit
 
 TIMEOUT_ABORT = 0x05040000
 
@@ -47,10 +49,10 @@ ABORT_TEXT = {  # CiA 301, table "SDO abort codes"
 NO_SUCH_OBJECT = (0x06020000, 0x06090011)
 """The node has no such object, or no such part of it."""
 
-_REQUEST = struct.Struct("<BHBI")
-_UPLOAD_REQUEST = 0x40
-_DOWNLOAD_REPLY = 0x60
-_ABORT = 0x80
+UPLOAD: Final = 0x40
+ABORT: Final = 0x80
+_DOWNLOAD_REPLY: Final = 0x60
+_LENGTH: Final = 8
 
 
 @dataclass(frozen=True, slots=True)
@@ -77,149 +79,69 @@ class SdoStep:
         return f"0x{self.index:04X}:{self.subindex:02X} ({self.what})"
 
 
-class ReplyKind(Enum):
+class ReplyKind(IntEnum):
     """What a server's frame is. OTHER: a segmented or block transfer, which nothing of ours asks for."""
 
-    READ = auto()
-    WRITTEN = auto()
-    ABORT = auto()
-    OTHER = auto()
+    READ = 0
+    WRITTEN = 1
+    ABORT = 2
+    OTHER = 3
 
 
-class SdoReply(NamedTuple):
-    """A server's answer. ``value`` is what was read, or the abort code; ``size`` 0 means that it was not said."""
+_READ, _WRITTEN, _ABORTED, _OTHER = (int(kind) for kind in ReplyKind)
 
-    kind: ReplyKind
-    object_index: int
-    subindex: int
-    value: int
-    size: int
+
+@njit(cache=True, error_model="numpy")
+def message(command: int, index: int, subindex: int, value: int) -> int:
+    """A message, a number with sign. ``value`` 0 to 0xFFFF_FFFF."""
+    return command | index << 8 | subindex << 24 | ((value ^ 0x8000_0000) - 0x8000_0000) << 32
+
+
+@njit(cache=True, error_model="numpy")
+def download(size: int) -> int:
+    """The command that writes ``size`` bytes: expedited, size indicated; bits 2 and 3 tell how many are empty."""
+    return 0x23 | (4 - size) << 2
+
+
+@njit(cache=True, error_model="numpy")
+def kind_of(word: int) -> int:
+    """What a server's message is, a ``ReplyKind``."""
+    command = word & 0xFF
+    if command == ABORT:
+        return _ABORTED
+    if command == _DOWNLOAD_REPLY:
+        return _WRITTEN
+    return _READ if command & 0xE2 == 0x42 else _OTHER  # initiate upload, expedited
+
+
+@njit(cache=True, error_model="numpy")
+def size_of(word: int) -> int:
+    """Bytes of what was read; 0: it does not say."""
+    return 4 - (word >> 2 & 3) if word & 1 else 0
+
+
+@njit(cache=True, error_model="numpy")
+def value_of(word: int) -> int:
+    """What was read, or the abort code."""
+    value, size = word >> 32 & 0xFFFF_FFFF, size_of(word)
+    if kind_of(word) == _READ and 0 < size < 4:
+        return value & ((1 << 8 * size) - 1)
+    return value
 
 
 def request(step: SdoStep) -> bytes:
     """The eight bytes of an expedited request."""
     if not step.write:
-        return _REQUEST.pack(_UPLOAD_REQUEST, step.index, step.subindex, 0)
+        return _bytes(message(UPLOAD, step.index, step.subindex, 0))
     if step.value is None:
         raise ValueError(f"{step.name}: nothing to write")
-    # 0x23: initiate download, expedited, size indicated; bits 2 and 3 tell how many bytes are empty
-    return _REQUEST.pack(0x23 | (4 - step.size) << 2, step.index, step.subindex, step.value)
+    return _bytes(message(download(step.size), step.index, step.subindex, step.value))
 
 
-def abort(index: int, subindex: int, code: int) -> bytes:
-    """The eight bytes that end a transfer."""
-    return _REQUEST.pack(_ABORT, index, subindex, code)
-
-
-def parse_reply(data: bytes) -> SdoReply | None:
-    """A server's frame; None if it has not eight bytes."""
-    if len(data) != _REQUEST.size:
-        return None
-    command, index, subindex, value = _REQUEST.unpack(data)
-    if command == _ABORT:
-        return SdoReply(ReplyKind.ABORT, index, subindex, value, 4)
-    if command == _DOWNLOAD_REPLY:
-        return SdoReply(ReplyKind.WRITTEN, index, subindex, 0, 0)
-    if command & 0xE2 == 0x42:  # initiate upload, expedited
-        size = 4 - (command >> 2 & 3) if command & 1 else 0
-        return SdoReply(ReplyKind.READ, index, subindex, value & ((1 << 8 * (size or 4)) - 1), size)
-    return SdoReply(ReplyKind.OTHER, index, subindex, value, 0)
+def _bytes(word: int) -> bytes:
+    return word.to_bytes(_LENGTH, "little", signed=True)
 
 
 def abort_text(code: int) -> str:
     """``0x06020000, object does not exist in the object dictionary``."""
     return f"0x{code:08X}, {ABORT_TEXT.get(code, 'a code that CiA 301 does not know')}"
-
-
-class SdoDialogue:
-    """A list of transfers, one after the other. Bytes in, bytes out; ends with ``done`` or with a ``failure``.
-
-    An answer that does not belong to the open request (late, repeated, for another object) is ignored; a request
-    without an answer is aborted and repeated, at most ``retries`` times.
-    """
-
-    def __init__(self, steps: tuple[SdoStep, ...], timeout_us: int, retries: int) -> None:
-        self._steps = steps
-        self._timeout_us = timeout_us
-        self._retries = retries
-        self._position = 0
-        self._tries = 0
-        self._deadline_us = 0
-        self.failure = ""
-        self.values: dict[tuple[int, int], int | None] = {}
-        """What was read, by index and sub-index; None where there is no such object."""
-
-    @property
-    def is_begun(self) -> bool:
-        """Whether anything was answered."""
-        return self._position > 0
-
-    @property
-    def done(self) -> bool:
-        """Whether every step has been answered as it should."""
-        return self._position == len(self._steps)
-
-    def begin(self, t_us: int) -> tuple[bytes, ...]:
-        """The first request."""
-        return self._ask(t_us)
-
-    def poll(self, t_us: int) -> tuple[bytes, ...]:
-        """Repeats the open request after a time-out, or gives up."""
-        if self.done or self.failure or t_us < self._deadline_us:
-            return ()
-        step = self._steps[self._position]
-        if self._tries > self._retries:
-            self.failure = (
-                f"no answer to {step.name} within {self._timeout_us / 1000:g} ms, asked {self._tries} times; "
-                "check node id, bit rates, wiring and termination"
-            )
-            return (abort(step.index, step.subindex, TIMEOUT_ABORT),)
-        return (abort(step.index, step.subindex, TIMEOUT_ABORT), *self._ask(t_us))
-
-    def receive(self, data: bytes, t_us: int) -> tuple[bytes, ...]:
-        """Takes the server's frame and returns the next request, if there is one."""
-        reply = parse_reply(data)
-        if reply is None or self.done or self.failure:
-            return ()
-        step = self._steps[self._position]
-        if (reply.object_index, reply.subindex) != (step.index, step.subindex):
-            return ()
-        if reply.kind is ReplyKind.ABORT and reply.value == TIMEOUT_ABORT:
-            return ()  # the server has lost a transfer, too: our own time-out repeats it
-        if step.optional and (reply.kind is ReplyKind.ABORT or (reply.kind is ReplyKind.OTHER and not step.write)):
-            if reply.kind is ReplyKind.ABORT and reply.value in NO_SUCH_OBJECT:
-                self.values[step.index, step.subindex] = None
-            return self._next(t_us)
-        if reply.kind is ReplyKind.ABORT:
-            verb = "writing" if step.write else "reading"
-            self.failure = f"{verb} {step.name} was refused: {abort_text(reply.value)}; {step.remedy}"
-            return ()
-        if reply.kind is ReplyKind.OTHER and not step.write:
-            self.failure = f"{step.name} is longer than four bytes or not a number; {step.remedy}"
-            return ()
-        if reply.kind is not (ReplyKind.WRITTEN if step.write else ReplyKind.READ):
-            return ()
-        if not step.write and not self._accept(step, reply):
-            return ()
-        return self._next(t_us)
-
-    def _next(self, t_us: int) -> tuple[bytes, ...]:
-        self._position += 1
-        self._tries = 0
-        return () if self.done else self._ask(t_us)
-
-    def _accept(self, step: SdoStep, reply: SdoReply) -> bool:
-        self.values[step.index, step.subindex] = reply.value
-        digits = 2 * step.size
-        if reply.size not in (0, step.size):
-            self.failure = f"{step.name} has {reply.size} bytes instead of {step.size}; {step.remedy}"
-        elif step.value is not None and (reply.value ^ step.value) & ((1 << 8 * step.size) - 1) & ~step.alike:
-            self.failure = (
-                f"{step.name} is 0x{reply.value:0{digits}X}, expected 0x{step.value:0{digits}X}; {step.remedy}"
-            )
-        return not self.failure
-
-    def _ask(self, t_us: int) -> tuple[bytes, ...]:
-        self._tries += 1
-        self._deadline_us = t_us + self._timeout_us
-        return (request(self._steps[self._position]),)

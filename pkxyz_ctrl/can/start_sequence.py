@@ -1,250 +1,389 @@
-"""From NMT reset to a node that may be driven: who is it, what does it hold, does it notice when we are gone?
+"""From NMT reset to a node that may be driven, compiled: who is it, what does it hold, does it notice when we are gone?
 
-No clock, no socket: messages in, messages out, time passed in. ``AmplifierDriver`` makes frames of them.
+``memory["state"]`` runs from RESETTING to RUNNING or FAILED. In IDENTIFYING the node says who it is, in CONFIGURING
+what it holds; what differs is written, and everything that has to hold is read once more. Once it is operational, at
+0 V, our heartbeat stays away: in TRYING a node has to leave that state by itself. One that has done so, or of which a
+report says so, is known by identity and serial number and not tried again.
 """
 
-from collections.abc import Callable
+from enum import IntEnum
+from typing import Final
 
-from . import cob_id, startup
-from .cob_id import NmtCommand, NmtState
-from .driver_config import DriverConfig
-from .driver_rules import DriverState
-from .sdo import SdoDialogue, SdoStep
-from .startup import Found, Key, Plan, identity_steps
+import numpy as np
+from numba import njit
 
-Message = tuple[int, bytes]
-Messages = tuple[Message, ...]
+from pkxyz_ctrl.can import cob_id, driver_rules, sdo, start_plan
+from pkxyz_ctrl.can.cob_id import NmtCommand, NmtState
+from pkxyz_ctrl.can.driver_rules import (
+    CONFIGURING,
+    FAILED,
+    IDENTIFYING,
+    RESETTING,
+    RUNNING,
+    START_UP,
+    STARTING,
+    TRYING,
+    Failure,
+    Records,
+    put,
+    put_nmt,
+)
+from pkxyz_ctrl.can.sdo import NO_SUCH_OBJECT, ReplyKind
+from pkxyz_ctrl.can.start_plan import ABSENT, ANY, ASK, IDENTIFY, READ_BACK, VALUE, WRITE
 
-_NOTHING: Messages = ()
-_NEVER_US = 1 << 62
+
+class Cause(IntEnum):
+    """Why the start-up failed."""
+
+    NONE = 0
+    NEVER_BOOTED = 1
+    BOOTS_AGAIN = 2
+    NO_ANSWER = 3
+    REFUSED = 4  # ``reply``: abort code
+    NO_NUMBER = 5
+    SIZE = 6
+    VALUE = 7
+    LACKS = 8
+    SYNC_COUNTER = 9
+    NOT_STARTED = 10
+    NOT_NOTICED = 11
+    DISTURBED = 12
 
 
-class StartSequence:
-    """The start-up of one node; ``state`` runs from RESETTING to OPERATIONAL or FAILED.
+FIRST_HEARTBEAT_US: Final = 2000  # after the start-up: the loop's first tick has the node's heartbeat in it
 
-    In IDENTIFYING the node says who it is, in CONFIGURING what it holds; what differs is written, and everything that
-    has to hold is read once more. Once it is operational, at 0 V, our heartbeat stays away: in TRYING a node has to
-    leave that state by itself. One that has done so, or of which a report says so, is known by identity and serial
-    number and not tried again. ``lost`` tells which protections it does without.
+(
+    _NONE, _NEVER_BOOTED, _BOOTS_AGAIN, _NO_ANSWER, _REFUSED, _NO_NUMBER, _SIZE, _VALUE, _LACKS, _SYNC_COUNTER,
+    _NOT_STARTED, _NOT_NOTICED, _DISTURBED,
+) = (int(cause) for cause in Cause)  # fmt: skip
+_RESET, _START = int(NmtCommand.RESET_NODE), int(NmtCommand.START)
+_PRE_OPERATIONAL = int(NmtCommand.PRE_OPERATIONAL)
+_BOOT_UP, _OPERATIONAL = int(NmtState.BOOT_UP), int(NmtState.OPERATIONAL)
+_READ, _WRITTEN, _ABORTED, _OTHER = (int(kind) for kind in ReplyKind)
+_NO_OBJECT, _NO_SUBINDEX = NO_SUCH_OBJECT
+_TIMED_OUT: Final = sdo.TIMEOUT_ABORT
+_START_FAILED: Final = int(Failure.START_UP)
+_SDO_OUT, _SDO_IN, _HEARTBEAT = cob_id.SDO_REQUEST_BASE, cob_id.SDO_RESPONSE_BASE, cob_id.HEARTBEAT_BASE
+_OVERFLOW_MOST: Final = cob_id.SYNC_COUNTER_OVERFLOW
+_OVERFLOW: Final = 0x1019
+
+
+@njit(cache=True, error_model="numpy")
+def begin(config_array: Records, memory_array: Records, t_us: int) -> None:
+    """Reset the node, from any state."""
+    config, memory = config_array[0], memory_array[0]
+    driver_rules.start(memory_array)
+    start = memory["start"][0]
+    start["never_booted"] = start["is_surveyed"] = start["cause"] = 0
+    start["repeats_left"] = config["start"][0]["retries"]
+    was = memory["state"]
+    _reset(config, memory, t_us)
+    _enter(config, memory, was, t_us)
+
+
+@njit(cache=True, error_model="numpy")
+def poll(config_array: Records, memory_array: Records, t_us: int) -> None:
+    """Time-outs and repetitions of the start-up; our heartbeat while no loop sends it."""
+    config, memory = config_array[0], memory_array[0]
+    was = memory["state"]
+    if driver_rules.is_starting_up(was):
+        _on_time(config, memory, t_us)
+        _enter(config, memory, was, t_us)
+    driver_rules.watch(memory, t_us)
+    if t_us >= memory["heartbeat_next_us"]:
+        driver_rules.heartbeat(config_array, memory_array, t_us)
+
+
+@njit(cache=True, error_model="numpy")
+def on_frame(
+    config_array: Records, memory_array: Records, can_id: int, flags: int, length: int, word: int, t_us: int
+) -> int:
+    """A frame from the bus, as ``driver_rules.receive`` has it; what the start-up answers stands in ``out``."""
+    told = driver_rules.receive(config_array, memory_array, can_id, flags, length, word, t_us)
+    if told & START_UP:
+        _go_on(config_array[0], memory_array[0], can_id, length, word, t_us)
+    return told
+
+
+@njit(cache=True, error_model="numpy")
+def _go_on(config: np.void, memory: np.void, can_id: int, length: int, word: int, t_us: int) -> None:
+    was = memory["state"]
+    if can_id == _HEARTBEAT + config["node_id"]:
+        _on_heartbeat(config, memory, t_us)
+    elif can_id != _SDO_IN + config["node_id"]:  # somebody speaks in our name while the node is operational
+        _fail(memory, _DISTURBED)
+        put_nmt(config, memory, _PRE_OPERATIONAL)
+    elif length == 8 and was in (IDENTIFYING, CONFIGURING):
+        _on_answer(config, memory, word, t_us)
+    _enter(config, memory, was, t_us)
+    if memory["state"] == RUNNING:
+        driver_rules.heard(config, memory, memory["node_state"], t_us)
+
+
+@njit(cache=True, error_model="numpy")
+def _enter(config: np.void, memory: np.void, was: int, t_us: int) -> None:
+    """What begins with another state: our heartbeat runs while the node is starting, and stays away while its loss is
+    tried.
     """
-
-    def __init__(
-        self,
-        config: DriverConfig,
-        count_step_max: int,
-        survey: Callable[[DriverConfig], tuple[SdoStep, ...]] = startup.survey,
-        plan: Callable[[DriverConfig, int, Found], Plan] = startup.plan,
-    ) -> None:
-        """``survey``: what is asked first; ``plan``: what is done about the answers."""
-        self._survey, self._plan = survey, plan
-        self.state = DriverState.OFF
-        self.failure = ""
-        self.lost: tuple[str, ...] = ()
-        self.sync_overflow = cob_id.SYNC_COUNTER_OVERFLOW  # 0: a SYNC without counter
-        self._config = config
-        self._count_step_max = count_step_max
-        self._name = f"amplifier (node {config.node_id})"
-        self._heartbeat = cob_id.HEARTBEAT_BASE + config.controller_node_id, bytes((NmtState.OPERATIONAL,))
-        self._dialogue = SdoDialogue((), 0, 0)
-        self._is_planned = False  # the dialogue is that of what was planned, not the survey before it
-        self._deadline_us = _NEVER_US
-        self._repeats_left = 0
-        self._never_booted = ""
-        self._node_state: int | None = None
-        self._found: dict[Key, int | None] = {}
-        self._identity: tuple[int | None, ...] = ()
-        self._is_tried = False
-        self._times_left = 0
-        self._tried_identity: tuple[int | None, ...] = ()
-
-    def begin(self, t_us: int) -> Messages:
-        """Reset the node, from any state."""
-        self.failure = self._never_booted = ""
-        self.lost = ()
-        self._node_state = None
-        self._repeats_left = self._config.retries
-        return self._reset(t_us)
-
-    def poll(self, t_us: int) -> Messages:
-        """Time-outs and repetitions."""
-        if self.state in (DriverState.IDENTIFYING, DriverState.CONFIGURING):
-            return self._advance(self._dialogue.poll(t_us), t_us)
-        if t_us < self._deadline_us:
-            return _NOTHING
-        if self.state is DriverState.RESETTING:
-            return self._boot_timed_out(t_us)
-        if self.state is DriverState.STARTING:
-            return self._start_timed_out(t_us)
-        return self._trial_timed_out() if self.state is DriverState.TRYING else _NOTHING
-
-    def answer(self, data: bytes, t_us: int) -> Messages:
-        """An SDO answer of the node's."""
-        if self.state not in (DriverState.IDENTIFYING, DriverState.CONFIGURING):
-            return _NOTHING
-        return self._advance(self._dialogue.receive(data, t_us), t_us)
-
-    def heartbeat(self, node_state: int, t_us: int) -> Messages:
-        """A heartbeat of the node's."""
-        self._node_state = node_state
-        if node_state == NmtState.BOOT_UP:
-            return self._boot_up(t_us)
-        if self.state is DriverState.STARTING and node_state == NmtState.OPERATIONAL:
-            return self._started(t_us)
-        return self._left_or_not(node_state, t_us) if self.state is DriverState.TRYING else _NOTHING
-
-    # -- reset ------------------------------------------------------------------------------------------------------
-
-    def _reset(self, t_us: int) -> Messages:
-        self.state = DriverState.RESETTING
-        self._deadline_us = t_us + self._config.boot_timeout_us
-        return (self._nmt(NmtCommand.RESET_NODE),)
-
-    def _boot_timed_out(self, t_us: int) -> Messages:
-        """After the last try the node is asked all the same: its boot-up message may have been missed."""
-        if self._repeats_left > 0:
-            self._repeats_left -= 1
-            return self._reset(t_us)
-        self._never_booted = (
-            f"{self._name} sent no boot-up message 0x{cob_id.HEARTBEAT_BASE + self._config.node_id:03X} within "
-            f"{self._config.boot_timeout_us / 1000:g} ms of NMT reset, {self._config.retries + 1} times"
-        )
-        return self._identify(t_us)
-
-    def _boot_up(self, t_us: int) -> Messages:
-        if self.state is DriverState.RESETTING:
-            return self._identify(t_us)
-        self._never_booted = ""
-        if self._repeats_left > 0:  # late answer to a repeated reset: what was written is lost
-            self._repeats_left -= 1
-            return self._identify(t_us)
-        return self._fail(f"{self._name} restarts again and again while it is configured; check its power supply")
-
-    # -- dialogue ---------------------------------------------------------------------------------------------------
-
-    def _identify(self, t_us: int) -> Messages:
-        """A node that starts by itself (CiA 302-2, object 1F80h) is not configured while it is operational."""
-        self.state = DriverState.IDENTIFYING
-        self._deadline_us = _NEVER_US
-        self._found = {}
-        return self._nmt(NmtCommand.PRE_OPERATIONAL), *self._ask(identity_steps(self._config), t_us)
-
-    def _ask(self, steps: tuple[SdoStep, ...], t_us: int) -> Messages:
-        self._dialogue = SdoDialogue(steps, self._config.sdo_timeout_us, self._config.retries)
-        return self._sdo(self._dialogue.begin(t_us))
-
-    def _advance(self, requests: tuple[bytes, ...], t_us: int) -> Messages:
-        dialogue = self._dialogue
-        if dialogue.failure:
-            if self._never_booted and not dialogue.is_begun:
-                return self._fail(f"{self._never_booted}; check node id, power, wiring and bit rates")
-            return self._fail(f"{self._name}: {dialogue.failure}", *self._sdo(requests))
-        if not dialogue.done:
-            return self._sdo(requests)
-        if self.state is DriverState.IDENTIFYING:
-            self.state, self._is_planned = DriverState.CONFIGURING, False
-            self._found = dict(dialogue.values)
-            return self._ask(self._survey(self._config), t_us)
-        if not self._is_planned:
-            return self._configure(t_us)
-        overflow = dialogue.values.get((0x1019, 0), self._found.get((0x1019, 0))) or 0
-        if overflow == 1 or overflow > cob_id.SYNC_COUNTER_OVERFLOW:
-            return self._fail(
-                f"{self._name} counts SYNCs to {overflow} (0x1019), CiA 301 permits 2 to 240; see its manual"
-            )
-        self.sync_overflow = overflow
-        self._repeats_left = self._config.retries
-        return self._start(t_us)
-
-    def _configure(self, t_us: int) -> Messages:
-        self._is_planned = True
-        self._found = self._found | self._dialogue.values
-        self._identity = tuple(self._found.get((0x1018, part)) for part in (1, 2, 3, 4))
-        planned = self._plan(self._config, self._count_step_max, self._found)
-        missed = (f"{self._never_booted}: that it answers, and what it holds, was seen instead",)
-        self.lost = (*(missed if self._never_booted else ()), *planned.lost)
-        if planned.refusal:
-            return self._fail(f"{self._name}: {planned.refusal}")
-        is_known = None not in self._identity and self._identity == self._tried_identity
-        self._is_tried = planned.is_proven or is_known
-        return self._ask(planned.steps, t_us)
-
-    # -- start and trial --------------------------------------------------------------------------------------------
-
-    def _start(self, t_us: int) -> Messages:
-        self.state = DriverState.STARTING
-        self._deadline_us = t_us + self._config.start_timeout_us
-        return self._heartbeat, self._nmt(NmtCommand.START)
-
-    def _started(self, t_us: int) -> Messages:
-        if self._is_tried:
-            self.state = DriverState.OPERATIONAL
-            self._deadline_us = _NEVER_US
-            return _NOTHING
-        self.state = DriverState.TRYING
-        self._times_left = 0
-        self._deadline_us = t_us + 1000 * self._trial_ms
-        return _NOTHING
-
-    def _left_or_not(self, node_state: int, t_us: int) -> Messages:
-        """It has left once it says so twice: one heartbeat may be damaged, late, or somebody else's."""
-        self._times_left = self._times_left + 1 if node_state != NmtState.OPERATIONAL else 0
-        if self._times_left < 2:
-            return _NOTHING
-        self._is_tried, self._tried_identity = True, self._identity
-        self._repeats_left = self._config.retries
-        return self._start(t_us)
-
-    def _start_timed_out(self, t_us: int) -> Messages:
-        if self._repeats_left > 0:
-            self._repeats_left -= 1
-            return self._start(t_us)[1:]
-        return self._fail(
-            f"{self._name} did not become operational within {self._config.start_timeout_us / 1000:g} ms of NMT start, "
-            f"{self._config.retries + 1} times: {self._heard}; look at its emergencies",
-            self._nmt(NmtCommand.PRE_OPERATIONAL),
-        )
-
-    def _trial_timed_out(self) -> Messages:
-        return self._fail(
-            f"{self._name} did not notice that our heartbeat ended: {self._trial_ms} ms later {self._heard}. "
-            "It may store 0x1016 and 0x1029 and do nothing with them: it would hold its combs at a voltage for ever",
-            self._nmt(NmtCommand.PRE_OPERATIONAL),
-        )
-
-    def disturbed(self, by: str) -> Messages:
-        """Somebody speaks in our name while the node is operational and we are silent: it goes back at once."""
-        return self._fail(by, self._nmt(NmtCommand.PRE_OPERATIONAL))
-
-    # -- small things -----------------------------------------------------------------------------------------------
-
-    @property
-    def _trial_ms(self) -> int:
-        """The node's consumer, and then two heartbeats of its own."""
-        config = self._config
-        return (
-            config.controller_heartbeat_timeout_ms + config.node_heartbeat_period_ms + config.node_heartbeat_timeout_ms
-        )
-
-    @property
-    def _heard(self) -> str:
-        return "no heartbeat came" if self._node_state is None else f"its heartbeat says {state_name(self._node_state)}"
-
-    def _fail(self, failure: str, *last: Message) -> Messages:
-        self.failure = failure
-        self.state = DriverState.FAILED
-        self._deadline_us = _NEVER_US
-        return last
-
-    def _nmt(self, command: NmtCommand) -> Message:
-        return cob_id.NMT, bytes((command, self._config.node_id))
-
-    def _sdo(self, requests: tuple[bytes, ...]) -> Messages:
-        return tuple((cob_id.SDO_REQUEST_BASE + self._config.node_id, data) for data in requests)
+    state = memory["state"]
+    if state == was:
+        return
+    driver_rules.fall_silent(memory)
+    if state == STARTING:
+        memory["heartbeat_next_us"] = t_us + config["heartbeat_period_us"]
+    elif state == RUNNING:
+        memory["heartbeat_next_us"] = t_us + FIRST_HEARTBEAT_US
 
 
-def state_name(node_state: int) -> str:
-    """``pre-operational``: what a heartbeat's number means."""
-    try:
-        return NmtState(node_state).name.lower().replace("_", "-")
-    except ValueError:
-        return f"unknown state 0x{node_state:02X}"
+@njit(cache=True, error_model="numpy")
+def _fail(memory: np.void, cause: int) -> None:
+    memory["state"] = FAILED
+    memory["start"][0]["cause"] = cause
+    if memory["failure"] == 0:
+        memory["failure"], memory["failed_state"] = _START_FAILED, memory["node_state"]
+
+
+@njit(cache=True, error_model="numpy")
+def _on_time(config: np.void, memory: np.void, t_us: int) -> None:
+    state, plan, start = memory["state"], config["start"][0], memory["start"][0]
+    if state in (IDENTIFYING, CONFIGURING):
+        if t_us >= start["answer_due_us"]:
+            _ask_again(config, memory, t_us)
+    elif t_us < start["deadline_us"]:
+        return
+    elif state == RESETTING and start["repeats_left"] > 0:
+        start["repeats_left"] -= 1
+        _reset(config, memory, t_us)
+    elif state == RESETTING:  # it is asked all the same: its boot-up message may have been missed
+        start["never_booted"] = 1
+        _identify(config, memory, t_us)
+    elif state == STARTING and start["repeats_left"] > 0:
+        start["repeats_left"] -= 1
+        start["deadline_us"] = t_us + plan["start_timeout_us"]
+        put_nmt(config, memory, _START)
+    else:
+        _fail(memory, _NOT_STARTED if state == STARTING else _NOT_NOTICED)
+        put_nmt(config, memory, _PRE_OPERATIONAL)
+
+
+@njit(cache=True, error_model="numpy")
+def _on_heartbeat(config: np.void, memory: np.void, t_us: int) -> None:
+    state, node_state = memory["state"], memory["node_state"]
+    if node_state == _BOOT_UP:
+        _on_boot_up(config, memory, t_us)
+    elif state == STARTING and node_state == _OPERATIONAL:
+        _on_started(config, memory, t_us)
+    elif state == TRYING:
+        _left_or_not(config, memory, t_us)
+
+
+# -- reset --------------------------------------------------------------------------------------------------------
+
+
+@njit(cache=True, error_model="numpy")
+def _reset(config: np.void, memory: np.void, t_us: int) -> None:
+    memory["state"] = RESETTING
+    memory["start"][0]["deadline_us"] = t_us + config["start"][0]["boot_timeout_us"]
+    put_nmt(config, memory, _RESET)
+
+
+@njit(cache=True, error_model="numpy")
+def _on_boot_up(config: np.void, memory: np.void, t_us: int) -> None:
+    start = memory["start"][0]
+    if start["never_booted"] != 0:  # it was only slow
+        start["never_booted"] = 0
+    elif memory["state"] != RESETTING:  # late answer to a repeated reset: what was written is lost
+        if start["repeats_left"] == 0:
+            _fail(memory, _BOOTS_AGAIN)
+            return
+        start["repeats_left"] -= 1
+    _identify(config, memory, t_us)
+
+
+# -- dialogue -----------------------------------------------------------------------------------------------------
+
+
+@njit(cache=True, error_model="numpy")
+def _identify(config: np.void, memory: np.void, t_us: int) -> None:
+    """A node that starts by itself (CiA 302-2, object 1F80h) is not configured while it is operational."""
+    memory["state"] = IDENTIFYING
+    start_plan.identify(config["start"][0], memory["start"][0])
+    put_nmt(config, memory, _PRE_OPERATIONAL)
+    _begin_to_ask(config, memory, t_us)
+
+
+@njit(cache=True, error_model="numpy")
+def _begin_to_ask(config: np.void, memory: np.void, t_us: int) -> None:
+    memory["start"][0]["position"] = memory["start"][0]["tries"] = 0
+    _ask(config, memory, t_us)
+
+
+@njit(cache=True, error_model="numpy")
+def _ask(config: np.void, memory: np.void, t_us: int) -> None:
+    """The request of the open step."""
+    start = memory["start"][0]
+    start["tries"] += 1
+    start["answer_due_us"] = t_us + config["start"][0]["sdo_timeout_us"]
+    row, act = config["start"][0]["rows"][start["row"][start["position"]]], start["act"][start["position"]]
+    if act < WRITE:
+        _put_sdo(config, memory, row, sdo.UPLOAD, 0)
+    else:
+        _put_sdo(config, memory, row, sdo.download(int(row["size"])), start_plan.value_of(row, act))
+
+
+@njit(cache=True, error_model="numpy")
+def _put_sdo(config: np.void, memory: np.void, row: np.void, command: int, value: int) -> None:
+    word = sdo.message(command, int(row["index"]), int(row["subindex"]), value)
+    put(config, memory, _SDO_OUT + config["node_id"], 8, word)
+
+
+@njit(cache=True, error_model="numpy")
+def _ask_again(config: np.void, memory: np.void, t_us: int) -> None:
+    """A request without an answer is aborted and repeated, until it was often enough."""
+    start = memory["start"][0]
+    gives_up = start["tries"] > config["start"][0]["retries"]
+    if gives_up and start["never_booted"] != 0 and start["position"] == 0:
+        _fail(memory, _NEVER_BOOTED)
+        return
+    row = start["row"][start["position"]]
+    _put_sdo(config, memory, config["start"][0]["rows"][row], sdo.ABORT, _TIMED_OUT)
+    if gives_up:
+        _fail_step(memory, _NO_ANSWER, 0, 0)
+    else:
+        _ask(config, memory, t_us)
+
+
+@njit(cache=True, error_model="numpy")
+def _fail_step(memory: np.void, cause: int, reply: int, size: int) -> None:
+    """The open step can't be done; the words want to know what was answered."""
+    start = memory["start"][0]
+    start["cause_row"], start["reply"], start["reply_size"] = start["row"][start["position"]], reply, size
+    if start["never_booted"] != 0 and start["position"] == 0:
+        cause = _NEVER_BOOTED
+    _fail(memory, cause)
+
+
+@njit(cache=True, error_model="numpy")
+def _on_answer(config: np.void, memory: np.void, word: int, t_us: int) -> None:
+    """One that does not belong to the open request (late, repeated, for another object) is ignored."""
+    start = memory["start"][0]
+    place, act = start["row"][start["position"]], start["act"][start["position"]]
+    row = config["start"][0]["rows"][place]
+    if word >> 8 & 0xFFFF != row["index"] or word >> 24 & 0xFF != row["subindex"]:
+        return
+    kind, value, is_write = sdo.kind_of(word), sdo.value_of(word), act >= WRITE
+    if kind == _ABORTED and value == _TIMED_OUT:
+        return  # the server has lost a transfer, too: our own time-out repeats it
+    may_refuse = act == ASK or (act == WRITE and row["flags"] & start_plan.MAY_DIFFER != 0)
+    if may_refuse and (kind == _ABORTED or (kind == _OTHER and not is_write)):
+        if kind == _ABORTED and value in (_NO_OBJECT, _NO_SUBINDEX):
+            _note_absent(start, place)
+        _next(config, memory, t_us)
+    elif kind == _ABORTED:
+        _fail_step(memory, _REFUSED, value, 0)
+    elif kind == _OTHER and not is_write:
+        _fail_step(memory, _NO_NUMBER, value, 0)
+    elif is_write and kind == _WRITTEN:
+        _next(config, memory, t_us)
+    elif not is_write and kind == _READ:
+        _on_value(config, memory, value, sdo.size_of(word), t_us)
+
+
+@njit(cache=True, error_model="numpy")
+def _note_absent(start: np.void, place: int) -> None:
+    """Once there is a plan it stands; what then turns out to be lacking holds nothing."""
+    start["found"][place], start["known"][place] = 0, VALUE if start["is_planned"] != 0 else ABSENT
+
+
+@njit(cache=True, error_model="numpy")
+def _on_value(config: np.void, memory: np.void, value: int, size: int, t_us: int) -> None:
+    start = memory["start"][0]
+    place, act = start["row"][start["position"]], start["act"][start["position"]]
+    row = config["start"][0]["rows"][place]
+    start["found"][place], start["known"][place] = value, VALUE
+    is_compared = act == READ_BACK or (act == IDENTIFY and row["flags"] & ANY == 0)
+    if size != 0 and size != row["size"]:
+        _fail_step(memory, _SIZE, value, size)
+    elif is_compared and (value ^ int(row["value"])) & ((1 << 8 * int(row["size"])) - 1) & ~int(row["alike"]) != 0:
+        _fail_step(memory, _VALUE, value, size)
+    else:
+        _next(config, memory, t_us)
+
+
+@njit(cache=True, error_model="numpy")
+def _next(config: np.void, memory: np.void, t_us: int) -> None:
+    plan, start = config["start"][0], memory["start"][0]
+    start["position"] += 1
+    start["tries"] = 0
+    if start["position"] < start["steps"]:
+        _ask(config, memory, t_us)
+    elif memory["state"] == IDENTIFYING:
+        memory["state"] = CONFIGURING
+        start_plan.survey(plan, start)
+        _begin_to_ask(config, memory, t_us)
+    elif start["is_planned"] == 0:
+        _configure(config, memory, t_us)
+    else:
+        _end_dialogue(config, memory, t_us)
+
+
+@njit(cache=True, error_model="numpy")
+def _configure(config: np.void, memory: np.void, t_us: int) -> None:
+    plan, start = config["start"][0], memory["start"][0]
+    refused = start_plan.plan(plan, start)
+    if refused >= 0:
+        start["cause_row"] = refused
+        _fail(memory, _LACKS)
+        return
+    start["is_tried"] = 1 if start_plan.is_proven(plan, start) or start_plan.is_known(start) else 0
+    _begin_to_ask(config, memory, t_us)
+
+
+@njit(cache=True, error_model="numpy")
+def _end_dialogue(config: np.void, memory: np.void, t_us: int) -> None:
+    plan, start, overflow = config["start"][0], memory["start"][0], 0
+    for place in range(plan["count"]):
+        if plan["rows"][place]["index"] == _OVERFLOW and start["known"][place] == VALUE:
+            overflow = int(start["found"][place])
+    if overflow == 1 or overflow > _OVERFLOW_MOST:
+        start["reply"] = overflow
+        _fail(memory, _SYNC_COUNTER)
+        return
+    if memory["sync_overflow"] != overflow:
+        memory["sync_overflow"], memory["sync_count"] = overflow, 0
+    _start(config, memory, t_us)
+
+
+# -- start and trial ----------------------------------------------------------------------------------------------
+
+
+@njit(cache=True, error_model="numpy")
+def _start(config: np.void, memory: np.void, t_us: int) -> None:
+    plan, start = config["start"][0], memory["start"][0]
+    memory["state"] = STARTING
+    start["repeats_left"] = plan["retries"]
+    start["deadline_us"] = t_us + plan["start_timeout_us"]
+    put(config, memory, config["our_heartbeat_id"], 1, _OPERATIONAL)
+    put_nmt(config, memory, _START)
+
+
+@njit(cache=True, error_model="numpy")
+def _on_started(config: np.void, memory: np.void, t_us: int) -> None:
+    start = memory["start"][0]
+    if start["is_tried"] != 0:
+        memory["state"] = RUNNING
+        return
+    memory["state"] = TRYING
+    start["times_left"] = 0
+    start["deadline_us"] = t_us + config["start"][0]["trial_us"]
+
+
+@njit(cache=True, error_model="numpy")
+def _left_or_not(config: np.void, memory: np.void, t_us: int) -> None:
+    """It has left once it says so twice: one heartbeat may be damaged, late, or somebody else's."""
+    start = memory["start"][0]
+    start["times_left"] = start["times_left"] + 1 if memory["node_state"] != _OPERATIONAL else 0
+    if start["times_left"] == 2:
+        start["is_tried"] = 1
+        start_plan.remember_tried(start)
+        _start(config, memory, t_us)

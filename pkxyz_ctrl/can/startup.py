@@ -1,14 +1,20 @@
-"""What the amplifier has to hold before it may be started, and what follows from what it holds already.
+"""What the amplifier has to hold before it may be started, and the words for what follows from what it holds already.
 
-Plain data and pure functions: ``survey`` asks, ``plan`` compares the answers with what is wanted.
+What is asked and written is compiled, in ``start_plan`` and ``start_sequence``; here its table is made.
 """
 
 from collections.abc import Mapping
 from dataclasses import dataclass
 
-from . import cob_id
+import numpy as np
+from numpy.typing import NDArray
+
+from . import cob_id, start_plan
+from .cob_id import NmtState
 from .driver_config import DriverConfig
-from .sdo import SdoStep
+from .sdo import SdoStep, abort_text
+from .start_plan import ABSENT, ASK, COB_ID, COUNT, ENTRY, IDENTIFY, IDENTITY, KIND, OTHER, READ_BACK, TOLD, VALUE
+from .start_sequence import Cause
 
 Key = tuple[int, int]
 Found = Mapping[Key, int | None]
@@ -32,18 +38,33 @@ HEARTBEAT_LOST, LEAVING, DRIVE_TIMEOUT = "heartbeat lost", "leaving operational"
 """Lines of a report that stand in for an object which a node has not."""
 
 
+_SHOWN = {
+    HEARTBEAT_LOST: start_plan.SHOWN_HEARTBEAT_LOST,
+    LEAVING: start_plan.SHOWN_LEAVING,
+    DRIVE_TIMEOUT: start_plan.SHOWN_DRIVE_TIMEOUT,
+}
+_NOTES = {
+    start_plan.COMPLETE: ", complete",
+    start_plan.ON: ", on",
+    start_plan.OFF: ", off",
+    start_plan.CLEAR: ", cleared",
+}
+
+
 @dataclass(frozen=True, slots=True)
 class Setting:
-    """What one object has to hold. ``size`` in bytes; ``alike``: bits in which it may differ; ``may_differ``: where it
-    can't be written, what is there is taken.
+    """What one object has to hold, or has to say; None: anything. ``size`` in bytes; ``part``: of ``start_plan``, what
+    it is about; ``alike``: bits in which it may differ; ``may_differ``: where it can't be written, what is there is
+    taken.
     """
 
     index: int
     subindex: int
     size: int
-    value: int
+    value: int | None
     what: str
     remedy: str
+    part: int = OTHER
     alike: int = 0
     may_differ: bool = False
 
@@ -51,25 +72,23 @@ class Setting:
     def key(self) -> Key:
         return self.index, self.subindex
 
-    def stands(self, found: Found) -> bool:
-        """Whether the node holds it already."""
-        value = found.get(self.key)
-        return value is not None and (value ^ self.value) & ~self.alike == 0
+    @property
+    def row(self) -> tuple[int, int, int, int, int, int, int]:
+        """As ``start_plan.ROW`` has it."""
+        flags = start_plan.ANY * (self.value is None) | start_plan.MAY_DIFFER * self.may_differ
+        return self.value or 0, self.alike, self.index, self.subindex, self.size, self.part, flags
 
-    def write(self, value: int | None = None, note: str = "") -> SdoStep:
-        """Write it, or something else on the way to it."""
-        wanted = self.value if value is None else value
-        return SdoStep(
-            self.index, self.subindex, self.size, wanted, True, self.what + note, self.remedy, optional=self.may_differ
-        )
-
-    def read_back(self) -> SdoStep:
-        what = f"read-back of {self.what}"
-        return SdoStep(self.index, self.subindex, self.size, self.value, False, what, _READ_BACK, alike=self.alike)
-
-    def ask(self) -> SdoStep:
-        """Read it, whatever it is, and whether it is there at all."""
-        return SdoStep(self.index, self.subindex, self.size, None, False, self.what, self.remedy, optional=True)
+    def step(self, act: int) -> SdoStep:
+        """The transfer that an act of ``start_plan`` makes of it."""
+        if act in (IDENTIFY, READ_BACK):
+            what = f"read-back of {self.what}" if act == READ_BACK else self.what
+            remedy = _READ_BACK if act == READ_BACK else self.remedy
+            return SdoStep(self.index, self.subindex, self.size, self.value, False, what, remedy, alike=self.alike)
+        if act == ASK:
+            return SdoStep(self.index, self.subindex, self.size, None, False, self.what, self.remedy, optional=True)
+        value = start_plan.value_of(_records((self,))[0], act)
+        what = self.what + _NOTES.get(act, "")
+        return SdoStep(self.index, self.subindex, self.size, value, True, what, self.remedy, optional=self.may_differ)
 
 
 @dataclass(frozen=True, slots=True)
@@ -85,61 +104,14 @@ class Plan:
     is_proven: bool = False
 
 
-@dataclass(frozen=True, slots=True)
-class _Pdo:
-    """Parameters of one process PDO."""
-
-    what: str
-    cob_id: Setting
-    kind: Setting
-    count: Setting
-    entries: tuple[Setting, ...]
-
-    @property
-    def settings(self) -> tuple[Setting, ...]:
-        return self.cob_id, self.kind, *self.entries, self.count
-
-    def writes(self, found: Found) -> tuple[tuple[SdoStep, ...], tuple[SdoStep, ...]]:
-        """What is written before anything else, and what once all else is. CiA 301, 7.5.2.36: PDO off, mapping empty,
-        entries, number of entries, on. A PDO whose mapping stands is left alone.
-        """
-        is_mapped = all(setting.stands(found) for setting in (*self.entries, self.count))
-        kind = () if self.kind.stands(found) else (self.kind.write(),)
-        if is_mapped and self.cob_id.stands(found):
-            return kind, ()
-        off = self.cob_id.write(cob_id.COB_ID_INVALID | self.cob_id.value, ", off")
-        mapped = (
-            ()
-            if is_mapped
-            else (
-                self.count.write(0, ", cleared"),
-                *(entry.write() for entry in self.entries),
-                self.count.write(note=", complete"),
-            )
-        )
-        return (off, *kind, *mapped), (self.cob_id.write(note=", on"),)
-
-
 def identity_steps(config: DriverConfig) -> tuple[SdoStep, ...]:
     """Device type, vendor and product, compared with the configuration (0x1000, 0x1018)."""
-
-    def read(index: int, subindex: int, value: int | None, what: str) -> SdoStep:
-        return SdoStep(index, subindex, 4, value, False, what, _SAME_DEVICE)
-
-    return (
-        read(0x1000, 0, config.device_type, "device type"),
-        read(0x1018, 1, config.vendor_id, "vendor"),
-        read(0x1018, 2, config.product_code, "product code"),
-    )
+    return tuple(setting.step(IDENTIFY) for setting in _identity(config) if setting.part == IDENTITY)
 
 
 def survey(config: DriverConfig) -> tuple[SdoStep, ...]:
     """Reads of revision and serial number, which may be missing, and of everything that has to hold."""
-    single = tuple(
-        SdoStep(0x1018, part, 4, None, False, what, _SAME_DEVICE, optional=True)
-        for part, what in ((3, "revision"), (4, "serial number"))
-    )
-    return (*single, *(setting.ask() for setting in settings(config)))
+    return tuple(setting.step(ASK) for setting in table(config) if setting.part != IDENTITY)
 
 
 def configuration_steps(config: DriverConfig, count_step_max: int = 32767) -> tuple[SdoStep, ...]:
@@ -147,54 +119,79 @@ def configuration_steps(config: DriverConfig, count_step_max: int = 32767) -> tu
     return plan(config, count_step_max, {}).steps
 
 
+def table(config: DriverConfig, count_step_max: int = 32767) -> tuple[Setting, ...]:
+    """What the start-up goes by: identity, then ``settings``."""
+    return (*_identity(config), *settings(config, count_step_max))
+
+
 def settings(config: DriverConfig, count_step_max: int = 32767) -> tuple[Setting, ...]:
     """Everything that has to hold. ``count_step_max``: most that a drive count may change at a SYNC, which a protected
     node holds itself to.
     """
-    drive, sense = _pdos(config)
-    return (*drive.settings, *sense.settings, *_others(config, count_step_max))
+    return (*_pdos(config), *_others(config, count_step_max))
+
+
+def start_record(config: DriverConfig, rows: tuple[Setting, ...]) -> NDArray[np.void]:
+    """(1,) of ``start_plan.START``, as the compiled start-up reads it."""
+    record, proven = np.zeros(1, start_plan.START), config.proven
+    to = record[0]
+    to["rows"][: len(rows)], to["count"] = _records(rows), len(rows)
+    to["protection"], to["retries"] = config.protection, config.retries
+    if proven is not None:
+        to["proven"] = proven.identity
+        to["shown"] = sum(bit for line, bit in _SHOWN.items() if line in proven.lines)
+    for name in ("boot_timeout_us", "start_timeout_us", "sdo_timeout_us"):
+        to[name] = getattr(config, name)
+    to["trial_us"] = 1000 * trial_ms(config)
+    return record
+
+
+def trial_ms(config: DriverConfig) -> int:
+    """The node's consumer, and then two heartbeats of its own."""
+    return config.controller_heartbeat_timeout_ms + config.node_heartbeat_period_ms + config.node_heartbeat_timeout_ms
+
+
+def _records(rows: tuple[Setting, ...]) -> NDArray[np.void]:
+    return np.array([setting.row for setting in rows], start_plan.ROW)
 
 
 def plan(config: DriverConfig, count_step_max: int, found: Found) -> Plan:
     """What is to be written to a node that holds ``found``, and what it can't give."""
-    identity = tuple(found.get((0x1018, part)) for part in (1, 2, 3, 4))
-    proven = config.proven
-    lines = proven.lines if proven is not None and proven.identity == identity else ()
-    wanted = settings(config, count_step_max)
-    absent = {setting.index: setting for setting in reversed(wanted) if found.get(setting.key, 0) is None}
-    lost = _left_out(config)
-    if proven is not None and not lines:
-        lost.append("the report in the bus config: it is of another module, and does not count")
-    for index, setting in sorted(absent.items()):
-        told, refusal = _without(index, setting, config, lines)
-        if refusal:
-            return Plan((), tuple(lost), refusal)
-        lost += told
-    writes = _writes(config, count_step_max, found, absent)
-    # Also of what stood already: one answer that was damaged must not pass for a value that is there.
-    back = tuple(
-        setting.ask() if setting.may_differ else setting.read_back()
-        for setting in wanted
-        if setting.index not in absent
-    )
-    return Plan((*writes, *back), tuple(lost), "", bool({HEARTBEAT_LOST, DRIVE_TIMEOUT} & set(lines)))
+    rows = table(config, count_step_max)
+    record, memory = start_record(config, rows)[0], np.zeros(1, start_plan.START_MEMORY)[0]
+    for place, setting in enumerate(rows):
+        if setting.key in found:
+            value = found[setting.key]
+            memory["found"][place], memory["known"][place] = value or 0, ABSENT if value is None else VALUE
+    refused = start_plan.plan(record, memory)
+    steps = tuple(rows[memory["row"][n]].step(memory["act"][n]) for n in range(memory["steps"]))
+    is_proven = bool(start_plan.is_proven(record, memory))
+    return Plan(steps, lost(config, rows, record, memory), refusal(rows, refused), is_proven)
 
 
-def _writes(
-    config: DriverConfig, count_step_max: int, found: Found, absent: Mapping[int, Setting]
-) -> tuple[SdoStep, ...]:
-    first: list[SdoStep] = []
-    last: list[SdoStep] = []
-    for pdo in _pdos(config):
-        before, after = pdo.writes(found)
-        first += before
-        last += after
-    others = (
-        setting.write()
-        for setting in _others(config, count_step_max)
-        if not setting.stands(found) and setting.index not in absent
-    )
-    return (*first, *others, *last)
+def lost(config: DriverConfig, rows: tuple[Setting, ...], record: np.void, memory: np.void) -> tuple[str, ...]:
+    """Protections that the node which was found does not give, and what stands in for each."""
+    told, proven = list(_left_out(config)), config.proven
+    if proven is not None and not (proven.lines and start_plan.has_identity(memory, record["proven"])):
+        told.append("the report in the bus config: it is of another module, and does not count")
+    refused = start_plan.lacks(record, memory)
+    known = zip(rows, memory["known"], strict=False)
+    lacking = {setting.index: setting for setting, known in reversed(list(known)) if known == ABSENT}
+    spared = [s for index, s in sorted(lacking.items()) if refused < 0 or index < rows[refused].index]
+    return (*told, *(text for setting in spared if (text := _without(setting, config))))
+
+
+def refusal(rows: tuple[Setting, ...], place: int) -> str:
+    """Why a node without the object of this row must not be started; empty if there is none, -1."""
+    if place < 0:
+        return ""
+    setting = rows[place]
+    name = f"no 0x{setting.index:04X} ({setting.what})"
+    if setting.index in (0x6443, 0x6444):
+        return f"{name}, and no report shows that its outputs go to 0 V by themselves: {_REPORT}"
+    if setting.index == 0x1016:
+        return f"{name}, and nothing else takes the combs to 0 V when this controller falls silent: {_NO_SAFE_STATE}"
+    return f"{name}: {setting.remedy}"
 
 
 def _left_out(config: DriverConfig) -> list[str]:
@@ -213,28 +210,97 @@ def _left_out(config: DriverConfig) -> list[str]:
     return lost
 
 
-def _without(index: int, setting: Setting, config: DriverConfig, lines: tuple[str, ...]) -> tuple[tuple[str, ...], str]:
-    """What is lost without an object and what replaces it; or, in second place, why nothing does."""
-    name = f"no 0x{index:04X} ({setting.what})"
-    if index == 0x1005:
-        return (), ""  # then SYNC is 0x080, as CiA 301 has it
+def _without(setting: Setting, config: DriverConfig) -> str:
+    """What is lost without an object that can be done without, and what replaces it."""
+    index, name = setting.index, f"no 0x{setting.index:04X} ({setting.what})"
     if index == 0x1019:
         remains = "its limits on steps and time remain" if config.protection else "a missing sense PDO still tells"
-        return (f"{name}: the node can't notice a SYNC that it missed; {remains}",), ""
+        return f"{name}: the node can't notice a SYNC that it missed; {remains}"
     if index == 0x1029:
-        return (f"{name}: CiA 301's default is relied on, pre-operational; the live trial shows it",), ""
+        return f"{name}: CiA 301's default is relied on, pre-operational; the live trial shows it"
     if index in (0x6443, 0x6444):
-        if {HEARTBEAT_LOST, LEAVING} <= set(lines):
-            return (f"{name}: that its outputs go to 0 V stands in the report on this module",), ""
-        return (), f"{name}, and no report shows that its outputs go to 0 V by themselves: {_REPORT}"
+        return f"{name}: that its outputs go to 0 V stands in the report on this module"
     if index == 0x1016:
-        if config.protection and DRIVE_TIMEOUT in lines:
-            return (f"{name}: its drive time-out (0x2012) takes over, as the report on this module shows",), ""
-        return (
-            (),
-            f"{name}, and nothing else takes the combs to 0 V when this controller falls silent: {_NO_SAFE_STATE}",
-        )
-    return (), f"{name}: {setting.remedy}"
+        return f"{name}: its drive time-out (0x2012) takes over, as the report on this module shows"
+    return ""  # without 0x1005, SYNC is 0x080, as CiA 301 has it; the others nobody can do without
+
+
+def _identity(config: DriverConfig) -> tuple[Setting, ...]:
+    return (
+        Setting(0x1000, 0, 4, config.device_type, "device type", _SAME_DEVICE, IDENTITY),
+        Setting(0x1018, 1, 4, config.vendor_id, "vendor", _SAME_DEVICE, IDENTITY),
+        Setting(0x1018, 2, 4, config.product_code, "product code", _SAME_DEVICE, IDENTITY),
+        Setting(0x1018, 3, 4, None, "revision", _SAME_DEVICE, TOLD),
+        Setting(0x1018, 4, 4, None, "serial number", _SAME_DEVICE, TOLD),
+    )
+
+
+def failure_words(
+    config: DriverConfig, rows: tuple[Setting, ...], memory: np.void, node_state: int, foreign: str
+) -> str:
+    """Why the start-up failed, from ``memory``, of ``start_plan.START_MEMORY``: what was expected, what came and what
+    to do. ``node_state``: what the node's last heartbeat said, -1 if none came.
+    """
+    name, times = f"amplifier (node {config.node_id})", config.retries + 1
+    heard = f"its heartbeat says {state_name(node_state)}" if node_state >= 0 else "no heartbeat came"
+    match Cause(int(memory["cause"])):
+        case Cause.DISTURBED:
+            return foreign
+        case Cause.NEVER_BOOTED:
+            return f"{never_booted(config)}; check node id, power, wiring and bit rates"
+        case Cause.BOOTS_AGAIN:
+            return f"{name} restarts again and again while it is configured; check its power supply"
+        case Cause.LACKS:
+            return f"{name}: {refusal(rows, int(memory['cause_row']))}"
+        case Cause.SYNC_COUNTER:
+            return f"{name} counts SYNCs to {memory['reply']} (0x1019), CiA 301 permits 2 to 240; see its manual"
+        case Cause.NOT_STARTED:
+            return (
+                f"{name} did not become operational within {config.start_timeout_us / 1000:g} ms of NMT start, "
+                f"{times} times: {heard}; look at its emergencies"
+            )
+        case Cause.NOT_NOTICED:
+            return (
+                f"{name} did not notice that our heartbeat ended: {trial_ms(config)} ms later {heard}. It may store "
+                "0x1016 and 0x1029 and do nothing with them: it would hold its combs at a voltage for ever"
+            )
+    return f"{name}: {_step_words(config, rows, memory)}"
+
+
+def never_booted(config: DriverConfig) -> str:
+    """What was missed where a node is asked all the same."""
+    return (
+        f"amplifier (node {config.node_id}) sent no boot-up message 0x{cob_id.HEARTBEAT_BASE + config.node_id:03X} "
+        f"within {config.boot_timeout_us / 1000:g} ms of NMT reset, {config.retries + 1} times"
+    )
+
+
+def _step_words(config: DriverConfig, rows: tuple[Setting, ...], memory: np.void) -> str:
+    """Why the open step could not be done."""
+    step = rows[int(memory["cause_row"])].step(int(memory["act"][memory["position"]]))
+    reply, digits = int(memory["reply"]), 2 * step.size
+    match Cause(int(memory["cause"])):
+        case Cause.NO_ANSWER:
+            return (
+                f"no answer to {step.name} within {config.sdo_timeout_us / 1000:g} ms, asked {memory['tries']} times; "
+                "check node id, bit rates, wiring and termination"
+            )
+        case Cause.REFUSED:
+            verb = "writing" if step.write else "reading"
+            return f"{verb} {step.name} was refused: {abort_text(reply)}; {step.remedy}"
+        case Cause.NO_NUMBER:
+            return f"{step.name} is longer than four bytes or not a number; {step.remedy}"
+        case Cause.SIZE:
+            return f"{step.name} has {memory['reply_size']} bytes instead of {step.size}; {step.remedy}"
+    return f"{step.name} is 0x{reply:0{digits}X}, expected 0x{step.value or 0:0{digits}X}; {step.remedy}"
+
+
+def state_name(node_state: int) -> str:
+    """``pre-operational``: what a heartbeat's number means."""
+    try:
+        return NmtState(node_state).name.lower().replace("_", "-")
+    except ValueError:
+        return f"unknown state 0x{node_state:02X}"
 
 
 def mapping(
@@ -246,26 +312,27 @@ def mapping(
     return values + guard if protection else values
 
 
-def _pdos(config: DriverConfig) -> tuple[_Pdo, _Pdo]:
+def _pdos(config: DriverConfig) -> tuple[Setting, ...]:
     node, guarded = config.node_id, config.protection
     drive_entries = mapping(0x6411, 0x2000, guarded, config.drive_channels)
     sense_entries = mapping(0x6401, 0x2001, guarded, config.sense_channels)
     drive = _pdo(0x1400 + config.drive_pdo - 1, cob_id.drive(node, config.drive_pdo), drive_entries, "drive PDO")
     sense_id = cob_id.COB_ID_NO_RTR | cob_id.sense(node, config.sense_pdo)
-    return drive, _pdo(0x1800 + config.sense_pdo - 1, sense_id, sense_entries, "sense PDO")
+    return (*drive, *_pdo(0x1800 + config.sense_pdo - 1, sense_id, sense_entries, "sense PDO"))
 
 
-def _pdo(communication: int, pdo_cob_id: int, entries: tuple[int, ...], what: str) -> _Pdo:
-    mapped = communication + 0x200
-    return _Pdo(
-        what,
-        Setting(communication, 1, 4, pdo_cob_id, f"COB-ID of the {what}", _NO_401, alike=cob_id.COB_ID_NO_RTR),
-        Setting(communication, 2, 1, cob_id.SYNCHRONOUS_EVERY_SYNC, f"{what} on every SYNC", _NO_401),
-        Setting(mapped, 0, 1, len(entries), f"mapping of the {what}", _NO_PROTECTION if len(entries) > 3 else _NO_401),
-        tuple(
-            Setting(mapped, place, 4, entry, f"mapping of the {what}", _NO_401 if place <= 3 else _NO_PROTECTION)
+def _pdo(communication: int, pdo_cob_id: int, entries: tuple[int, ...], what: str) -> tuple[Setting, ...]:
+    """Parameters of one process PDO, in the order of ``start_plan``'s parts."""
+    mapped, every = communication + 0x200, cob_id.SYNCHRONOUS_EVERY_SYNC
+    mapping_of = f"mapping of the {what}"
+    return (
+        Setting(communication, 1, 4, pdo_cob_id, f"COB-ID of the {what}", _NO_401, COB_ID, cob_id.COB_ID_NO_RTR),
+        Setting(communication, 2, 1, every, f"{what} on every SYNC", _NO_401, KIND),
+        *(
+            Setting(mapped, place, 4, entry, mapping_of, _NO_401 if place <= 3 else _NO_PROTECTION, ENTRY)
             for place, entry in enumerate(entries, 1)
         ),
+        Setting(mapped, 0, 1, len(entries), mapping_of, _NO_PROTECTION if len(entries) > 3 else _NO_401, COUNT),
     )
 
 

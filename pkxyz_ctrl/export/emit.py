@@ -9,9 +9,10 @@ from pathlib import Path
 from typing import Any
 
 import llvmlite.binding as llvm
+import numpy as np
 from numba import from_dtype, types
 
-from pkxyz_ctrl.export.entries import ENTRIES, Entry
+from pkxyz_ctrl.export.entries import ENTRIES, FIELD, RECORD, Argument, Entry
 
 
 def main(out: Path) -> None:
@@ -29,10 +30,20 @@ def main(out: Path) -> None:
 
 
 def _compiled(entry: Entry) -> Any:
-    signature = tuple(types.Array(from_dtype(argument.dtype), 1, "C") for argument in entry.arguments)
+    signature = tuple(map(_type_of, entry.arguments))
     kernel = entry.kernel
     kernel.compile(signature)
     return kernel.overloads[signature]
+
+
+def _type_of(argument: Argument) -> Any:
+    if argument.dtype is None:
+        return types.int64
+    if argument.kind == RECORD:
+        return from_dtype(argument.dtype)
+    if argument.kind == FIELD:
+        return from_dtype(np.dtype((argument.dtype, (1,))))
+    return types.Array(from_dtype(argument.dtype), 1, "C")
 
 
 if __name__ == "__main__":

@@ -1,88 +1,112 @@
 """What of the compiled kernels gets a name in C, and what each is handed."""
 
-from typing import Any, NamedTuple
+from typing import Any, Final, NamedTuple
 
 import numpy as np
 
-from pkxyz_ctrl.export import wire as wiring
 from pkxyz_ctrl.loop import cycle as cycling
+from pkxyz_ctrl.loop import exchange
 from pkxyz_ctrl.loop.reference import REFERENCE
+
+ONE, MANY, FIELD, RECORD = range(4)
+"""How a kernel takes records: an array of one, an array of any number, the one-element field of a record, the record
+itself. A cycle that takes fields is the very one that ``period`` calls, so that it is compiled once.
+"""
 
 
 class Argument(NamedTuple):
-    """One array of records: a pointer to the one record, or a pointer and how many there are."""
+    """Records, by a pointer to the first and, if there may be many, their number; or a number, ``c_type`` in C."""
 
     name: str
-    dtype: np.dtype[np.void]
+    dtype: np.dtype[np.void] | None = None
     is_const: bool = False
-    many: bool = False
+    kind: int = ONE
+    c_type: str = "int64_t"
 
 
 class Entry(NamedTuple):
-    """A kernel that returns nothing, and its name in C; there it returns a status, 0 if all is well."""
+    """A kernel, and its name in C; there it returns a status, 0 if all is well. ``told``: the kernel's own answer goes
+    where a last argument points to.
+    """
 
     name: str
     kernel: Any
     arguments: tuple[Argument, ...]
     about: str
+    told: bool = True
 
 
-_WIRE = Argument("wire", wiring.WIRE, is_const=True)
-_WIRE_MEMORY = Argument("wire_memory", wiring.WIRE_MEMORY)
-_MEMORY = Argument("memory", cycling.MEMORY)
-_FRAME = Argument("frame", wiring.FRAME)
+_CONFIG = Argument("config", exchange.EXCHANGE, is_const=True)
+_MEMORY = Argument("memory", exchange.EXCHANGE_MEMORY)
+_PATH = Argument("reference", REFERENCE, is_const=True, kind=MANY)
+_T_US = Argument("t_us")
+_NUMBERS: Final = tuple(Argument(name, c_type="int32_t") for name in ("can_id", "flags", "length"))
+_OUT = "Leaves frames in memory->driver[0].out, told: their number, 256 where one was refused"
 
 ENTRIES = (
+    Entry(
+        "pkxyz_switch_on",
+        exchange.switch_on,
+        (_MEMORY,),
+        "Once, with a memory of zeros: nothing has been sent or received.",
+        told=False,
+    ),
+    Entry("pkxyz_start", exchange.start, (_CONFIG, _MEMORY, _T_US), f"The start-up begins. {_OUT}."),
+    Entry(
+        "pkxyz_wait",
+        exchange.wait,
+        (_CONFIG, _MEMORY, _T_US),
+        f"During the start-up, a millisecond or so after the last frame. {_OUT}.",
+    ),
+    Entry(
+        "pkxyz_come_up",
+        exchange.come_up,
+        (_MEMORY,),
+        "During the start-up, after pkxyz_wait and pkxyz_on_frame. told: 1, periods may begin; -1, it failed; else 0.",
+    ),
+    Entry(
+        "pkxyz_begin",
+        exchange.begin,
+        (_CONFIG, _MEMORY, _T_US),
+        f"A period begins: SYNC, and what else is due. {_OUT}; 512 and 1024 where the start-up after a clear began and "
+        "failed.",
+    ),
+    Entry(
+        "pkxyz_on_frame",
+        exchange.on_frame,
+        (_CONFIG, _MEMORY, *_NUMBERS, Argument("data"), _T_US),
+        "Each frame that comes, data its first eight bytes, the first lowest. told: 1 once this period's sense values "
+        "are in, 4 where the start-up has left frames in memory->driver[0].out.",
+    ),
+    Entry(
+        "pkxyz_period",
+        exchange.period,
+        (_CONFIG, _MEMORY, _PATH, Argument("overrun", c_type="int32_t")),
+        "The cycle, after overrun periods that were skipped. The record is memory->cycle[0].row. told: the mode that "
+        "was left, -1 if it stays.",
+    ),
+    Entry(
+        "pkxyz_finish",
+        exchange.finish,
+        (_CONFIG, _MEMORY, _T_US, Argument("heartbeat_until_us")),
+        f"The drive frame of this period, for the next SYNC, and our heartbeat if it is due and fits. {_OUT}.",
+    ),
+    Entry("pkxyz_stop", exchange.stop, (_CONFIG, _MEMORY, _T_US), f"0 V and pre-operational. {_OUT}."),
+    Entry(
+        "pkxyz_judge",
+        exchange.judge,
+        (_CONFIG._replace(kind=RECORD), _MEMORY._replace(kind=RECORD), Argument("first"), _T_US),
+        f"The gate, for frames of your own behind the first so many in memory->driver[0].out. {_OUT}.",
+    ),
     Entry(
         "pkxyz_cycle",
         cycling.cycle,
         (
-            Argument("law", cycling.LAW, is_const=True),
-            _MEMORY,
-            Argument("reference", REFERENCE, is_const=True, many=True),
+            Argument("law", cycling.LAW, is_const=True, kind=FIELD),
+            Argument("memory", cycling.MEMORY, kind=FIELD),
+            _PATH,
         ),
-        "One period: reads memory->input, leaves counts for the combs, mode and record in memory->row.",
-    ),
-    Entry(
-        "pkxyz_begin",
-        wiring.begin,
-        (_WIRE_MEMORY,),
-        "Before the first frame, once: nothing has been sent or received.",
-    ),
-    Entry(
-        "pkxyz_judge",
-        wiring.judge,
-        (_WIRE, _WIRE_MEMORY, _FRAME),
-        "The gate. Every frame, before it is sent: frame->reason is 0 if it may be, and then it counts as sent.",
-    ),
-    Entry(
-        "pkxyz_clear",
-        wiring.clear,
-        (_WIRE_MEMORY,),
-        "After a fault was cleared: until then, the first frame that was refused leaves only what is always permitted.",
-    ),
-    Entry(
-        "pkxyz_sync",
-        wiring.sync,
-        (_WIRE, _WIRE_MEMORY),
-        "With each SYNC that goes out: what was sensed before is old.",
-    ),
-    Entry(
-        "pkxyz_receive",
-        wiring.receive,
-        (_WIRE, _WIRE_MEMORY, Argument("frame", wiring.FRAME, is_const=True)),
-        "Each frame that comes: length, counter and CRC of the sense frame are looked at, others are passed over.",
-    ),
-    Entry(
-        "pkxyz_take",
-        wiring.take,
-        (_WIRE_MEMORY, _MEMORY),
-        "Before pkxyz_cycle: sense counts and their status go to memory->input.",
-    ),
-    Entry(
-        "pkxyz_drive",
-        wiring.drive,
-        (_WIRE, Argument("memory", cycling.MEMORY, is_const=True), _FRAME),
-        "After pkxyz_cycle: the drive frame with frame->counter; judge it before it is sent.",
+        "What pkxyz_period calls: reads memory->input, leaves counts for the combs, mode and record in memory->row.",
+        told=False,
     ),
 )

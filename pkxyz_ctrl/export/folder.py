@@ -15,15 +15,15 @@ from numpy.typing import NDArray
 
 from pkxyz_ctrl.compiled.kernel_cache import digest_of_kernels
 from pkxyz_ctrl.core.demand import PREDICTIVE
-from pkxyz_ctrl.export import wire as wiring
 from pkxyz_ctrl.export.elf import loaded_bytes
 from pkxyz_ctrl.export.kernels import ExportError, kernels
 from pkxyz_ctrl.export.lowering import Lowered, lower
-from pkxyz_ctrl.export.selftest import BEGINS_IN, EVERY, SelfTest, self_test
+from pkxyz_ctrl.export.selftest import EVERY, SelfTest, self_test
+from pkxyz_ctrl.export.stored import Stored, stored_in_exchange
 from pkxyz_ctrl.export.structs import header, struct_name
 from pkxyz_ctrl.export.targets import TARGETS, Target
 from pkxyz_ctrl.export.words import CANONICAL_NAN, FNV_OFFSET, FNV_PRIME, c_words, double_words, words_of
-from pkxyz_ctrl.loop import cycle as cycling
+from pkxyz_ctrl.loop.exchange import EXCHANGE_MEMORY
 from pkxyz_ctrl.loop.row import ROW
 
 Records = NDArray[np.void]
@@ -37,17 +37,27 @@ BUSY_MOST = 0.8
 
 
 class Exported(NamedTuple):
-    """What is to be exported: the law (1,), the wire's settings (1,), the reference's rows (n,), inputs (m,) of which
-    the self-test takes the sense counts, names for people.
+    """What is to be exported: what the controller goes by, (1,) of ``exchange.EXCHANGE``, the reference's rows (n,),
+    calls (m,) of an exchange for the self-test, names for people.
     """
 
-    law: Records
-    wire: Records
+    config: Records
     reference: Records
-    inputs: Records
+    calls: Records
     scenario: str
     controller: str
     config_digest: str
+
+    @property
+    def law(self) -> Records:
+        """(1,) of ``cycle.LAW``."""
+        law: Records = self.config["law"][0]
+        return law
+
+    @property
+    def stored(self) -> Stored:
+        """What a board holds of both records."""
+        return stored_in_exchange(self.law)
 
 
 def target_of(name: str) -> Target:
@@ -83,7 +93,7 @@ def write(out: Path, target_name: str, exported: Exported) -> dict[str, Any]:
             f"the reference takes {size / 2**20:.1f} MiB, more than a board's flash; give --ticks {rows} or less, and "
             "stream the rest"
         )
-    test = self_test(exported.law, exported.wire, exported.reference, exported.inputs)
+    test = self_test(exported.config, exported.reference, exported.calls)
     lowered = lower(kernels(), target)
     files = _files(target_name, target, exported, test, lowered)
     manifest = _manifest(target_name, target, exported, test, lowered, files)
@@ -100,26 +110,23 @@ def _files(name: str, target: Target, exported: Exported, test: SelfTest, lowere
     values = {
         "target": name, "about": target.about, "compiler": target.compiler, "flags": target.flags,
         "scenario": exported.scenario, "controller": exported.controller,
-        "period_us": str(int(exported.law["period_us"][0])), "ticks": str(len(test.frames)), "every": str(EVERY),
+        "period_us": str(int(exported.law["period_us"][0])), "ticks": str(len(test.tried)), "every": str(EVERY),
         "last": f"{test.digests[-1]:016x}",
-        "code_bytes": str(loaded_bytes(lowered.code)), "law_bytes": str(exported.law.nbytes),
-        "wire_bytes": str(exported.wire.nbytes), "wire_memory_bytes": str(wiring.WIRE_MEMORY.itemsize),
-        "memory_bytes": str(cycling.MEMORY.itemsize), "row_bytes": str(ROW.itemsize),
+        "code_bytes": str(loaded_bytes(lowered.code)), "config_bytes": str(exported.stored.settings),
+        "memory_bytes": str(exported.stored.memory), "row_bytes": str(ROW.itemsize),
         "reference_bytes": str(exported.reference.nbytes), "rows": str(len(exported.reference)),
         "owed": ", ".join(lowered.owed) or "nothing",
-        "port": target.port,
-        "mode": str(int(BEGINS_IN)), "link": target.link,
+        "port": target.port, "link": target.link,
     }  # fmt: skip
     files = {file: _filled(file, values) for file in ("main.c", "Makefile", "CMakeLists.txt", "README.md")}
     files |= {
         file: (PORT / file).read_bytes() for file in (target.port, *target.link.split()) if (PORT / file).is_file()
     }
     texts = {
-        "pkxyz.h": header(int(exported.law["period_us"][0])),
+        "pkxyz.h": header(int(exported.law["period_us"][0]), exported.stored),
         "pkxyz.s": lowered.assembly,
-        "law.c": _constant("pkxyz_law_words", exported.law, many=False),
-        "wire.c": _constant("pkxyz_wire_words", exported.wire, many=False),
-        "reference.c": _constant("pkxyz_path_words", exported.reference, many=True),
+        "config.c": _config_c(exported),
+        "reference.c": _constant("pkxyz_path_words", exported.reference),
         "selftest.c": _self_test_c(test),
     }
     return files | {file: text.encode() for file, text in texts.items()} | {"pkxyz.o": lowered.code}
@@ -129,17 +136,26 @@ def _filled(file: str, values: dict[str, str]) -> bytes:
     return Template((PORT / file).read_text(encoding="utf-8")).substitute(values).encode()
 
 
-def _constant(name: str, records: Records, *, many: bool) -> str:
-    kind, words = struct_name(records.dtype), words_of(records)
-    count = f"const int32_t {name}_count = {len(records)};\n" if many else ""
+def _config_c(exported: Exported) -> str:
+    """What this law has of the settings, and room for what it has of the memory."""
+    return _constant("pkxyz_config_words", exported.config, count=exported.stored.settings // 8) + (
+        "\n/* room for what this law needs of pkxyz_exchange_memory */\n"
+        "uint64_t pkxyz_memory_words[PKXYZ_MEMORY_BYTES / 8];\n"
+    )
+
+
+def _constant(name: str, records: Records, *, count: int | None = None) -> str:
+    """The words of records and how many there are; or the first ``count`` words of one."""
+    kind, words = struct_name(records.dtype), words_of(records)[:count]
+    length = f"const int32_t {name}_count = {len(records)};\n" if count is None else ""
     return (
-        f'#include "pkxyz.h"\n\n/* {len(records)} of {kind} */\n{count}'
+        f'#include "pkxyz.h"\n\n/* {len(records)} of {kind} */\n{length}'
         f"const uint64_t {name}[{len(words)}] = {{\n{c_words(words)}}};\n"
     )
 
 
 def _self_test_c(test: SelfTest) -> str:
-    records = {"row": ROW, "memory": cycling.MEMORY, "frame": wiring.FRAME, "wire_memory": wiring.WIRE_MEMORY}
+    records = {"row": ROW, "memory": EXCHANGE_MEMORY}
     flags = "".join(
         f"const uint8_t pkxyz_{name}_is_double[{len(double_words(dtype))}] = "
         f"{{{','.join(str(int(is_double)) for is_double in double_words(dtype))}}};\n"
@@ -151,8 +167,8 @@ def _self_test_c(test: SelfTest) -> str:
         f"const uint64_t pkxyz_nan = 0x{CANONICAL_NAN:016x};\n"
     )
     return (
-        f"{_constant('pkxyz_frame_words', test.frames, many=True)}\n"
-        f"{_constant('pkxyz_tried_words', test.tried, many=True)}\n{constants}{flags}"
+        f"{_constant('pkxyz_call_words', test.calls)}\n{_constant('pkxyz_tried_words', test.tried)}\n"
+        f"uint64_t pkxyz_doubtful_words[PKXYZ_MEMORY_BYTES / 8];\n{constants}{flags}"
         f"const uint64_t pkxyz_digests[{len(test.digests)}] = {{\n{digests}}};\n"
     )
 
@@ -170,11 +186,10 @@ def _manifest(
             "kernels": digest_of_kernels(),
             "files": {file: hashlib.sha256(content).hexdigest() for file, content in sorted(files.items())},
         },
-        "self_test": {"ticks": len(test.frames), "every": EVERY, "fnv1a_64": [f"{d:016x}" for d in test.digests]},
+        "self_test": {"ticks": len(test.tried), "every": EVERY, "fnv1a_64": [f"{d:016x}" for d in test.digests]},
         "bytes": {
-            "code": loaded_bytes(lowered.code), "law": exported.law.nbytes + exported.wire.nbytes,
-            "memory": cycling.MEMORY.itemsize + wiring.WIRE_MEMORY.itemsize, "row": ROW.itemsize,
-            "reference": exported.reference.nbytes,
+            "code": loaded_bytes(lowered.code), "law": exported.stored.settings, "memory": exported.stored.memory,
+            "row": ROW.itemsize, "reference": exported.reference.nbytes,
         },
         "owed_symbols": list(lowered.owed),
         "versions": {

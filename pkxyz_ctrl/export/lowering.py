@@ -7,12 +7,19 @@ import llvmlite.binding as llvm
 
 from pkxyz_ctrl.export import runtime
 from pkxyz_ctrl.export.elf import undefined
-from pkxyz_ctrl.export.entries import ENTRIES, Entry
+from pkxyz_ctrl.export.entries import ENTRIES, MANY, RECORD, Argument, Entry
 from pkxyz_ctrl.export.kernels import ExportError, Kernels
 from pkxyz_ctrl.export.targets import Target
 
 _SOFT_DOUBLE = re.compile(r"__aeabi_(d\w+|\w*2d|cd\w+|f2d)")
 _LIBRARY = re.compile(r"(__aeabi_)?mem(set|clr|cpy|move)[48]?")
+# of mangled names: where a tick's time goes, all else is to be small; of that what stands apart, not to be made small
+# with its callers; and what of it is seldom called
+_IN_A_HURRY = re.compile(r"10pkxyz_ctrl4core")
+_APART = re.compile(
+    r"10adaptation(5learn|8_compare|5begin)B|10linear_law(7advance|12add_feedback)B|5youla12add_feedbackB"
+)
+_SELDOM = re.compile(r"10adaptation(5begin|8set_base|8_compare|5clear)B")
 _ROUNDS = 2  # of the passes: what a callee turned out to return is known to its caller in the second
 
 
@@ -30,7 +37,7 @@ def lower(kernels: Kernels, target: Target) -> Lowered:
     text = _prepared(kernels, target, machine)
     module = _optimised(text, machine)
     if not target.is_wide:
-        module = _optimised(_without_wide_conversions(str(module)), machine)
+        module = _optimised(_without_wide_divisions(_without_wide_conversions(str(module))), machine)
     _name_plainly(module, kernels)
     if not target.is_hosted:
         module = _with_memory_functions(module, target, machine)
@@ -72,30 +79,45 @@ def _replaced(text: str, name: str, definition: str) -> str:
 
 
 def _c_entry(entry: Entry, kernels: Kernels) -> str:
-    """A function of pointers and counts that builds what numba hands over for an array: owner, parent, items, bytes of
-    an item, data, shape, strides.
-    """
+    """A function of pointers, counts and numbers that hands them over as numba does; what is told goes to its last."""
     symbol = kernels.symbols[entry.name]
     found = re.search(rf"^define [^\n]*@{re.escape(symbol)}\(([^\n]*)\)", kernels.ir, re.MULTILINE)
-    expected = 2 + 7 * len(entry.arguments)
-    if found is None or found[1].count("%") != expected:
-        raise ExportError(f"this version of numba hands arguments of {entry.name} over in another way: see constraints")
-    taken, counts, handed = [], [], ["ptr %result", "ptr %problem"]
+    taken, before, handed = [], "", ["ptr %told", "ptr %problem"]
     for argument in entry.arguments:
-        taken.append(f"ptr %{argument.name}")
-        count = "1"
-        if argument.many:
-            taken.append(f"i32 %{argument.name}_count")
-            counts.append(f"  %{argument.name}_n = sext i32 %{argument.name}_count to i64\n")
-            count = f"%{argument.name}_n"
-        size = argument.dtype.itemsize
-        handed += ["ptr null", "ptr null", f"i64 {count}", f"i64 {size}", f"ptr %{argument.name}", f"i64 {count}"]
-        handed.append(f"i64 {size}")
+        parameters, widened, values = _handed(argument)
+        taken += parameters
+        before += widened
+        handed += values
+    if found is None or found[1].count("%") != len(handed):
+        raise ExportError(f"this version of numba hands arguments of {entry.name} over in another way: see constraints")
+    if entry.told:
+        taken.append("ptr %told")
+    else:
+        before += "  %told = alloca ptr\n"
     return (
-        f"\ndefine i32 @{entry.name}({', '.join(taken)}) {{\n{''.join(counts)}"
-        f"  %result = alloca ptr\n  %problem = alloca ptr\n"
+        f"\ndefine i32 @{entry.name}({', '.join(taken)}) {{\n{before}  %problem = alloca ptr\n"
         f"  %status = call i32 @{symbol}({', '.join(handed)})\n  ret i32 %status\n}}\n"
     )
+
+
+def _handed(argument: Argument) -> tuple[list[str], str, list[str]]:
+    """What C gives for an argument, what has to be done to it, and what numba takes: for an array owner, parent, items,
+    bytes of an item, data, shape, strides.
+    """
+    name = argument.name
+    if argument.dtype is None:
+        if argument.c_type == "int64_t":
+            return [f"i64 %{name}"], "", [f"i64 %{name}"]
+        return [f"i32 %{name}"], f"  %{name}_n = sext i32 %{name} to i64\n", [f"i64 %{name}_n"]
+    if argument.kind == RECORD:
+        return [f"ptr %{name}"], "", [f"ptr %{name}"]
+    taken, before, count = [f"ptr %{name}"], "", "1"
+    if argument.kind == MANY:
+        taken.append(f"i32 %{name}_count")
+        before, count = f"  %{name}_n = sext i32 %{name}_count to i64\n", f"%{name}_n"
+    size = argument.dtype.itemsize
+    handed = ["ptr null", "ptr null", f"i64 {count}", f"i64 {size}", f"ptr %{name}", f"i64 {count}", f"i64 {size}"]
+    return taken, before, handed
 
 
 def _optimised(text: str, machine: llvm.TargetMachine) -> llvm.ModuleRef:
@@ -106,6 +128,10 @@ def _optimised(text: str, machine: llvm.TargetMachine) -> llvm.ModuleRef:
     for function in module.functions:
         if not function.is_declaration:
             function.linkage = "external" if function.name in public else "internal"
+            if not _IN_A_HURRY.search(function.name) or _SELDOM.search(function.name):
+                function.add_function_attribute("optsize")
+            if _APART.search(function.name):
+                function.add_function_attribute("noinline")
     for variable in module.global_variables:
         if not variable.is_declaration:
             variable.linkage = "internal"
@@ -128,6 +154,16 @@ def _without_wide_conversions(text: str) -> str:
         return text
     declared = "" if "@llvm.fabs.f64(" in text else "declare double @llvm.fabs.f64(double)\n"
     return text + declared + runtime.CONVERSIONS
+
+
+def _without_wide_divisions(text: str) -> str:
+    """Likewise for divisions of 64 bits."""
+    operand = r"([%@\w.$\"-]+)"
+    before = text
+    for operation in ("sdiv", "udiv", "srem", "urem"):
+        pattern = rf"= {operation} (?:exact )?i64 {operand}, {operand}"
+        text = re.sub(pattern, rf"= call i64 @pkxyz.{operation}(i64 \1, i64 \2)", text)
+    return text if text == before else text + runtime.DIVISIONS
 
 
 def _name_plainly(module: llvm.ModuleRef, kernels: Kernels) -> None:

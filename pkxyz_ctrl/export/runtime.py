@@ -64,6 +64,61 @@ define internal i64 @pkxyz.to_i64(double %x) noinline nounwind {
 """Between 64-bit integers and doubles where the processor has them for 32 bits only: both halves are exact, so their
 sum is rounded once."""
 
+DIVISIONS: Final = """
+define internal i64 @pkxyz.udiv(i64 %a, i64 %b) noinline nounwind optsize {
+entry:
+  br label %digit
+digit:
+  %left = phi i32 [ 64, %entry ], [ %left_next, %digit ]
+  %rest = phi i64 [ 0, %entry ], [ %rest_next, %digit ]
+  %open = phi i64 [ %a, %entry ], [ %open_next, %digit ]
+  %found = phi i64 [ 0, %entry ], [ %found_next, %digit ]
+  %carried = icmp slt i64 %rest, 0
+  %doubled = shl i64 %rest, 1
+  %top = lshr i64 %open, 63
+  %with_top = or i64 %doubled, %top
+  %reached = icmp uge i64 %with_top, %b
+  %fits = or i1 %carried, %reached
+  %less = sub i64 %with_top, %b
+  %rest_next = select i1 %fits, i64 %less, i64 %with_top
+  %one = zext i1 %fits to i64
+  %longer = shl i64 %found, 1
+  %found_next = or i64 %longer, %one
+  %open_next = shl i64 %open, 1
+  %left_next = sub i32 %left, 1
+  %more = icmp ne i32 %left_next, 0
+  br i1 %more, label %digit, label %done
+done:
+  ret i64 %found_next
+}
+define internal i64 @pkxyz.urem(i64 %a, i64 %b) nounwind optsize {
+  %whole = call i64 @pkxyz.udiv(i64 %a, i64 %b)
+  %taken = mul i64 %whole, %b
+  %rest = sub i64 %a, %taken
+  ret i64 %rest
+}
+define internal i64 @pkxyz.sdiv(i64 %a, i64 %b) noinline nounwind optsize {
+  %minus_a = sub i64 0, %a
+  %minus_b = sub i64 0, %b
+  %a_below = icmp slt i64 %a, 0
+  %b_below = icmp slt i64 %b, 0
+  %a_size = select i1 %a_below, i64 %minus_a, i64 %a
+  %b_size = select i1 %b_below, i64 %minus_b, i64 %b
+  %size = call i64 @pkxyz.udiv(i64 %a_size, i64 %b_size)
+  %negated = sub i64 0, %size
+  %differ = xor i1 %a_below, %b_below
+  %whole = select i1 %differ, i64 %negated, i64 %size
+  ret i64 %whole
+}
+define internal i64 @pkxyz.srem(i64 %a, i64 %b) nounwind optsize {
+  %whole = call i64 @pkxyz.sdiv(i64 %a, i64 %b)
+  %taken = mul i64 %whole, %b
+  %rest = sub i64 %a, %taken
+  ret i64 %rest
+}
+"""
+"""Of 64-bit integers, bit by bit, where the processor divides 32 bits only: a heartbeat takes one now and then."""
+
 SQUARE_ROOT: Final = """
 define internal double @pkxyz.sqrt(double %x) noinline nounwind {
 entry:

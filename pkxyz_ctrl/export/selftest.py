@@ -1,102 +1,150 @@
-"""What a target has to compute from recorded frames, to the last bit: digests of rows, frames and memories."""
+"""What a target has to compute from a recorded exchange, to the last bit: digests of rows, frames and memories."""
 
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
 from pkxyz_ctrl.can.process_pdo import encode
 from pkxyz_ctrl.compiled.direct_call import direct
-from pkxyz_ctrl.export import wire as wiring
+from pkxyz_ctrl.export.calls import CALL, Call
+from pkxyz_ctrl.export.stored import stored_in_exchange
 from pkxyz_ctrl.export.words import FNV_OFFSET, canonical, digest
-from pkxyz_ctrl.loop import cycle as cycling
-from pkxyz_ctrl.loop.period import period_of
+from pkxyz_ctrl.loop import exchange
+from pkxyz_ctrl.loop.exchange import EXCHANGE_MEMORY
 from pkxyz_ctrl.safety.modes import Mode
 
 Records = NDArray[np.void]
 
 EVERY = 100
-"""Ticks between two digests, so that a difference has a place."""
-BEGINS_IN = Mode.IDLE
-"""As every run: the node is operational, and nothing is known."""
+"""Periods between two digests, so that a difference has a place."""
 _DAMAGED, _LOST, _SEED = 97, 131, 13
-_SYNC_ID, _SYNCS = 0x080, 240
 _IDENTIFIERS = (0x000, 0x080, 0x123)
 
 
 class SelfTest(NamedTuple):
-    """``frames`` (n,) of ``wire.FRAME``, the sense frame of each tick, and ``tried`` (n,), frames that a second gate
-    is asked about; ``digests`` of all that came of them up to every ``EVERY``-th, and last of the memories.
+    """``calls`` (n,) of ``calls.CALL``, and ``tried`` (m,), of frames that a second gate is asked about, one a period;
+    ``digests`` of all that came of them up to every ``EVERY``-th period, and last of the memories.
     """
 
-    frames: Records
+    calls: Records
     tried: Records
     digests: tuple[int, ...]
 
 
-def self_test(law: Records, wire: Records, reference: Records, inputs: Records) -> SelfTest:
-    """Run the sense counts of inputs (n,), n a multiple of ``EVERY``, from frame to frame on this machine."""
-    if len(inputs) == 0 or len(inputs) % EVERY:
-        raise ValueError(f"a self-test has a multiple of {EVERY} ticks, not {len(inputs)}")
-    frames, tried = _sense_frames(wire, inputs), _frames_to_try(wire, len(inputs))
-    board = Board(law, wire, reference)
-    state, digests = FNV_OFFSET, []
-    for n in range(len(frames)):
-        state = digest(state, np.concatenate([canonical(part) for part in board.tick(n, frames, tried)]))
-        if (n + 1) % EVERY == 0:
+def self_test(config: Records, reference: Records, calls: Records) -> SelfTest:
+    """Go through the calls (n,) of an exchange on this machine, now and then with a sense frame that is damaged or
+    lost. ``config`` (1,) of ``EXCHANGE``.
+    """
+    calls = damaged(config, calls)
+    ticks = int(np.count_nonzero(calls["kind"] == Call.PERIOD))
+    if ticks == 0 or ticks % EVERY:
+        raise ValueError(f"a self-test has a multiple of {EVERY} periods, not {ticks}")
+    tried, board = _frames_to_try(config, ticks), Board(config, reference)
+    doubtful = Board(config, reference)
+    state, digests, done = FNV_OFFSET, [], 0
+    for call in calls:
+        words = [board.play(call)]
+        if call["kind"] == Call.PERIOD:
+            words.append(doubtful.play(tried[done]))
+            if done % 2:
+                doubtful.clear()
+            done += 1
+        state = digest(state, np.concatenate(words))
+        if call["kind"] == Call.PERIOD and done % EVERY == 0:
             digests.append(state)
-    last = np.concatenate([canonical(part) for part in (board.memory, board.wire_memory, board.doubtful)])
-    return SelfTest(frames, tried, (*digests, digest(state, last)))
+    return SelfTest(calls, tried, (*digests, digest(state, np.concatenate([board.held(), doubtful.held()]))))
 
 
 class Board:
-    """What ``main.c`` does: SYNC, sense frame, period, drive frame, each through the gate; and a gate beside, which is
-    asked about anything.
-    """
+    """What ``main.c`` does with a call, over memories of its own."""
 
-    def __init__(self, law: Records, wire: Records, reference: Records) -> None:
-        self.memory, self.frame = cycling.new_memory(BEGINS_IN), np.zeros(1, wiring.FRAME)
-        self.wire_memory, self.doubtful = wiring.new_wire_memory(), wiring.new_wire_memory()
-        self._law, self._wire, self._reference = law, wire, reference
-        self._cycle = period_of(law, reference)
-        self._judge = direct(wiring.judge, wire, self.wire_memory, self.frame)
+    def __init__(self, config: Records, reference: Records) -> None:
+        self.memory = np.zeros(1, EXCHANGE_MEMORY)
+        self._config, self._reference = config, reference
+        self._driver, self._cycle = self.memory["driver"][0], self.memory["cycle"][0]
+        self._held = stored_in_exchange(config["law"][0]).memory
+        exchange.switch_on(self.memory)
+        c, m = config, self.memory
+        self._begin, self._finish = direct(exchange.begin, c, m, 0), direct(exchange.finish, c, m, 0, 0)
+        self._on_frame = direct(exchange.on_frame, c, m, *[0] * 5)
+        self._period = direct(exchange.period, c, m, reference, 0)
 
-    def tick(self, n: int, frames: Records, tried: Records) -> tuple[Records, ...]:
-        """Row, drive frame and the frame that was tried, as they are to be digested."""
-        frame, wire = self.frame, self._wire
-        t_us = n * int(self._law["period_us"][0])
-        frame[0] = (t_us, n % _SYNCS + 1, _SYNC_ID, wire["flags"][0], 1, self.memory["mode"][0], n & 0xFF, 0)
-        self._judge(wire, self.wire_memory, frame)
-        wiring.sync(wire, self.wire_memory)
-        wiring.receive(wire, self.wire_memory, frames[n : n + 1])
-        wiring.take(self.wire_memory, self.memory)
-        self._cycle(self._law, self.memory, self._reference)
-        wiring.drive(wire, self.memory, frame)
-        self._judge(wire, self.wire_memory, frame)
-        doubtful = tried[n : n + 1].copy()
-        self._judge(wire, self.doubtful, doubtful)
-        if n % 2:
-            wiring.clear(self.doubtful)
-        return self.memory["row"].copy(), frame, doubtful
+    def play(self, call: np.void) -> NDArray[np.uint64]:
+        """Words that come of one of ``CALL``: what was told; frames, or the row of a period."""
+        kind = int(call["kind"])
+        told = self._called(kind, call)
+        told_words = np.array([told], np.int64).view(np.uint64)
+        if kind in (Call.COME_UP, Call.REQUEST, Call.CLEAR):
+            return told_words
+        if kind == Call.PERIOD:
+            return np.concatenate([told_words, canonical(self.row)])
+        return np.concatenate([told_words, canonical(self._driver["out"][0, : self._driver["outgoing"][0]])])
+
+    def _called(self, kind: int, call: np.void) -> int:
+        config, memory = self._config, self.memory
+        t_us, data = int(call["t_us"]), int(call["data"])
+        can_id, flags, length = int(call["can_id"]), int(call["flags"]), int(call["length"])
+        told: Any = 0
+        if kind == Call.FRAME:
+            told = self._on_frame(config, memory, can_id, flags, length, data, t_us)
+        elif kind == Call.BEGIN:
+            told = self._begin(config, memory, t_us)
+        elif kind == Call.PERIOD:
+            told = self._period(config, memory, self._reference, data)
+        elif kind == Call.FINISH:
+            told = self._finish(config, memory, t_us, data)
+        elif kind == Call.COME_UP:
+            told = exchange.come_up(memory)
+        elif kind == Call.JUDGE:
+            self._driver["out"][0, 0] = (data, can_id, flags, length, 0)
+            self._driver["outgoing"], self._cycle["mode"] = 1, call["mode"]
+            told = exchange.judge(config[0], memory[0], 0, t_us)
+        elif kind == Call.REQUEST:
+            memory["event"] = data
+        elif kind == Call.CLEAR:
+            memory["clearing"] = data
+        else:
+            told = {Call.START: exchange.start, Call.WAIT: exchange.wait, Call.STOP: exchange.stop}[Call(kind)](
+                config, memory, t_us
+            )
+        return int(told)
+
+    @property
+    def row(self) -> Records:
+        """(1,) of the last period."""
+        row: Records = self._cycle["row"]
+        return row
+
+    def clear(self) -> None:
+        """Let the gate pass the mode's frames again."""
+        self.memory["gate"]["latched"] = 0
+
+    def held(self) -> NDArray[np.uint64]:
+        """Words of what a board holds of the memory. Raises ``AssertionError`` if this law used more."""
+        words = canonical(self.memory)
+        assert not words[self._held // 8 :].any()
+        return words[: self._held // 8]
 
 
-def _sense_frames(wire: Records, inputs: Records) -> Records:
-    """Each tick's sense frame; now and then one is damaged, or is lost and leaves an empty one of nobody's."""
-    frames = np.zeros(len(inputs), wiring.FRAME)
-    pdo = wire[0]["sense"][0]["pdo"]
-    for n, counts in enumerate(inputs["sense_count"].tolist()):
-        frames[n]["can_id"], frames[n]["length"] = pdo[0]["cob_id"], pdo[0]["length"]
-        frames[n]["data"] = encode(pdo, *counts, n & 0xFF) ^ (1 << n % 48 if n % _DAMAGED == _DAMAGED - 1 else 0)
-        if n % _LOST == _LOST - 1:
-            frames[n] = np.zeros((), wiring.FRAME)
-    return frames
+def damaged(config: Records, calls: Records) -> Records:
+    """Each so many-th sense frame with a bit turned over, and others lost."""
+    is_sense = (calls["kind"] == Call.FRAME) & (
+        calls["can_id"] == config["driver"][0, 0]["sense"][0]["pdo"][0]["cob_id"]
+    )
+    places, changed = np.flatnonzero(is_sense), calls.copy()
+    for n in range(_DAMAGED - 1, len(places), _DAMAGED):
+        changed[places[n]]["data"] ^= 1 << n % 48
+    lost = places[_LOST - 1 :: _LOST]
+    return np.delete(changed, lost)
 
 
-def _frames_to_try(wire: Records, ticks: int) -> Records:
+def _frames_to_try(config: Records, ticks: int) -> Records:
     """Frames of all identifiers that the gate knows, well-formed or not, in every mode."""
     random = np.random.default_rng(_SEED)
-    gate, drive = wire[0]["gate"][0], wire[0]["drive"]
-    frames = np.zeros(ticks, wiring.FRAME)
+    gate, drive = config[0]["gate"][0], config[0]["driver"][0]["drive"]
+    frames = np.zeros(ticks, CALL)
+    frames["kind"] = Call.JUDGE
     requests = (0x2F, 0x2B, 0x23, 0x40, 0x60, 0x80)
     objects = (0x1016, 0x1017, 0x1400, 0x1401, 0x1600, 0x1801, 0x1A00, 0x2010, 0x2011, 0x2012, 0x6443, 0x6444)
     ours = (int(gate[name]) for name in ("sdo_id", "heartbeat_id", "drive_id", "drive_id"))

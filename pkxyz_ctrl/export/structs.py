@@ -18,12 +18,18 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from pkxyz_ctrl.export.entries import ENTRIES, Entry
+from pkxyz_ctrl.export.calls import CALL, Call
+from pkxyz_ctrl.export.entries import ENTRIES, MANY, Entry
+from pkxyz_ctrl.export.stored import Stored
+from pkxyz_ctrl.safety.gate_rules import Reason
 from pkxyz_ctrl.safety.modes import Event, Mode
 from pkxyz_ctrl.safety.monitors import NodeEvent, SenseStatus
 from pkxyz_ctrl.safety.trips import Trip
 
-_NUMBERS = (("MODE", Mode), ("EVENT", Event), ("SENSE", SenseStatus), ("NODE", NodeEvent), ("TRIP", Trip))
+_NUMBERS = (
+    ("MODE", Mode), ("EVENT", Event), ("SENSE", SenseStatus), ("NODE", NodeEvent), ("TRIP", Trip), ("CALL", Call),
+    ("REFUSED", Reason),
+)  # fmt: skip
 _C_TYPE = MappingProxyType(
     {"f8": "double", "i8": "int64_t", "i4": "int32_t", "i2": "int16_t", "i1": "int8_t", "u8": "uint64_t"}
     | {"u4": "uint32_t", "u2": "uint16_t", "u1": "uint8_t"}
@@ -49,12 +55,14 @@ class _Place(NamedTuple):
         return f"pkxyz_{own}" if own == stem or stem in own.split("_") else f"pkxyz_{stem}_{own}"
 
 
-def header(period_us: int) -> str:
-    """``pkxyz.h``. ``period_us``: of the law that goes with it."""
+def header(period_us: int, held: Stored) -> str:
+    """``pkxyz.h``. ``period_us``: of the law that goes with it, ``held``: what of settings and memory it needs."""
     places = {id(dtype): place for dtype, place in _defined()}
-    records = _in_order(argument.dtype for entry in ENTRIES for argument in entry.arguments)
+    taken = [argument.dtype for entry in ENTRIES for argument in entry.arguments if argument.dtype is not None]
+    records = _in_order([*taken, CALL])
     names = {id(dtype): places[id(dtype)].c_name for dtype in records}
-    parts = [_HEAD.format(period_us=period_us)]
+    sizes = {"settings": held.settings, "memory": held.memory}
+    parts = [_HEAD.format(period_us=period_us, **sizes)]
     parts += [_enumeration(prefix, kind) for prefix, kind in _NUMBERS]
     parts += [_struct(dtype, places[id(dtype)], names) for dtype in records]
     for entry in ENTRIES:
@@ -118,9 +126,13 @@ def _struct(dtype: Dtype, place: _Place, names: dict[int, str]) -> str:
 def _prototype(entry: Entry, names: dict[int, str]) -> str:
     taken = []
     for argument in entry.arguments:
+        if argument.dtype is None:
+            taken.append(f"{argument.c_type} {argument.name}")
+            continue
         const = "const " if argument.is_const else ""
         taken.append(f"{const}{names[id(argument.dtype)]} *{argument.name}")
-        taken += [f"int32_t {argument.name}_count"] if argument.many else []
+        taken += [f"int32_t {argument.name}_count"] if argument.kind == MANY else []
+    taken += ["int64_t *told"] if entry.told else []
     return f"int32_t {entry.name}({', '.join(taken)})"
 
 
@@ -185,7 +197,9 @@ extern "C" {{
 
 PKXYZ_ASSERT(sizeof(double) == 8);
 
-#define PKXYZ_PERIOD_US {period_us} /* between two calls of pkxyz_cycle */
+#define PKXYZ_PERIOD_US {period_us} /* between two calls of pkxyz_begin */
+#define PKXYZ_CONFIG_BYTES {settings} /* of pkxyz_exchange; what this law lacks stands behind and is never looked at */
+#define PKXYZ_MEMORY_BYTES {memory} /* of pkxyz_exchange_memory, likewise */
 """
 
 _TAIL = """#ifdef __cplusplus

@@ -1,5 +1,6 @@
 """Records as the exact words of C arrays, and the digest that a target makes of what it computed."""
 
+from functools import cache
 from typing import Any
 
 import numpy as np
@@ -16,11 +17,12 @@ CANONICAL_NAN = 0x7FF8000000000000
 
 def words_of(records: Records) -> NDArray[np.uint64]:
     """Words (n,) of records (m,), little-endian, with zeros where nothing is stored."""
-    raw = np.ascontiguousarray(records).view(np.uint8).reshape(len(records), -1).copy()
+    raw = np.ascontiguousarray(records).view(np.uint8).reshape(len(records), records.dtype.itemsize).copy()
     raw[:, ~_stored(records.dtype)] = 0
     return raw.reshape(-1).view("<u8")
 
 
+@cache
 def double_words(dtype: np.dtype[Any]) -> NDArray[np.bool_]:
     """Which words of a record of ``dtype`` are doubles."""
     of_bytes = np.zeros(dtype.itemsize, bool)
@@ -49,6 +51,7 @@ def c_words(words: NDArray[np.uint64]) -> str:
     return "".join(f"    {', '.join(texts[k : k + _A_LINE])},\n" for k in range(0, len(texts), _A_LINE))
 
 
+@cache
 def _stored(dtype: np.dtype[Any]) -> NDArray[np.bool_]:
     of_bytes = np.zeros(dtype.itemsize, bool)
     _mark(dtype, 0, of_bytes, doubles=False)

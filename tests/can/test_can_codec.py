@@ -59,7 +59,6 @@ def test_crc_equals_both_oracles(data):
     assert crc8(data) == crc8_bit_by_bit(data) == Crc8Autosar.calc(data)
 
 
-@settings(deadline=None)  # kernels are loaded at the first
 @given(st.integers(0, 0x7FF), triples, alive)
 @example(SENSE, (COUNTS_MIN, -1, COUNTS_MAX), 255)
 def test_payload_is_counts_counter_and_crc_over_the_cob_id(cob_id, values, counter):
@@ -70,7 +69,6 @@ def test_payload_is_counts_counter_and_crc_over_the_cob_id(cob_id, values, count
     assert codec.decode(payload) == (*values, counter, True)
 
 
-@settings(deadline=None)
 @given(triples, alive)
 def test_plain_payload_is_the_counts_alone(values, counter):
     codec = ProcessCodec(DRIVE, protected=False)

@@ -9,12 +9,12 @@ import cantools
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
+from object_tables import object_table, pdo_table
 
 from pkxyz_ctrl.can import cob_id
 from pkxyz_ctrl.can.codec import DRIVE_SCALE, ProcessCodec
 from pkxyz_ctrl.can.driver_config import DriverConfig
 from pkxyz_ctrl.can.startup import configuration_steps, identity_steps, mapping
-from pkxyz_ctrl.can.wire_doc import object_table, pdo_table
 
 ROOT = Path(__file__).resolve().parents[2]
 EDS = ROOT / "configs" / "comb_amplifier.eds"
@@ -104,7 +104,7 @@ def test_the_start_up_mapping_is_the_default_mapping(dictionary):
             assert dictionary.get_variable(entry >> 16, entry >> 8 & 0xFF).pdo_mappable
 
 
-@settings(max_examples=150, deadline=None)
+@settings(max_examples=150)
 @given(st.tuples(drive_counts, drive_counts, drive_counts), alive)
 def test_drive_pdo_equals_cantools_and_canopen(dbc, canopen_pdos, values, counter):
     payload = ProcessCodec(0x30A, protected=True).encode(values, counter)
@@ -119,7 +119,7 @@ def test_drive_pdo_equals_cantools_and_canopen(dbc, canopen_pdos, values, counte
     assert canopen_payload(canopen_pdos["drive"], values, counter, payload[7]) == payload
 
 
-@settings(max_examples=150, deadline=None)
+@settings(max_examples=150)
 @given(st.tuples(counts, counts, counts), alive)
 def test_sense_pdo_equals_cantools_and_canopen(dbc, canopen_pdos, values, counter):
     """Femtofarads by the scale of ``configs/buses/fd_5k.toml``: 4.14 pF and 68 aF a count."""

@@ -299,7 +299,7 @@ def test_a_release_ends_a_start_up_and_a_start_begins_anew():
     assert driver.state is DriverState.RESETTING
 
 
-@settings(max_examples=150, deadline=None)
+@settings(max_examples=150)
 @given(st.lists(st.tuples(frames, st.integers(0, 300_000)), max_size=40), st.booleans())
 def test_no_frame_whatsoever_upsets_the_driver(traffic, from_operational):
     driver = started() if from_operational else AmplifierDriver(DriverConfig())

@@ -19,7 +19,7 @@ from pkxyz_ctrl.can.codec import CountsOutOfRangeError, ProcessCodec
 from pkxyz_ctrl.can.driver import FOREIGN_FRAME, NODE_EMERGENCY, NODE_REBOOTED, AmplifierDriver
 from pkxyz_ctrl.can.driver_config import DriverConfig
 from pkxyz_ctrl.can.driver_rules import DriverState
-from pkxyz_ctrl.can.start_sequence import StartSequence
+from pkxyz_ctrl.can.startup import table
 
 HEARTBEAT_ERROR, OTHER_ERROR, RESET_ERROR = "30 81 11", "00 10 01", "00 00 00"
 
@@ -120,10 +120,10 @@ def test_a_plain_pdo_has_no_counter_that_could_be_out_of_range() -> None:
         ProcessCodec(0x30A, True).encode((1, 2, 3), 256)
 
 
-def test_a_start_sequence_may_be_handed_in() -> None:
+def test_what_the_start_up_goes_by_may_be_handed_in() -> None:
     """One that was told to hold the node to another step, say."""
     config = DriverConfig()
-    driver = AmplifierDriver(config, start_up=StartSequence(config, 77))
+    driver = AmplifierDriver(config, settings=table(config, 77))
     server = ObedientServer()
     driver.start(0)
     run_dialogue(driver, server, driver.receive(heartbeat(BOOT_UP), 0))

@@ -6,10 +6,10 @@ import pytest
 
 from hil import cli
 from hil.runs.scenario import load_scenario
+from pkxyz_ctrl.export.calls import CALL
 from pkxyz_ctrl.export.folder import Exported, write
 from pkxyz_ctrl.export.kernels import ExportError
-from pkxyz_ctrl.export.wire import WIRE
-from pkxyz_ctrl.loop.cycle import INPUT
+from pkxyz_ctrl.loop.exchange import EXCHANGE
 
 
 def refused(capsys, monkeypatch, *words):
@@ -33,7 +33,8 @@ def refused(capsys, monkeypatch, *words):
         (("--controller", "nope"), "nope"),
         (("--ticks", "10"), "ticks"),
         (("--target", "cortex-m4"), "a period of 200 us is too short for cortex-m4, where the longest tick takes 3700"),
-        (("--controller", "robust_20k", "--bus", "local_20k"), "give a bus of 70 us or more, or another target"),
+        (("--controller", "robust_20k", "--bus", "local_20k", "--target", "host"), "bus 'local_20k' has no [can]"),
+        (("--controller", "robust_20k", "--bus", "local_20k"), "give a bus of 80 us or more, or another target"),
     ],
 )
 def test_what_does_not_go_is_said_in_a_line(tmp_path, capsys, monkeypatch, words, says):
@@ -54,10 +55,9 @@ def test_a_path_that_no_board_holds_is_refused_with_what_it_takes(tmp_path):
 
     from pkxyz_ctrl.loop.reference import REFERENCE
 
-    law = load_scenario("raster").setup().law
-    exported = Exported(
-        law, np.zeros(1, WIRE), np.zeros(20_000, REFERENCE), np.zeros(100, INPUT), "raster", "youla", ""
-    )
+    config = np.zeros(1, EXCHANGE)
+    config["law"][0] = load_scenario("raster").setup().law
+    exported = Exported(config, np.zeros(20_000, REFERENCE), np.zeros(100, CALL), "raster", "youla", "")
     with pytest.raises(ExportError, match=r"takes 2\.4 MiB.*give --ticks 16384 or less"):
         write(tmp_path / "out", "cortex-m7", exported)
     assert not (tmp_path / "out").exists()

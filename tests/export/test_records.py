@@ -8,9 +8,11 @@ import pytest
 
 from pkxyz_ctrl.core import estimator, feedback
 from pkxyz_ctrl.core import tick as ticking
+from pkxyz_ctrl.export.stored import Stored
 from pkxyz_ctrl.export.structs import header, struct_name, unit_of
 from pkxyz_ctrl.export.words import CANONICAL_NAN, FNV_OFFSET, canonical, digest, words_of
 from pkxyz_ctrl.loop import cycle
+from pkxyz_ctrl.loop.exchange import EXCHANGE, EXCHANGE_MEMORY
 from pkxyz_ctrl.loop.reference import REFERENCE
 from pkxyz_ctrl.loop.row import ROW
 
@@ -48,8 +50,8 @@ def records_in(dtype, found):
 
 
 def test_every_field_of_every_record_is_declared_asserted_and_has_what_is_said_of_it():
-    text = header(200)
-    for root in (cycle.LAW, cycle.MEMORY, REFERENCE):
+    text = header(200, Stored(8136, 11496))
+    for root in (EXCHANGE, EXCHANGE_MEMORY, REFERENCE):
         for dtype in records_in(root, []):
             name = struct_name(dtype)
             for field, (_, offset, *_) in dtype.fields.items():
@@ -59,7 +61,11 @@ def test_every_field_of_every_record_is_declared_asserted_and_has_what_is_said_o
     assert "    double gain[9][3]; /* steady-state Kalman gain of the measurement update */" in text
     assert "    int32_t drive_count[3]; /* count, goes to the combs at the next SYNC */" in text
     assert "#define PKXYZ_PERIOD_US 200 " in text
+    assert "#define PKXYZ_CONFIG_BYTES 8136 " in text
+    assert "#define PKXYZ_MEMORY_BYTES 11496 " in text
     assert "    PKXYZ_MODE_TRACKING = 5," in text
+    assert "    PKXYZ_REFUSED_DRIVE_STEP = 14," in text
+    assert "int32_t flags, int32_t length, int64_t data, int64_t t_us, int64_t *told);" in text
 
 
 @pytest.mark.parametrize("words", [("-std=c11", "-xc"), ("-std=c++17", "-xc++")])
@@ -67,7 +73,7 @@ def test_compilers_hold_every_offset_and_size(tmp_path, words):
     compiler = shutil.which("gcc") or shutil.which("cc")
     if compiler is None:
         pytest.skip("no C compiler")
-    (tmp_path / "pkxyz.h").write_text(header(200), encoding="utf-8")
+    (tmp_path / "pkxyz.h").write_text(header(200, Stored(8136, 11496)), encoding="utf-8")
     strict = ["-fsyntax-only", "-Wall", "-Wextra", "-Werror"]
     said = subprocess.run(
         [compiler, *words, *strict, tmp_path / "pkxyz.h"], capture_output=True, text=True, check=False

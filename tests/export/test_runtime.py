@@ -20,7 +20,8 @@ def function():
     """Looks a function up by its name and the types of its result and its argument."""
     llvm.initialize_native_target()
     llvm.initialize_native_asmprinter()
-    text = runtime.FLOOR + runtime.CONVERSIONS + runtime.SQUARE_ROOT + "declare double @llvm.fabs.f64(double)\n"
+    text = runtime.FLOOR + runtime.CONVERSIONS + runtime.DIVISIONS + runtime.SQUARE_ROOT
+    text += "declare double @llvm.fabs.f64(double)\n"
     module = llvm.parse_assembly(text.replace("define internal", "define"))
     module.verify()
     engine = llvm.create_mcjit_compiler(module, llvm.Target.from_default_triple().create_target_machine())
@@ -72,3 +73,19 @@ def test_integers_to_doubles_are_rounded_once(function, whole, shift):
 @given(st.floats(-(2.0**62), 2.0**62), st.integers(0, 70))
 def test_doubles_to_integers_are_cut_towards_zero(function, x, shift):
     assert function("to_i64", I64, D)(x / 2.0**shift) == int(x / 2.0**shift)
+
+
+SIGNED = st.integers(-(2**63), 2**63 - 1)
+
+
+@given(SIGNED, st.one_of(SIGNED, st.integers(-5, 5), st.integers(-(2**32), 2**32)), st.integers(0, 63))
+def test_whole_numbers_are_divided_as_a_processor_divides(function, a, b, shift):
+    a, b = a >> shift, b or 1
+    if b == -1:
+        a = max(a, -(2**63) + 1)  # the one quotient that there is no room for
+    towards_zero = abs(a) // abs(b) * (1 if (a < 0) == (b < 0) else -1)
+    assert function("sdiv", I64, I64, I64)(a, b) == towards_zero
+    assert function("srem", I64, I64, I64)(a, b) == a - towards_zero * b
+    wide_a, wide_b = a % 2**64, b % 2**64
+    assert function("udiv", U64, U64, U64)(wide_a, wide_b) == wide_a // wide_b
+    assert function("urem", U64, U64, U64)(wide_a, wide_b) == wide_a % wide_b

@@ -8,8 +8,9 @@ from numpy.typing import NDArray
 
 from pkxyz_ctrl.can.process_pdo import encode
 from pkxyz_ctrl.compiled.direct_call import direct
-from pkxyz_ctrl.export import wire as wiring
-from pkxyz_ctrl.safety.gate_rules import Reason
+from pkxyz_ctrl.export.calls import CALL, Call
+from pkxyz_ctrl.safety import gate_rules
+from pkxyz_ctrl.safety.gate_rules import Reason, new_gate_memory
 from pkxyz_ctrl.safety.modes import Mode
 
 Records = NDArray[np.void]
@@ -20,8 +21,8 @@ _OBJECTS = (0x1005, 0x1016, 0x1017, 0x1019, 0x1029, 0x1400, 0x1401, 0x1601, 0x18
 
 
 class Judged(NamedTuple):
-    """``frames`` (n,) of ``wire.FRAME`` as they were asked about, the ``reasons`` (n,) given here, and the memory (1,)
-    after the last.
+    """``frames`` (n,) of ``calls.CALL`` as they were asked about, the ``reasons`` (n,) given here, and the memory (1,)
+    of the gate after the last.
     """
 
     frames: Records
@@ -29,23 +30,22 @@ class Judged(NamedTuple):
     memory: Records
 
 
-def judged(wire: Records, count: int, seed: int) -> Judged:
-    """So many frames through the gate of this machine."""
+def judged(config: Records, count: int, seed: int) -> Judged:
+    """So many frames through the gate of this machine. ``config`` (1,) of ``exchange.EXCHANGE``."""
     draw = random.Random(seed)
-    memory, frame = wiring.new_wire_memory(), np.zeros(1, wiring.FRAME)
-    judge = direct(wiring.judge, wire, memory, frame)
-    frames, reasons = np.zeros(count, wiring.FRAME), np.zeros(count, np.int32)
-    sender = Sender(wire, draw)
+    gate, memory = config["gate"][0], new_gate_memory()
+    check = direct(gate_rules.check, gate, memory, *[0] * 6)
+    frames, reasons = np.zeros(count, CALL), np.zeros(count, np.int32)
+    sender = Sender(config, draw)
     for n in range(count):
-        frame[0] = sender.frame()
-        if memory[0]["gate"][0]["latched"] and draw.random() < 0.5:
-            frame["mode"] = CLEAR
-        frames[n] = frame[0]
-        if frame[0]["mode"] == CLEAR:
-            wiring.clear(memory)
+        t_us, data, can_id, flags, length, kind, mode = sender.frame()
+        if memory[0]["latched"] and draw.random() < 0.5:
+            mode = CLEAR
+        frames[n] = t_us, data, can_id, flags, length, kind, mode
+        if mode == CLEAR:
+            gate_rules.clear(memory)
         else:
-            judge(wire, memory, frame)
-            reasons[n] = frame[0]["reason"]
+            reasons[n] = check(gate, memory, can_id, flags, length, data, mode, t_us)
             sender.answered(int(reasons[n]))
     return Judged(frames, reasons, memory)
 
@@ -59,8 +59,8 @@ def missing(found: Judged) -> list[str]:
 class Sender:
     """A controller that errs: it keeps to what it was answered, so that its next frame is a good one more often."""
 
-    def __init__(self, wire: Records, draw: random.Random) -> None:
-        self._gate, self._drive, self._draw = wire[0]["gate"][0], wire[0]["drive"], draw
+    def __init__(self, config: Records, draw: random.Random) -> None:
+        self._gate, self._drive, self._draw = config[0]["gate"][0], config[0]["driver"][0]["drive"], draw
         self._most, self._slew = int(self._gate["count_max"]), int(self._gate["count_slew_max"])
         self._period_us = int(self._gate["period_us"])
         self._t_us, self._counter, self._mode = 0, 0, int(Mode.TRACKING)
@@ -75,7 +75,7 @@ class Sender:
             self._held = (0, 0, 0)
 
     def frame(self) -> tuple[int, ...]:
-        """The next one, as fields of ``wire.FRAME``."""
+        """The next one, as fields of ``calls.CALL``."""
         draw = self._draw
         if draw.random() < 0.01:
             self._mode = draw.choice((*map(int, Mode), int(Mode.TRACKING), int(Mode.TRACKING), 99))
@@ -89,7 +89,7 @@ class Sender:
 
     def _made(self, can_id: int, data: int, length: int, flags: int = 3) -> tuple[int, ...]:
         signed = data - (1 << 64) if data >= 1 << 63 else data
-        return self._t_us, signed, can_id, flags, length, self._mode, 0, 0
+        return self._t_us, signed, can_id, flags, length, int(Call.JUDGE), self._mode
 
     def _drive_frame(self) -> tuple[int, ...]:
         draw, slew, self._is_drive = self._draw, self._slew, True

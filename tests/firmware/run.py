@@ -5,44 +5,38 @@ The emulator and the compiler for ARM are Debian's packages, unpacked beside, or
 had the board's part is left out, loudly. Exit code 0 if all that was tried holds, 1 if not.
 """
 
-import ctypes
 import dataclasses
+import multiprocessing
 import os
 import re
-import shutil
 import subprocess
 import sys
 import tempfile
 import time
-from collections.abc import Iterator
+from concurrent.futures import ProcessPoolExecutor
 from pathlib import Path
-from typing import NamedTuple
 
 import numpy as np
-from debian import fetched
-from disassembly import fused_instructions, stack_bound
-from frames import judged, missing
+from compared import Law, compared_here, exchanges_compared, first_difference, frames_compared, shared
+from disassembly import fused_instructions
 from numpy.typing import NDArray
-from segments import PREVIEW, TICKS, Segment, segments
+from on_board import HELD_MOST, SCRATCH, compared_on_board
+from segments import TICKS, segments
 
+from hil.commands.export import exported_of
 from hil.lanes.setup import Setup
 from hil.runs.scenario import load_scenario
-from pkxyz_ctrl.can.driver_config import DriverConfig
 from pkxyz_ctrl.compiled.kernel_cache import choose_kernel_cache
 from pkxyz_ctrl.config.files import CONFIG_DIR, ConfigError
 from pkxyz_ctrl.core.tick import PREDICTIVE
 from pkxyz_ctrl.design.model.discrete_law import LawError
 from pkxyz_ctrl.export import kernels as exporting
-from pkxyz_ctrl.export.elf import symbols
-from pkxyz_ctrl.export.entries import ENTRIES
-from pkxyz_ctrl.export.folder import Exported, write
+from pkxyz_ctrl.export.folder import write
 from pkxyz_ctrl.export.kernels import Kernels, kernels
-from pkxyz_ctrl.export.lowering import lower
+from pkxyz_ctrl.export.lowering import Lowered, lower
+from pkxyz_ctrl.export.stored import stored_in_exchange
 from pkxyz_ctrl.export.targets import TARGETS
-from pkxyz_ctrl.export.wire import new_wire_memory, wire_record
-from pkxyz_ctrl.export.words import FNV_OFFSET, FNV_PRIME, canonical
 from pkxyz_ctrl.loop import cycle as cycling
-from pkxyz_ctrl.loop.reference import reference_rows
 from pkxyz_ctrl.loop.row import ROW
 from pkxyz_ctrl.safety.modes import Mode
 from pkxyz_ctrl.safety.trips import Trip
@@ -50,22 +44,8 @@ from pkxyz_ctrl.safety.trips import Trip
 Records = NDArray[np.void]
 
 TICKS_LEAST = 1_000_000
-FRAMES = 300_000
-HERE = Path(__file__).parent
-ROOT = HERE.parents[1]
-SCRATCH = ROOT / ".firmware"
-BOARD_PACKAGES = ("qemu-system-arm", "gcc-arm-none-eabi")
 FROM_OUTSIDE = Trip.GATE_BLOCKED | Trip.OPERATOR | Trip.SOLVER
 """What no exported law raises by itself: its callers do, and the one law with a solver does not go."""
-MHZ = 480
-
-
-class Law(NamedTuple):
-    """A shipped controller: its name, its segments as they ran in Python, and the memory (1,) after the last."""
-
-    name: str
-    segments: list[Segment]
-    memory: Records
 
 
 def main(ticks: int) -> int:
@@ -73,17 +53,21 @@ def main(ticks: int) -> int:
     begin_s = time.monotonic()
     SCRATCH.mkdir(exist_ok=True)
     failures: list[str] = []
-    with tempfile.TemporaryDirectory(dir=SCRATCH) as folder:
+    spawning = multiprocessing.get_context("spawn")
+    with ProcessPoolExecutor(1, spawning) as beside, tempfile.TemporaryDirectory(dir=SCRATCH) as folder:
         work = Path(folder)
         host, board = exported("host", work), exported("cortex-m7", work)
+        again, others = beside.submit(anew), {name: beside.submit(lowered, name) for name in TARGETS}
         failures += own_test(host)
         laws = played(ticks)
         failures += covered(laws)
+        failures += too_large(laws)
         library = shared(host / "pkxyz.o", host)
         failures += compared_here(laws, library)
+        failures += exchanges_compared(library)
         failures += frames_compared(library)
         failures += planted(laws[0], host)
-        failures += clean(board)
+        failures += clean(board, {name: other.result() for name, other in others.items()}, again.result())
         failures += compared_on_board(laws, board)
     for line in failures:
         print(f"FAILED: {line}")
@@ -93,13 +77,8 @@ def main(ticks: int) -> int:
 
 def exported(target: str, work: Path) -> Path:
     """The folder of ``pkxyz export`` for a target, of the default scenario."""
-    setup = load_scenario("raster").setup()
-    reference = reference_rows(setup.trajectory.sample(0, TICKS + PREVIEW, setup.bus.period_us))
-    (segment,) = segments(setup.law, setup.trajectory, setup.bus.period_us, 1, 0)
     out = work / target
-    wire = wire_record(setup.gate, DriverConfig())
-    records = setup.law, wire, reference, segment.inputs[:1000]
-    write(out, target, Exported(*records, "raster", setup.controller.name, ""))
+    write(out, target, exported_of(load_scenario("raster"), TICKS))
     return out
 
 
@@ -157,56 +136,14 @@ def covered(laws: list[Law]) -> list[str]:
     return [f"the ticks had no {name}" for name in missing]
 
 
-def shared(code: Path, folder: Path) -> ctypes.CDLL:
-    """An object for this machine as a library, with ``play`` around it."""
-    out = code.with_suffix(".so")
-    words = ["cc", "-shared", "-fPIC", "-O2", f"-I{folder}", "-o", out, HERE / "play.c", code]
-    subprocess.run(words, check=True)
-    return ctypes.CDLL(str(out))
-
-
-def compared_here(laws: list[Law], library: ctypes.CDLL) -> list[str]:
-    """Every row and the last memory, word by word."""
-    begin_s = time.monotonic()
-    failures = [difference for law in laws if (difference := first_difference(law, library))]
-    print(f"host: rows and memories of all {len(laws)} laws compared, {time.monotonic() - begin_s:.0f} s")
+def too_large(laws: list[Law]) -> list[str]:
+    """Laws of which a board would have to hold more than it should."""
+    failures = []
+    for law in laws:
+        held = stored_in_exchange(law.segments[0].law)
+        print(f"{law.name:34} {held.settings:6} bytes of law and settings, {held.memory:6} of memory")
+        failures += [f"{law.name}: more than {HELD_MOST} bytes"] if sum(held) > HELD_MOST else []
     return failures
-
-
-def frames_compared(library: ctypes.CDLL) -> list[str]:
-    """The gate's answer to each frame, and what it remembers in the end."""
-    begin_s = time.monotonic()
-    wire = wire_record(load_scenario("raster").setup().gate, DriverConfig())
-    here = judged(wire, FRAMES, 13)
-    failures = [f"no frame was refused for {name}" for name in missing(here)]
-    frames, memory = here.frames.copy(), new_wire_memory()
-    words = [array.ctypes.data_as(ctypes.c_void_p) for array in (wire, memory, frames)]
-    status = library.judge(*words, len(frames))
-    same = frames["reason"] == here.reasons
-    if status != 0 or not same.all():
-        failures.append(f"the gate's answer to frame {int(same.argmin())}, status {status}")
-    if not np.array_equal(canonical(memory), canonical(here.memory)):
-        failures.append("the gate's memory in the end")
-    passed = here.frames[here.reasons == 0]
-    voltages = np.count_nonzero((passed["can_id"] == wire["drive"]["cob_id"][0, 0]) & (passed["data"] << 16 != 0))
-    print(f"host: {FRAMES} frames judged, {voltages} voltages passed, {time.monotonic() - begin_s:.0f} s")
-    return failures if voltages > FRAMES // 100 else [*failures, "hardly a voltage passed the gate"]
-
-
-def first_difference(law: Law, library: ctypes.CDLL) -> str:
-    """Where a library parts from Python; empty if nowhere."""
-    memory, ticks = cycling.new_memory(Mode.IDLE), 0
-    for segment in law.segments:
-        rows, path = np.zeros_like(segment.rows), segment.reference
-        words = [array.ctypes.data_as(ctypes.c_void_p) for array in (segment.law, memory, path, segment.inputs, rows)]
-        status = library.play(*words[:3], len(path), words[3], len(rows), words[4])
-        if status != 0:
-            return f"{law.name}: status at tick {ticks + status - 1}"
-        same = (canonical(rows).reshape(len(rows), -1) == canonical(segment.rows).reshape(len(rows), -1)).all(axis=1)
-        if not same.all():
-            return f"{law.name}: row of tick {ticks + int(same.argmin())}"
-        ticks += len(rows)
-    return "" if np.array_equal(canonical(memory), canonical(law.memory)) else f"{law.name}: memory at the end"
 
 
 def planted(law: Law, host: Path) -> list[str]:
@@ -241,18 +178,21 @@ def changed_order(ir: str) -> str:
     return ir[: begin.start()] + changed + ir[end:]
 
 
-def clean(board: Path) -> list[str]:
+def lowered(name: str) -> Lowered:
+    """The kernels for a target."""
+    return lower(kernels(), TARGETS[name])
+
+
+def clean(board: Path, others: dict[str, Lowered], again: Kernels) -> list[str]:
     """No target's code fuses a multiplication with an addition, nor needs what a port does not owe."""
-    made, failures = kernels(), []
+    failures = []
     for name, target in TARGETS.items():
-        lowered = lower(made, target)
-        found = fused_instructions(lowered.assembly)
+        found = fused_instructions(others[name].assembly)
         failures += [f"{name}: {line}" for line in found]
-        if name == "cortex-m7" and lowered.code != (board / "pkxyz.o").read_bytes():
+        if name == "cortex-m7" and others[name].code != (board / "pkxyz.o").read_bytes():
             failures.append("the same input gave other bytes")
-        if lowered.owed and target.has_double and not target.is_hosted:
-            failures.append(f"{name}: needs {lowered.owed}")
-    again = anew()
+        if others[name].owed and target.has_double and not target.is_hosted:
+            failures.append(f"{name}: needs {others[name].owed}")
     if lower(again, TARGETS["cortex-m7"]).code != (board / "pkxyz.o").read_bytes():
         failures.append("kernels compiled anew, with another order of sets, gave other bytes")
     return failures
@@ -267,122 +207,6 @@ def anew() -> Kernels:
     finally:
         os.environ.pop("PYTHONHASHSEED")
         os.environ.update({name: value for name, value in kept.items() if value is not None})
-
-
-def compared_on_board(laws: list[Law], board: Path) -> list[str]:
-    """The same on the emulated Cortex-M7, by a hash of each row; and how many instructions each tick took."""
-    tools, why_not = board_tools()
-    if tools is None:
-        print(
-            f"\n*** SKIPPED: test-firmware on the board, nothing was tried on a Cortex-M7: {why_not}\n", file=sys.stderr
-        )
-        return []
-    failures = built(board, tools)
-    if failures:
-        return failures
-    with (board / "segments").open("wb") as file:
-        for law in laws:
-            for n, segment in enumerate(law.segments):
-                head = np.array([len(segment.reference), len(segment.inputs), n == 0, Mode.IDLE], np.int32)
-                file.writelines(array.tobytes() for array in (head, segment.law, segment.reference, segment.inputs))
-    begin_s = time.monotonic()
-    done = tools.run("qemu-system-arm", *QEMU, "-icount", "shift=0", "-kernel", "board.elf", cwd=board)
-    if done.returncode != 0:
-        return [f"the board ended with {done.returncode}: {done.stdout[-200:]} {done.stderr[-200:]}"]
-    print(
-        f"Cortex-M7: {sum(len(s.rows) for law in laws for s in law.segments)} ticks, {time.monotonic() - begin_s:.0f} s"
-    )
-    return list(board_differences(laws, (board / "results").read_bytes()))
-
-
-QEMU = ("-M", "mps2-an500", "-nographic", "-monitor", "none", "-serial", "null", "-semihosting-config",
-        "enable=on,target=native")  # fmt: skip
-INSTRUCTIONS_A_COUNT = 40
-"""The board's counter runs at 25 MHz, and with ``-icount shift=0`` an instruction takes a nanosecond."""
-RESULT = np.dtype([("hash", "<u8"), ("counts", "<u4"), ("status", "<u4")])
-
-
-def board_differences(laws: list[Law], results: bytes) -> Iterator[str]:
-    """What the board made otherwise; prints the instructions a tick."""
-    at = 0
-    print(f"{'instructions a tick':28} {'median':>8} {'p99.9':>8} {'most':>8}   at {MHZ} MHz, one each")
-    for law in laws:
-        counts: list[NDArray[np.uint32]] = []
-        for segment in law.segments:
-            size = len(segment.rows) * RESULT.itemsize
-            got = np.frombuffer(results[at : at + size], RESULT)
-            memory = np.frombuffer(results[at + size : at + size + cycling.MEMORY.itemsize], cycling.MEMORY)
-            at += size + cycling.MEMORY.itemsize
-            same = (got["hash"] == hashes(segment.rows)) & (got["status"] == 0)
-            if not same.all():
-                yield f"Cortex-M7, {law.name}: row of a tick, the {int(same.argmin())}th of its segment"
-                break
-            counts.append(got["counts"])
-        else:
-            if not np.array_equal(canonical(memory), canonical(law.memory)):
-                yield f"Cortex-M7, {law.name}: memory at the end"
-        taken = np.concatenate(counts) * INSTRUCTIONS_A_COUNT if counts else np.zeros(1)
-        middle, high, most = np.percentile(taken, [50, 99.9, 100])
-        print(f"{law.name:28} {middle:8.0f} {high:8.0f} {most:8.0f}   {most / MHZ:.1f} us")
-
-
-def hashes(rows: Records) -> NDArray[np.uint64]:
-    """FNV-1a of each row (n,) by itself."""
-    words = canonical(rows).reshape(len(rows), -1)
-    state = np.full(len(rows), FNV_OFFSET, np.uint64)
-    with np.errstate(over="ignore"):
-        for column in words.T:
-            state = (state ^ column) * np.uint64(FNV_PRIME)
-    return state
-
-
-class Tools(NamedTuple):
-    """Where the programs are, and what they need to run."""
-
-    folder: Path | None
-    environment: dict[str, str]
-
-    def run(self, name: str, *words: str, cwd: Path) -> subprocess.CompletedProcess[str]:
-        fetched_one = None if self.folder is None else self.folder / name
-        program = str(fetched_one) if fetched_one is not None and fetched_one.is_file() else name
-        return subprocess.run(
-            [program, *words], cwd=cwd, env=self.environment, check=False, capture_output=True, text=True, timeout=600
-        )
-
-
-def board_tools() -> tuple[Tools | None, str]:
-    """Compiler and emulator, from PATH or from Debian; or None and why there are none."""
-    if all(shutil.which(name) for name in ("qemu-system-arm", "arm-none-eabi-gcc", "arm-none-eabi-objdump")):
-        return Tools(None, dict(os.environ)), ""
-    root = SCRATCH / "root"
-    missing = fetched(BOARD_PACKAGES, root, with_dependencies=True)
-    if missing:
-        return None, missing
-    libraries = os.pathsep.join(str(root / part / "x86_64-linux-gnu") for part in ("usr/lib", "lib"))
-    return Tools(root / "usr" / "bin", {**os.environ, "LD_LIBRARY_PATH": libraries}), ""
-
-
-def built(board: Path, tools: Tools) -> list[str]:
-    """Link ``board.c`` with the exported object, run the folder's own self-test, and look at what was linked."""
-    shutil.copy(HERE / "board.c", board)
-    flags = ["-std=c11", "-O2", "-fno-strict-aliasing", *TARGETS["cortex-m7"].flags.split()]
-    link = TARGETS["cortex-m7"].link.split()
-    failures = []
-    for out, sources in (
-        ("board.elf", ["board.c", "selftest.c", "port_cortex_m.c"]),
-        ("selftest.elf", ["main.c", "law.c", "wire.c", "reference.c", "selftest.c", "port_cortex_m.c"]),
-    ):
-        done = tools.run("arm-none-eabi-gcc", *flags, "-o", out, *sources, "pkxyz.o", *link, cwd=board)
-        if done.returncode != 0:
-            return [f"linking {out}: {done.stderr[-400:]}"]
-    done = tools.run("qemu-system-arm", *QEMU, "-kernel", "selftest.elf", cwd=board)
-    print(f"Cortex-M7: {(done.stdout + done.stderr).strip()}")
-    failures += [] if done.returncode == 0 else ["the self-test on the board"]
-    listing = tools.run("arm-none-eabi-objdump", "-d", "--no-show-raw-insn", "board.elf", cwd=board).stdout
-    bound, way = max(stack_bound(listing, entry.name) for entry in ENTRIES)
-    code = (board / "pkxyz.o").read_bytes()
-    print(f"Cortex-M7: stack at most {bound} bytes, by {' > '.join(way)}; {len(symbols(code))} symbols")
-    return failures + [f"board.elf: {line}" for line in fused_instructions(listing)]
 
 
 if __name__ == "__main__":

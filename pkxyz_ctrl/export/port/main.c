@@ -1,43 +1,64 @@
-/* The self-test: the sense frames of $ticks recorded ticks, and what must come of them, bit by bit.
-   one_period() is all that a board does with the controller between its SYNC and its drive frame. */
+/* The self-test: a recorded exchange of $ticks periods, its start-up before it, and what must come of it, bit by bit.
+   called() has every call that a board makes of the controller. */
 #include "pkxyz.h"
 
-extern const uint64_t pkxyz_law_words[], pkxyz_wire_words[], pkxyz_path_words[];
-extern const uint64_t pkxyz_frame_words[], pkxyz_tried_words[];
-extern const int32_t pkxyz_path_words_count, pkxyz_frame_words_count;
+extern const uint64_t pkxyz_config_words[], pkxyz_path_words[], pkxyz_call_words[], pkxyz_tried_words[];
+extern uint64_t pkxyz_memory_words[], pkxyz_doubtful_words[]; /* zeros: nothing known, 0 V */
+extern const int32_t pkxyz_path_words_count, pkxyz_call_words_count;
 extern const uint8_t pkxyz_row_is_double[], pkxyz_memory_is_double[];
-extern const uint8_t pkxyz_frame_is_double[], pkxyz_wire_memory_is_double[];
 extern const uint64_t pkxyz_hash_begin, pkxyz_hash_prime, pkxyz_nan, pkxyz_digests[];
 
 /* What the port gives: a line to the engineer, and the end. */
 void port_print(const char *line);
 void port_exit(int code);
 
-static const pkxyz_cycle_law *const law = (const void *)pkxyz_law_words;
-static const pkxyz_wire *const wire = (const void *)pkxyz_wire_words;
+static const pkxyz_exchange *const config = (const void *)pkxyz_config_words;
 static const pkxyz_reference *const path = (const void *)pkxyz_path_words;
-static const pkxyz_wire_frame *const frames = (const void *)pkxyz_frame_words;
-static const pkxyz_wire_frame *const tried = (const void *)pkxyz_tried_words;
-static pkxyz_cycle_memory memory; /* zeros: nothing known, 0 V */
-static pkxyz_wire_memory wire_memory, doubtful;
+static const pkxyz_calls_call *const calls = (const void *)pkxyz_call_words;
+static const pkxyz_calls_call *const tried = (const void *)pkxyz_tried_words;
 
-/* From SYNC to drive frame. Each is sent if its reason is 0; a drive frame that may not be is 0 V by other means. */
-static int32_t one_period(int32_t tick, const pkxyz_wire_frame *sensed, pkxyz_wire_frame *frame)
+static int32_t called(const pkxyz_exchange *config, const pkxyz_reference *path, int32_t rows,
+                      const pkxyz_calls_call *call, pkxyz_exchange_memory *memory, int64_t *told)
 {
-    frame->t_us = (int64_t)tick * PKXYZ_PERIOD_US;
-    frame->data = tick % 240 + 1; /* the SYNC counter, one byte */
-    frame->can_id = 0x080;
-    frame->flags = wire->flags;
-    frame->length = 1;
-    frame->mode = memory.mode;
-    frame->counter = tick & 0xff;
-    int32_t status = pkxyz_judge(wire, &wire_memory, frame);
-    status |= pkxyz_sync(wire, &wire_memory);
-    status |= pkxyz_receive(wire, &wire_memory, sensed);
-    status |= pkxyz_take(&wire_memory, &memory);
-    status |= pkxyz_cycle(law, &memory, path, pkxyz_path_words_count);
-    status |= pkxyz_drive(wire, &memory, frame);
-    return status | pkxyz_judge(wire, &wire_memory, frame);
+    pkxyz_driver_rules_outgoing *out = memory->driver[0].out;
+    const int64_t t_us = call->t_us;
+    switch (call->kind) {
+    case PKXYZ_CALL_START:
+        return pkxyz_start(config, memory, t_us, told);
+    case PKXYZ_CALL_WAIT:
+        return pkxyz_wait(config, memory, t_us, told);
+    case PKXYZ_CALL_COME_UP:
+        return pkxyz_come_up(memory, told);
+    case PKXYZ_CALL_BEGIN:
+        return pkxyz_begin(config, memory, t_us, told);
+    case PKXYZ_CALL_FRAME:
+        return pkxyz_on_frame(config, memory, call->can_id, call->flags, call->length, call->data, t_us, told);
+    case PKXYZ_CALL_PERIOD:
+        return pkxyz_period(config, memory, path, rows, (int32_t)call->data, told);
+    case PKXYZ_CALL_FINISH:
+        return pkxyz_finish(config, memory, t_us, call->data, told);
+    case PKXYZ_CALL_STOP:
+        return pkxyz_stop(config, memory, t_us, told);
+    case PKXYZ_CALL_JUDGE:
+        out->data = call->data;
+        out->can_id = call->can_id;
+        out->flags = call->flags;
+        out->length = call->length;
+        out->reason = 0;
+        memory->driver[0].outgoing = 1;
+        memory->cycle[0].mode = call->mode;
+        return pkxyz_judge(config, memory, 0, t_us, told);
+    case PKXYZ_CALL_REQUEST:
+        memory->event = (int32_t)call->data;
+        break;
+    case PKXYZ_CALL_CLEAR:
+        memory->clearing = (int32_t)call->data;
+        break;
+    default:
+        return 1;
+    }
+    *told = 0;
+    return 0;
 }
 
 static uint64_t hashed(uint64_t state, const void *record, size_t size, const uint8_t *is_double)
@@ -45,43 +66,54 @@ static uint64_t hashed(uint64_t state, const void *record, size_t size, const ui
     const uint64_t *words = record;
     for (size_t n = 0; n < size / 8; n++) {
         uint64_t word = words[n];
-        if (is_double[n] && (word & 0x7fffffffffffffff) > 0x7ff0000000000000)
+        if (is_double && is_double[n] && (word & 0x7fffffffffffffff) > 0x7ff0000000000000)
             word = pkxyz_nan;
         state = (state ^ word) * pkxyz_hash_prime;
     }
     return state;
 }
 
-static int self_test(void)
+/* What a call left: what it told, and the row of a period or frames, each with the gate's reason. */
+static uint64_t left_by(const pkxyz_calls_call *call, pkxyz_exchange_memory *memory, int64_t told, uint64_t state)
+{
+    state = hashed(state, &told, sizeof told, 0);
+    if (call->kind == PKXYZ_CALL_COME_UP || call->kind >= PKXYZ_CALL_REQUEST)
+        return state;
+    if (call->kind == PKXYZ_CALL_PERIOD)
+        return hashed(state, &memory->cycle[0].row, sizeof memory->cycle[0].row, pkxyz_row_is_double);
+    return hashed(state, memory->driver[0].out, sizeof memory->driver[0].out[0] * memory->driver[0].outgoing, 0);
+}
+
+static int self_test(pkxyz_exchange_memory *memory, pkxyz_exchange_memory *doubtful)
 {
     uint64_t state = pkxyz_hash_begin;
-    int32_t part = 0;
-    pkxyz_wire_frame frame = {0}, other;
-    memory.mode = $mode; /* the node is operational */
-    if (pkxyz_begin(&wire_memory) != 0 || pkxyz_begin(&doubtful) != 0)
+    int64_t told = 0;
+    int32_t part = 0, periods = 0;
+    if (pkxyz_switch_on(memory) != 0 || pkxyz_switch_on(doubtful) != 0)
         return 1;
-    for (int32_t tick = 0; tick < pkxyz_frame_words_count; tick++) {
-        other = tried[tick]; /* another gate, which is asked about anything */
-        if (one_period(tick, &frames[tick], &frame) != 0 || pkxyz_judge(wire, &doubtful, &other) != 0)
+    for (int32_t n = 0; n < pkxyz_call_words_count; n++) {
+        if (called(config, path, pkxyz_path_words_count, &calls[n], memory, &told) != 0)
             return 1;
-        if (tick % 2 && pkxyz_clear(&doubtful) != 0)
+        state = left_by(&calls[n], memory, told, state);
+        if (calls[n].kind != PKXYZ_CALL_PERIOD)
+            continue;
+        if (called(config, path, 0, &tried[periods], doubtful, &told) != 0) /* another gate, which is asked about anything */
             return 1;
-        state = hashed(state, &memory.row, sizeof memory.row, pkxyz_row_is_double);
-        state = hashed(state, &frame, sizeof frame, pkxyz_frame_is_double);
-        state = hashed(state, &other, sizeof other, pkxyz_frame_is_double);
-        if ((tick + 1) % $every == 0 && state != pkxyz_digests[part++])
+        state = left_by(&tried[periods], doubtful, told, state);
+        if (periods++ % 2)
+            doubtful->gate[0].latched = 0;
+        if (periods % $every == 0 && state != pkxyz_digests[part++])
             return 1;
     }
-    state = hashed(state, &memory, sizeof memory, pkxyz_memory_is_double);
-    state = hashed(state, &wire_memory, sizeof wire_memory, pkxyz_wire_memory_is_double);
-    return hashed(state, &doubtful, sizeof doubtful, pkxyz_wire_memory_is_double) != pkxyz_digests[part];
+    state = hashed(state, memory, PKXYZ_MEMORY_BYTES, pkxyz_memory_is_double);
+    return hashed(state, doubtful, PKXYZ_MEMORY_BYTES, pkxyz_memory_is_double) != pkxyz_digests[part];
 }
 
 int main(void)
 {
-    int failed = self_test();
+    int failed = self_test((void *)pkxyz_memory_words, (void *)pkxyz_doubtful_words);
     port_print(failed ? "pkxyz: self-test FAILED: these are not the bits of the controller"
-                      : "pkxyz: self-test passed, $ticks ticks, $last");
+                      : "pkxyz: self-test passed, $ticks periods, $last");
     port_exit(failed);
     return failed;
 }

@@ -1,6 +1,6 @@
 """The tables of docs/lookup/wire.md, made from the EDS; a test compares them with the page.
 
-``python -m pkxyz_ctrl.can.wire_doc comb_amplifier.eds`` prints them.
+``python docs/site/object_tables.py comb_amplifier.eds`` prints them.
 """
 
 import sys

@@ -1,0 +1,51 @@
+"""What of the two records a board has to hold for a law: what only other laws have stands last, and stays away."""
+
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from pkxyz_ctrl.core import tick
+from pkxyz_ctrl.core.demand import LINEAR, PREDICTIVE
+from pkxyz_ctrl.core.linear_law import LINEAR_LAW
+from pkxyz_ctrl.loop import cycle as cycling
+from pkxyz_ctrl.loop.exchange import EXCHANGE, EXCHANGE_MEMORY
+
+Records = NDArray[np.void]
+
+_WORD = 8
+
+
+class Stored(NamedTuple):
+    """Bytes from the beginning of a record on, a multiple of eight: of its law or settings, and of its memory."""
+
+    settings: int
+    memory: int
+
+
+def stored(law: Records) -> Stored:
+    """Of ``cycle.LAW`` and ``cycle.MEMORY``, for a ``law`` (1,)."""
+    numbers = law[0]["tick"]
+    rows = int(numbers["linear"]["order"]) if numbers["kind"] == LINEAR else 0
+    linear_at = _at(cycling.LAW, "tick") + _at(tick.LAW, "linear")
+    row_bytes = LINEAR_LAW["a"].itemsize // LINEAR_LAW["a"].shape[0]
+    settings = linear_at + _at(LINEAR_LAW, "a") + rows * row_bytes if rows else linear_at
+    if numbers["kind"] == PREDICTIVE:
+        settings = cycling.LAW.itemsize
+    learns = numbers["adaptation"]["on"] != 0
+    memory = cycling.MEMORY.itemsize if learns else _at(cycling.MEMORY, "tick") + _at(tick.MEMORY, "adaptation")
+    return Stored(_whole(settings), _whole(memory))
+
+
+def stored_in_exchange(law: Records) -> Stored:
+    """Of ``EXCHANGE`` and ``EXCHANGE_MEMORY``, of which law and memory are the last."""
+    settings, memory = stored(law)
+    return Stored(_at(EXCHANGE, "law") + settings, _at(EXCHANGE_MEMORY, "cycle") + memory)
+
+
+def _at(record: np.dtype[np.void], field: str) -> int:
+    return int(dict(record.fields or {})[field][1])
+
+
+def _whole(size: int) -> int:
+    return -(-size // _WORD) * _WORD
