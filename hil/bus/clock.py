@@ -58,6 +58,16 @@ class Lockstep:
         if t_us >= self.now_us:
             self.run_until(t_us)
 
+    def first_us(self, is_meant: Callable[[Callable[[], object]], bool]) -> int | None:
+        """Time of the first event for which ``is_meant``; None if there is none."""
+        return min((t_us for t_us, _, fn in self._heap if is_meant(fn)), default=None)
+
+    def leap(self, t_us: int) -> None:
+        """It is ``t_us``: what was due until then runs only now. For who has seen to it that nothing minds."""
+        self.now_us = t_us
+        while self._heap and self._heap[0][0] <= t_us:
+            heappop(self._heap)[2]()
+
     def spend(self, compute_us: int) -> None:
         """Let ``compute_us`` pass: computing costs what one says that it costs."""
         t_us = self.now_us + compute_us

@@ -166,6 +166,10 @@ class Endpoint:
         self._received.clear()
         return received
 
+    def put_back(self, received: list[tuple[Frame, int]]) -> None:
+        """Frames that were taken and not read, oldest first: they are the next ones."""
+        self._received.extendleft(reversed(received))
+
     def flush(self) -> None:
         """Discard all queued frames but the one on the wire."""
         if self._medium is not None:

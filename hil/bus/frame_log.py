@@ -63,6 +63,13 @@ class FrameLog:
             self._file.write("".join(self._lines(rows)))
             self._file.flush()
 
+    def write_lines(self, lines: bytes, frames: int) -> None:
+        """Lines that somebody else has formatted (``log_lines``), behind what was recorded so far."""
+        self.flush()
+        self.frames += frames
+        self._file.write(lines.decode("ascii"))
+        self._file.flush()
+
     def close(self) -> None:
         if not self._file.closed:
             try:

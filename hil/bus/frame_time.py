@@ -128,6 +128,11 @@ def bits_ns(n_bits: int, bitrate: int) -> int:
     return (n_bits * 1_000_000_000 + bitrate // 2) // bitrate
 
 
+def to_end_ns(nominal_bitrate: int) -> int:
+    """What, added to a frame's start and duration, gives 1000 times the microsecond at which its EOF has ended."""
+    return 999 - bits_ns(INTERFRAME_BITS, nominal_bitrate)
+
+
 def frame_flags(frame: Frame, error_passive: bool = False) -> int:
     """The flags of ``duration_ns_kernel``. Raises FrameFormatError for an error frame."""
     flags = frame.flags

@@ -16,7 +16,7 @@ from hil.bus.clock import Lockstep
 from hil.bus.disturbance import Disturbance
 from hil.bus.endpoint import Endpoint, Kind, Listener
 from hil.bus.fault_confinement import ERROR_ACK, ERROR_PROTOCOL, FaultConfinement
-from hil.bus.frame_time import INTERFRAME_BITS, FrameFormatError, bits_ns, duration_ns_kernel, frame_duration_ns
+from hil.bus.frame_time import FrameFormatError, bits_ns, duration_ns_kernel, frame_duration_ns, to_end_ns
 from pkxyz_ctrl.can.frame import Frame
 from pkxyz_ctrl.compiled.direct_call import direct
 
@@ -54,11 +54,9 @@ class Wire:
         self._bitrates = nominal_bitrate, data_bitrate or nominal_bitrate
         self._duration_ns = partial(_duration_ns, *self._bitrates)
         self._error_delimiter_ns = bits_ns(ERROR_DELIMITER_BITS, nominal_bitrate)
-        self._to_end_ns = 999 - bits_ns(
-            INTERFRAME_BITS, nominal_bitrate
-        )  # to where the EOF ends, rounded up to a microsecond
+        self._to_end_ns = to_end_ns(nominal_bitrate)
         self._confinement = FaultConfinement(clock, nominal_bitrate, self._idle_ns)
-        self._endpoints: tuple[Endpoint, ...] = ()
+        self.endpoints: tuple[Endpoint, ...] = ()
         self._order = 0
         self._frames = 0
         self._error_frames = 0
@@ -97,20 +95,20 @@ class Wire:
         ``on_full`` is called to make some; else that one is lost.
         ``listen_only`` neither acknowledges nor sends; with ``error_frames`` error frames are delivered too.
         """
-        if any(other.name == name for other in self._endpoints):
+        if any(other.name == name for other in self.endpoints):
             raise ValueError(f"an endpoint named {name!r} is attached already")
         endpoint = Endpoint(
             self, name, on_frame, queue_limit, on_full, on_sent, listen_only, error_frames, auto_recover
         )
-        self._endpoints = (*self._endpoints, endpoint)
+        self.endpoints = (*self.endpoints, endpoint)
         self.introduce()
         return endpoint
 
     def introduce(self) -> None:
         """Tell every endpoint who is to get its frames."""
-        self._confinement.endpoints = self._endpoints
-        for endpoint in self._endpoints:
-            others = [e for e in self._endpoints if e is not endpoint]
+        self._confinement.endpoints = self.endpoints
+        for endpoint in self.endpoints:
+            others = [e for e in self.endpoints if e is not endpoint]
             endpoint._listeners = tuple(e for e in others if e.on_frame is not None)
             endpoint._queues = tuple((e._received, e.queue_limit, e) for e in others if e.on_frame is None)
 
@@ -118,7 +116,7 @@ class Wire:
         """Unplug ``endpoint``; a frame of its that is on its way is cut off."""
         self._is_ordinary = self._is_calm = False
         self._confinement.forget(endpoint)
-        self._endpoints = tuple(e for e in self._endpoints if e is not endpoint)
+        self.endpoints = tuple(e for e in self.endpoints if e is not endpoint)
         self.introduce()
         endpoint._unplug()
         if self._end_us >= 0 and not self._has_started():
@@ -137,6 +135,20 @@ class Wire:
         """Fraction of the time since ``since`` (None: since the wire was made) in which the wire was taken, 0..1."""
         now, then = self.statistics(), since or self._first
         return (now.busy_ns - then.busy_ns) / max(1, (now.t_us - then.t_us) * 1000)
+
+    @property
+    def is_calm(self) -> bool:
+        """Whether it is idle, with nothing queued, and the next frame meets no error."""
+        return self._is_calm and self._is_ordinary
+
+    @property
+    def carried(self) -> tuple[int, int, int]:
+        """End of the latest interframe space and time taken in ns, and frames; for who carries some in its place."""
+        return self._free_ns, self._busy_ns, self._frames
+
+    @carried.setter
+    def carried(self, carried: tuple[int, int, int]) -> None:
+        self._free_ns, self._busy_ns, self._frames = carried
 
     # -- queues ------------------------------------------------------------------------------------------------------
 
@@ -218,7 +230,7 @@ class Wire:
         if ready_ns < self._free_ns:
             ready_ns = self._free_ns
         sender, entry, tie, suspended = None, None, False, 0
-        for endpoint in self._endpoints:
+        for endpoint in self.endpoints:
             if endpoint._to_send:
                 head = endpoint._to_send[0]
                 if endpoint._earliest_ns > ready_ns:
@@ -243,7 +255,7 @@ class Wire:
 
     def _arbitrate_slowly(self, ready_ns: int) -> tuple[int, Endpoint | None, Entry | None]:
         """The cases that are rare: senders that must wait after their own frame, and equal identifiers."""
-        ready = [e for e in self._endpoints if e._to_send]
+        ready = [e for e in self.endpoints if e._to_send]
         ready_ns = max(ready_ns, min((e._earliest_ns for e in ready), default=ready_ns))
         ready = [e for e in ready if e._earliest_ns <= ready_ns]
         ready.sort(key=lambda e: (e._to_send[0][0], dominance(e._to_send[0][2])))
@@ -289,7 +301,7 @@ class Wire:
 
     def _go_on(self) -> None:
         """The wire is free: whoever has something to send may."""
-        if any(e._to_send for e in self._endpoints):
+        if any(e._to_send for e in self.endpoints):
             self._arbitrate()
         else:
             self._has_queue = False
@@ -331,7 +343,7 @@ class Wire:
             sender.on_sent(entry[2], t_us)
 
     def _deliver(self, frame: Frame, t_us: int, *senders: Endpoint) -> None:
-        for endpoint in self._endpoints:
+        for endpoint in self.endpoints:
             if endpoint not in senders and not endpoint.bus_off:
                 self._confinement.received(endpoint)
                 endpoint._take(frame, t_us)

@@ -26,6 +26,11 @@ class FaultyClock:
         """As the clock below has it."""
         return self._clock.now_us
 
+    @property
+    def quiet_until_us(self) -> int | None:
+        """When the first of them begins; None if none is left."""
+        return self._origin_us + self._faults[-1].at_us if self._faults else None
+
     def _due(self) -> list[Fault]:
         """Those that are on; what is over is forgotten."""
         now_us = self._clock.now_us - self._origin_us

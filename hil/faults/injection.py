@@ -59,7 +59,13 @@ class Injection:
         """The next instant of the loop is its first tick: make all appointments. Returns the loop's clock."""
         self._origin_us = self._clock.now_us + self._period_us
         self._wire.arm(self._origin_us)
-        return FaultyClock(self._clock, self.faults, self._origin_us, self._period_us)
+        self._faulty = FaultyClock(self._clock, self.faults, self._origin_us, self._period_us)
+        return self._faulty
+
+    @property
+    def quiet_until_us(self) -> int | None:
+        """Until when the controller's own time has no fault; None: for ever."""
+        return self._faulty.quiet_until_us
 
     def clearing(self, record: Callable[[int], object], begin_anew: Callable[[int], object]) -> Callable[[int], object]:
         """``record`` and, so many ticks after a fault decision, a clear; a look at the combs, if one is wanted.

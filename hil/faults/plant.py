@@ -43,14 +43,14 @@ class FaultyPlant(PlantOnBus):
             self._commanded = counts
         if not sample:
             return super().exchange(t_us, self._on_converters(counts), sample=False)
-        changed = self._pass_time(t_us, t_us if self._origin_us is None else self._origin_us, counts)
+        changed = self._pass_time(t_us, t_us if self.origin_us is None else self.origin_us, counts)
         sensed = super().exchange(t_us, changed, sample=True)
         return self._through_sense(sensed) if self._on else sensed
 
     def look(self, t_us: int) -> None:
         """Without a sample, too, time passes for the faults."""
-        if self._origin_us is not None:
-            super().exchange(t_us, self._pass_time(t_us, self._origin_us, None), sample=False)
+        if self.origin_us is not None:
+            super().exchange(t_us, self._pass_time(t_us, self.origin_us, None), sample=False)
         super().look(t_us)
 
     def _pass_time(self, t_us: int, origin_us: int, counts: Counts | None) -> Counts | None:

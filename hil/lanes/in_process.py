@@ -51,12 +51,13 @@ def run(
     on_block: Callable[[NDArray[np.void]], None],
     on_progress: Callable[[int, int], None] = lambda done, total: None,
     frame_log: Path | None = None,
+    whole_ticks: bool = True,
 ) -> LaneResult:
     """Run a setup in lockstep or in the fast lane.
 
     ``on_block`` gets the rows (n,) of ``ROW`` in order and must not keep them; ``on_progress`` the ticks done and in
-    all. What was run before an exception (Ctrl-C) has been handed on. Raises ``ConfigError`` for a bus that the lane
-    can't use and ``StartUpError`` where the amplifier doesn't start.
+    all; ``whole_ticks`` is the lockstep rig's. What was run before an exception (Ctrl-C) has been handed on. Raises
+    ``ConfigError`` for a bus that the lane can't use and ``StartUpError`` where the amplifier doesn't start.
     """
     learner = setup.new_learner()
     blocks = Blocks(
@@ -71,7 +72,7 @@ def run(
         begin_s = time.perf_counter()
         missed, load, faults = 0, None, _run_fast(setup, run_block, memory, plant, blocks)
     elif lane == Lane.LOCKSTEP:
-        rig = LockstepRig(setup, frame_log)
+        rig = LockstepRig(setup, frame_log, whole_ticks=whole_ticks)
         begin_s = time.perf_counter()  # designed, wired up and loaded: what is timed from here is the run
         missed, load = rig.run(blocks)
         faults, memory, lost = rig.controller.faults, rig.controller.memory, rig.controller.driver.lost

@@ -21,20 +21,23 @@ from hil.faults.clock import ControllerKilledError
 from hil.faults.injection import Injection, plant_of
 from hil.lanes.blocks import Blocks
 from hil.lanes.setup import Setup
+from hil.lanes.stretches import Stretches
 from hil.node.wired import wired_node
-from hil.plant.on_bus import RECORD
+from hil.plant.on_bus import RECORD, PlantOnBus
 from hil.plant.truth import TRUTH_BYTES
 from pkxyz_ctrl.can.cob_id import SYNC
 from pkxyz_ctrl.can.frame import Frame
 from pkxyz_ctrl.config.bus import CanConfig
 from pkxyz_ctrl.config.files import ConfigError
+from pkxyz_ctrl.core.demand import PREDICTIVE
 from pkxyz_ctrl.loop.controller import Controller
 from pkxyz_ctrl.loop.reference import REFERENCE
 from pkxyz_ctrl.loop.row import ROW
-from pkxyz_ctrl.loop.runtime import Clock, Port, run, start
+from pkxyz_ctrl.loop.runtime import Clock, Port, go_on, start
 
 _ROW_BYTES: Final = ROW.itemsize
 _TRUTH_AT: Final = ROW.itemsize - TRUTH_BYTES
+_FEW_MOST: Final = 32  # ticks until whole ones are tried again
 
 
 class WirePort:
@@ -79,9 +82,20 @@ class _Draining:
 
 
 class LockstepRig:
-    """Everything between controller and plant, wired up for one run."""
+    """Everything between controller and plant, wired up for one run.
 
-    def __init__(self, setup: Setup, frame_log: Path | None = None) -> None:
+    ``whole_ticks``: those in which nothing else happens may run in one go; else each runs event by event, to the same
+    bits. ``controller``: which of them, where one is to note its calls.
+    """
+
+    def __init__(
+        self,
+        setup: Setup,
+        frame_log: Path | None = None,
+        *,
+        whole_ticks: bool = True,
+        controller: type[Controller] = Controller,
+    ) -> None:
         if setup.bus.can is None:
             raise ConfigError(
                 f"bus {setup.bus.name!r} has no [can]: the lockstep lane is all about frames; use the fast lane"
@@ -97,11 +111,12 @@ class LockstepRig:
         latency_us = (setup.bus.delay_periods - 1) * setup.bus.period_us
         self._endpoint = self.wire.attach("controller")
         self.port: Port = WirePort(self._endpoint, self.clock, latency_us)
-        self.controller = Controller(setup.law.copy(), setup.bus, setup.gate, self.port.send, self.port.discard_unsent)
+        self.controller = controller(setup.law.copy(), setup.bus, setup.gate, self.port.send, self.port.discard_unsent)
         self.injection = _injection_of(self) if setup.faults or setup.clear_s is not None else None
         self.log = FrameLog(frame_log, can.channel) if frame_log is not None else None
         if self.log is not None:
             self.log.attach(self.wire)
+        self._stretches = self._stretches_of() if whole_ticks else None
 
     def run(self, blocks: Blocks) -> tuple[int, float]:
         """Start the amplifier and run all ticks; returns how many were missed, and the bus load since the first."""
@@ -120,7 +135,7 @@ class LockstepRig:
             if not self.controller.can.driver.protection:
                 clock = _Draining(clock, self._endpoint, self.controller)
             with _seldom_collected():
-                run(clock, self.port, self.controller, reference, blocks.ticks, taking)
+                self._run_ticks(clock, reference, taking, record)
         except ControllerKilledError:
             assert injection is not None
             injection.outlive(blocks.ticks)
@@ -129,6 +144,43 @@ class LockstepRig:
             if self.log is not None:
                 self.log.close()
         return self.controller.missed_ticks, self.wire.bus_load(before)
+
+    def _run_ticks(
+        self, clock: Clock, reference: "_Reference", taking: Callable[[int], object], record: "_Recorder"
+    ) -> None:
+        """Whole ticks as long as nothing happens in them; the others event by event."""
+        ticks, tick, t_us = record.ticks, 0, self.clock.now_us + self.controller.period_us
+        is_watched = self.injection is not None and self.injection.watched is not None
+        stretches = None if is_watched else self._stretches
+        if stretches is not None:
+            stretches.keep_to_tracking(taking is not record)  # somebody acts on the other modes
+        few = 1
+        while tick < ticks:
+            if stretches is not None:
+                last_us = None if self.injection is None else self.injection.quiet_until_us
+                done = 0
+                if stretches.may_begin(t_us, last_us):
+                    rows = reference(tick)
+                    done = stretches.run(rows, record.room(min(reference.left(tick), ticks - 1 - tick)), t_us)
+                record.skip(done)
+                tick, t_us = tick + done, t_us + done * self.controller.period_us
+                few = 1 if done else min(2 * few, _FEW_MOST)
+            some = range(tick, min(tick + few, ticks))
+            t_us = go_on(clock, self.port, self.controller, reference, some, taking, t_us)
+            tick = some.stop
+
+    def _stretches_of(self) -> Stretches | None:
+        """What runs whole ticks, loaded; None for a law, a bus or a plant that has none."""
+        law, can = self.controller.law["tick"], self.controller.can
+        is_slow = self.setup.bus.delay_periods > 1
+        if law["kind"][0] == PREDICTIVE or not can.driver.protection or is_slow:
+            return None
+        if type(self.plant) is not PlantOnBus:  # one with faults
+            return None
+        return Stretches(
+            self.clock, self.wire, self._endpoint, self.node, self.plant, self.controller, self.log,
+            self.wire.endpoints,
+        )  # fmt: skip
 
 
 def _injection_of(rig: LockstepRig) -> Injection:
@@ -160,6 +212,16 @@ class _Recorder:
         self._truth = rig.plant.record.view(np.uint8).data[:TRUTH_BYTES]
         self._plant, self._clock = rig.plant, rig.clock
         self._at = 0
+        self.ticks = blocks.ticks
+
+    def room(self, ticks: int) -> NDArray[np.void]:
+        """Where the rows of the next ticks go."""
+        first = self._at // _ROW_BYTES
+        return self._blocks.rows[first : first + ticks]
+
+    def skip(self, ticks: int) -> None:
+        """So many of them are whole."""
+        self._at += ticks * _ROW_BYTES
 
     def __call__(self, tick: int) -> None:
         rows, at = self._rows, self._at
@@ -193,6 +255,10 @@ class _Reference:
             self._next += self._blocks.next_count(self._memory)
             self._rows = self._blocks.reference(self._memory)
         return self._rows
+
+    def left(self, tick: int) -> int:
+        """Ticks from this one on for which the rows last."""
+        return self._next - tick
 
     def begin_anew(self, tick: int) -> None:
         """The trajectory starts over after ``tick``: the block ends here, since its rows do not reach back so far."""

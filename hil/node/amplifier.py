@@ -126,6 +126,11 @@ class AmplifierNode:
         """The fault is gone; the next valid drive PDO is applied again."""
         self._release(code)
 
+    @property
+    def work_alarms(self) -> list[Alarm]:
+        """Those that each cycle puts off."""
+        return [self._drive_deadline, self._heartbeat.alarm, *(consumer.alarm for consumer in self._consumers)]
+
     # -- NMT ---------------------------------------------------------------------------------------------------------
 
     def _on_nmt(self, data: bytes, t_us: int) -> None:

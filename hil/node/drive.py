@@ -56,6 +56,12 @@ class DriveReceiver:
             self._w3 = last_byte_table(self._parameters.cob_id)
             self.receive = self._receive_protected
 
+    @property
+    def is_usual(self) -> bool:
+        """Whether it takes the shipped frame, and holds nothing against the next one that is well."""
+        usual = self._layout.fields == self._parameters.protected_fields and self._parameters.transmission_type <= 240
+        return usual and self.counter is not None and not (self._is_owed or self._is_zero_due)
+
     def start(self) -> None:
         """Forget what came before: nothing pending, and any alive counter may come next."""
         self.pending = None

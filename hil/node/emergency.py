@@ -60,6 +60,11 @@ class EmergencyProducer:
         return tuple(self._active)
 
     @property
+    def is_waiting(self) -> bool:
+        """Whether there is something to be sent still."""
+        return bool(self._waiting)
+
+    @property
     def register(self) -> int:
         bits = 0
         for code in self._active:
@@ -133,23 +138,23 @@ class FrameErrors:
     Without it a frame that is wrong every other cycle would put two EMCY frames into each cycle, ahead of the PDOs.
     """
 
-    __slots__ = ("_emergency", "_hold_us", "_present", "_quiet_from_us", "present")
+    __slots__ = ("_emergency", "_hold_us", "_present", "present", "quiet_from_us")
 
     def __init__(self, emergency: EmergencyProducer, hold_us: int = HOLD_US) -> None:
         self._emergency = emergency
         self._hold_us = hold_us
         self._present: set[int] = set()
-        self._quiet_from_us = 0
+        self.quiet_from_us = 0
         self.present = False  # read in every cycle: calls `good` only if there is something to end
 
     def bad(self, code: int, t_us: int, info: bytes = b"") -> None:
-        self._quiet_from_us = t_us + self._hold_us
+        self.quiet_from_us = t_us + self._hold_us
         self._present.add(code)
         self.present = True
         self._emergency.begin(code, info)
 
     def good(self, t_us: int) -> None:
-        if t_us >= self._quiet_from_us:
+        if t_us >= self.quiet_from_us:
             for code in sorted(self._present):
                 self._emergency.end(code)
             self.forget()

@@ -50,13 +50,13 @@ class SenseTransmitter:
         self._send = send
         self._heartbeat = heartbeat
         self._w0, self._w1, self._w2 = WORDS
-        self._turnaround_us = turnaround_us
+        self.turnaround_us = turnaround_us
         self._event = Alarm(clock, self._on_event)
         self._running = False
         self._each = False  # SYNC is one to sample at
-        self._sync_us = 0
-        self._cycle_us = 0  # between the last two SYNCs
-        self._due_us: int | None = None  # of the frame in the turn-around
+        self.sync_us = 0
+        self.cycle_us = 0  # between the last two SYNCs
+        self.due_us: int | None = None  # of the frame in the turn-around
         self.counts = (0, 0, 0)  # last sample
         self.counter = 0  # alive counter of the last frame
         self.crc = 0
@@ -82,6 +82,11 @@ class SenseTransmitter:
         if self._running:
             self.start()
 
+    @property
+    def is_usual(self) -> bool:
+        """Whether it sends the shipped frame at every SYNC, and nothing at another time."""
+        return self._each and self._w3 is not None and not self._on_change and not self._event_us
+
     def start(self) -> None:
         """The node has become operational."""
         self._running = True
@@ -95,15 +100,15 @@ class SenseTransmitter:
     def stop(self) -> None:
         """The node has left operational: what is in the turn-around is not sent."""
         self._running = False
-        self._due_us = None
+        self.due_us = None
         self._event.cancel()
 
     def on_sync(self, data: bytes, t_us: int, outputs: Outputs | None) -> None:
         """The SYNC at ``t_us``: the converters take ``outputs``, if there are any, and the sense combs are sampled if
         it is time to. ``data`` of the SYNC: its counter, or nothing.
         """
-        self._cycle_us = t_us - self._sync_us
-        self._sync_us = t_us
+        self.cycle_us = t_us - self.sync_us
+        self.sync_us = t_us
         is_time = self._each or self._is_time(data)
         counts = self._plant.exchange(t_us, outputs, sample=is_time)
         if not is_time:
@@ -111,7 +116,7 @@ class SenseTransmitter:
         self.counts = counts
         if self._on_change and counts == self._sent:
             return
-        self._due_us = due_us = t_us + self._turnaround_us
+        self.due_us = due_us = t_us + self.turnaround_us
         self._clock.call_at(due_us, self._on_turnaround)
 
     def _is_time(self, data: bytes) -> bool:
@@ -128,11 +133,11 @@ class SenseTransmitter:
 
     def _on_turnaround(self) -> None:
         now_us = self._clock.now_us
-        if self._due_us is None or now_us < self._due_us:
+        if self.due_us is None or now_us < self.due_us:
             return  # stopped meanwhile, or overtaken by a SYNC that came too soon
-        self._due_us = None
+        self.due_us = None
         self._transmit()
-        self._heartbeat.ride(now_us, self._cycle_us)
+        self._heartbeat.ride(now_us, self.cycle_us)
 
     def _on_event(self, now_us: int) -> None:
         self.counts = self._plant.exchange(now_us, None, sample=True)

@@ -10,8 +10,6 @@ from pkxyz_ctrl.loop.row import TRUTH_FIELDS
 from sim import kernels
 from sim.plant import Plant
 
-Counts = tuple[int, int, int]
-
 RECORD = np.dtype(
     [
         *TRUTH_FIELDS,
@@ -23,7 +21,7 @@ RECORD = np.dtype(
 
 
 @njit(cache=True)
-def _exchange(
+def at_sync(
     params: NDArray[np.void],
     state: NDArray[np.void],
     record: NDArray[np.void],
@@ -57,34 +55,34 @@ class PlantOnBus:
         self.record = np.zeros(1, RECORD)
         """what is true at the last sample, and what was sampled"""
         self.was_sampled = False  # since somebody last set it to False
-        self._sensed: Counts = (0, 0, 0)
-        self._origin_us: int | None = None
-        self._plant_us = plant.t_us
-        self._exchange = direct(_exchange, plant.params, plant.state, self.record, 0, False, 0, 0, 0)
+        self.sensed: tuple[int, int, int] = (0, 0, 0)
+        self.origin_us: int | None = None
+        self.plant_us = plant.t_us
+        self._exchange = direct(at_sync, plant.params, plant.state, self.record, 0, False, 0, 0, 0)
         # Loaded now, not in the first tick:
         self._exchange(plant.params, plant.state.copy(), self.record.copy(), 0, False, 0, 0, 0)
 
-    def exchange(self, t_us: int, counts: Counts | None, *, sample: bool) -> Counts:
+    def exchange(self, t_us: int, counts: tuple[int, int, int] | None, *, sample: bool) -> tuple[int, int, int]:
         """As ``hil.node.sense.Plant`` says; with a sample one compiled call."""
-        if self._origin_us is None:
+        if self.origin_us is None:
             if not sample:
                 if counts is not None:
                     self.plant.drive(counts)
-                return self._sensed
-            self._origin_us = t_us
-        target_us = t_us - self._origin_us
+                return self.sensed
+            self.origin_us = t_us
+        target_us = t_us - self.origin_us
         if sample:
             a, b, c = counts or (0, 0, 0)
-            self._sensed = self._exchange(
-                self._params, self._state, self.record, target_us - self._plant_us, counts is not None, a, b, c
+            self.sensed = self._exchange(
+                self._params, self._state, self.record, target_us - self.plant_us, counts is not None, a, b, c
             )
             self.was_sampled = True
         else:
             self.plant.advance_to(target_us)
             if counts is not None:
                 self.plant.drive(counts)
-        self._plant_us = target_us
-        return self._sensed
+        self.plant_us = target_us
+        return self.sensed
 
     def look(self, t_us: int) -> None:
         """It is ``t_us``, and no sample brings the truth in ``record`` to it: bring it there."""

@@ -19,6 +19,8 @@ from hil.bus.unix_bus import UnixBus
 from pkxyz_ctrl.can.frame import Frame
 from pkxyz_ctrl.config.files import CONFIG_DIR
 
+pytestmark = pytest.mark.at_rate
+
 
 @contextlib.contextmanager
 def tool(*words):

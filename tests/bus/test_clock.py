@@ -8,7 +8,7 @@ from hil.bus.clock import ClockReentryError, Lockstep, TimeInPastError
 
 
 @given(times=st.lists(st.integers(0, 50), max_size=60), horizon=st.integers(0, 60))
-@settings(max_examples=100, deadline=None)
+@settings(max_examples=100)
 def test_events_run_by_time_then_by_insertion(times: list[int], horizon: int) -> None:
     clock = Lockstep()
     seen: list[tuple[int, int]] = []
@@ -23,7 +23,7 @@ def test_events_run_by_time_then_by_insertion(times: list[int], horizon: int) ->
 
 
 @given(steps=st.lists(st.integers(0, 40), min_size=1, max_size=20))
-@settings(max_examples=50, deadline=None)
+@settings(max_examples=50)
 def test_any_partition_of_the_time_gives_the_same_run(steps: list[int]) -> None:
     def run(stops: list[int]) -> list[tuple[int, str]]:
         clock, seen = Lockstep(), []

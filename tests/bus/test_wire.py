@@ -59,7 +59,7 @@ frames = st.tuples(st.integers(0, 2047), st.binary(max_size=8), st.booleans(), s
 
 
 @given(queue=st.lists(st.tuples(st.integers(0, 2), frames), min_size=1, max_size=12, unique_by=lambda q: q[1].can_id))
-@settings(max_examples=100, deadline=None)
+@settings(max_examples=100)
 def test_all_queued_frames_pass_lowest_identifier_first_and_back_to_back(queue: list[tuple[int, Frame]]) -> None:
     clock, _, seen, ends = wire_with("0", "1", "2")
     clock.run_until(50)
@@ -81,7 +81,7 @@ def test_all_queued_frames_pass_lowest_identifier_first_and_back_to_back(queue: 
     ),
     sent_before=st.booleans(),
 )
-@settings(max_examples=200, deadline=None)
+@settings(max_examples=200)
 def test_frames_queued_at_any_time_follow_the_reference_schedule(
     plan: list[tuple[int, int, Frame]], sent_before: bool
 ) -> None:
@@ -165,7 +165,7 @@ def test_the_nanoseconds_do_not_drift() -> None:
 
 
 @given(checkpoints=st.lists(st.integers(1, 3000), min_size=1, max_size=10))
-@settings(max_examples=50, deadline=None)
+@settings(max_examples=50)
 def test_bus_load_is_the_fraction_of_time_taken_over_any_window(checkpoints: list[int]) -> None:
     clock, wire, _, (a, _) = wire_with("a", "b")
     frame = Frame(0x30A, b"12345678")

@@ -29,7 +29,7 @@ def received(endpoint) -> list[tuple[Frame, int]]:
 
 
 @given(count=st.integers(0, 15))
-@settings(max_examples=16, deadline=None)
+@settings(max_examples=16)
 def test_a_destroyed_frame_is_sent_again_and_counted(count: int) -> None:
     clock, wire, (a, b) = two()
     if count:
@@ -268,7 +268,7 @@ def test_bit_errors_come_at_their_rate_and_by_their_seed() -> None:
     seed=st.integers(0, 2**16),
     plan=st.lists(st.tuples(st.integers(0, 5000), st.integers(0, 2), st.integers(1, 6)), max_size=40),
 )
-@settings(max_examples=60, deadline=None)
+@settings(max_examples=60)
 def test_nothing_is_lost_doubled_or_reordered_by_bit_errors(seed: int, plan: list[tuple[int, int, int]]) -> None:
     """As long as nobody goes bus-off, every frame arrives exactly once, and those of one identifier in order."""
     clock = Lockstep()

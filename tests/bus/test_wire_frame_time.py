@@ -108,14 +108,14 @@ def cut(data: bytes, longest: int) -> bytes:
 
 
 @given(ident=identifiers, data=payloads, remote=st.booleans())
-@settings(max_examples=400, deadline=None)
+@settings(max_examples=400)
 def test_classic_frame_has_the_length_of_its_bits(ident: tuple[int, bool], data: bytes, remote: bool) -> None:
     frame = Frame(ident[0], data[:8], is_remote=remote, is_extended=ident[1])
     assert frame_bit_counts(frame) == expected_counts(frame)
 
 
 @given(ident=identifiers, data=payloads, switch=st.booleans(), passive=st.booleans())
-@settings(max_examples=400, deadline=None)
+@settings(max_examples=400)
 def test_fd_frame_has_the_length_of_its_bits(ident: tuple[int, bool], data: bytes, switch: bool, passive: bool) -> None:
     frame = Frame(ident[0], cut(data, 64), True, switch, is_extended=ident[1])
     assert frame_bit_counts(frame, passive) == expected_counts(frame, passive)
@@ -157,7 +157,7 @@ def test_figures_from_the_literature() -> None:
 
 
 @given(ident=identifiers, data=payloads, is_fd=st.booleans())
-@settings(max_examples=200, deadline=None)
+@settings(max_examples=200)
 def test_no_frame_is_longer_than_its_worst_case(ident: tuple[int, bool], data: bytes, is_fd: bool) -> None:
     frame = Frame(ident[0], cut(data, 64 if is_fd else 8), is_fd, is_fd, is_extended=ident[1])
     bound_us = worst_case_frame_us(

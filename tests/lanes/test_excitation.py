@@ -4,7 +4,7 @@ import dataclasses
 
 import numpy as np
 import pytest
-from hypothesis import given, settings
+from hypothesis import given
 from hypothesis import strategies as st
 from loop_rig import first_difference, rows_of, setup, shortened
 
@@ -18,7 +18,6 @@ def an_excitation(kind="multisine", amplitude_m=5e-9, periods=2, first_tick=40):
     )  # fmt: skip
 
 
-@settings(deadline=None)
 @given(st.integers(0, 2000), st.integers(1, 700))
 def test_any_window_is_cut_from_the_same_signal(first, count):
     e = an_excitation()

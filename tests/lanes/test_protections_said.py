@@ -4,6 +4,8 @@ import dataclasses
 import threading
 from contextlib import suppress
 
+import pytest
+
 from hil.bus.unix_bus import UnixBus
 from hil.commands import sil
 from hil.lanes.ending import Ended, Ending
@@ -12,6 +14,8 @@ from hil.lanes.wall import WallRig
 from hil.lanes.wall_plant import WallPlant
 from hil.runs.run import run_in_memory
 from hil.runs.scenario import load_scenario
+
+pytestmark = pytest.mark.at_rate
 
 SAID = "protection = false: no alive counter, no CRC"
 _END = 15

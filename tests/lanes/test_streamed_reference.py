@@ -28,7 +28,7 @@ def rows_seen(reference, memory):
     return rows[at : at + PREVIEW_ROWS].copy()
 
 
-@settings(max_examples=20, deadline=None)
+@settings(max_examples=20)
 @given(st.data())
 def test_every_tick_sees_its_rows(trajectory, data):
     """Ticks that wait at a row (enabled, not tracking yet), go on by one, and begin anew from the first."""

@@ -1,7 +1,5 @@
-"""Two processes and the machine's clock: controller and plant meet on Unix sockets, and one of them is ended.
-
-What the machine does in between is not known here, so nothing is asserted about its punctuality: motion is compared
-where no tick was missed, times are those of the frames.
+"""Two processes and the machine's clock: controller and plant meet on Unix sockets, and one of them is ended. Nothing
+is asserted about the machine: motion is compared where no tick was missed, times are those of the frames.
 """
 
 import dataclasses
@@ -31,6 +29,8 @@ from hil.recording.wall_recorder import WallRecorder
 from hil.runs.scenario import load_scenario
 from pkxyz_ctrl.config.files import ConfigError
 from pkxyz_ctrl.safety.modes import NODE_EXPECTED, Mode
+
+pytestmark = pytest.mark.at_rate
 
 ROOT = Path(__file__).parents[2]
 PERIOD_US = 1000

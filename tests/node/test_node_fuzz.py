@@ -61,7 +61,7 @@ def _touches_the_drive(frame: Frame) -> bool:
 
 
 @given(steps, st.booleans())
-@settings(max_examples=250, deadline=None)
+@settings(max_examples=250)
 def test_no_frames_break_the_node_or_drive_a_comb(script: list[tuple[Any, int]], start: bool) -> None:
     rig = Rig()
     rig.write(0x1016, 1, 127 << 16 | 3, 4)
@@ -111,7 +111,7 @@ class Watched(RecordingPlant):
 
 
 @given(st.lists(sdo, max_size=60))
-@settings(max_examples=150, deadline=None)
+@settings(max_examples=150)
 def test_every_sdo_request_has_one_reply_and_the_mapping_stays_sound(requests: list[Frame]) -> None:
     """Whatever was written to the PDO parameters, both PDOs can be started and cycled."""
     rig = Rig()

@@ -29,7 +29,7 @@ def test_heartbeat_starts_at_once_and_keeps_its_period() -> None:
 
 
 @given(period_us=st.integers(150, 3000), producer_ms=st.integers(1, 12))
-@settings(max_examples=40, deadline=None)
+@settings(max_examples=40)
 def test_heartbeat_rides_behind_the_sense_pdo_and_is_never_late(period_us: int, producer_ms: int) -> None:
     rig = Rig()
     rig.start()
@@ -110,7 +110,7 @@ def test_controller_lost(behaviour: int, state: NmtState) -> None:
 
 
 @given(gaps_us=st.lists(st.integers(1, 1000 * CONSUMER_MS - 1), min_size=1, max_size=20))
-@settings(max_examples=30, deadline=None)
+@settings(max_examples=30)
 def test_consumer_counts_from_the_last_heartbeat(gaps_us: list[int]) -> None:
     rig = watched()
     rig.energise()

@@ -29,7 +29,7 @@ def test_crc_against_crccheck(data: bytes) -> None:
 
 
 @given(st.integers(0, 0x7FF), st.tuples(*[st.integers(-32768, 32767)] * 3), st.integers(0, 255))
-@settings(max_examples=50, deadline=None)
+@settings(max_examples=50)
 def test_word_tables_against_crccheck(cob_id: int, words: tuple[int, int, int], counter: int) -> None:
     (w0, w1, w2), w3 = WORDS, last_byte_table(cob_id)
     a, b, c = words
@@ -40,7 +40,7 @@ def test_word_tables_against_crccheck(cob_id: int, words: tuple[int, int, int], 
 
 
 @given(st.lists(COUNTS, min_size=1, max_size=20), st.integers(20, 2000))
-@settings(max_examples=30, deadline=None)
+@settings(max_examples=30)
 def test_one_period_from_drive_pdo_to_comb(trajectory: list[tuple[int, int, int]], period_us: int) -> None:
     rig = operational()
     sync_us = []

@@ -1,0 +1,86 @@
+"""A node at work as records, for ``rules``: taken from the node, and put back into it."""
+
+import numpy as np
+
+from hil.node.amplifier import AmplifierNode, NmtState
+from hil.node.rules import NEVER_US, NODE, NODE_MEMORY, crc_start
+
+_WATCHED_MOST = 1
+
+
+class NodeAtWork:
+    """``record`` (1,) of ``NODE`` and ``memory`` (1,) of ``NODE_MEMORY``, valid between `take` and `put`."""
+
+    def __init__(self, node: AmplifierNode) -> None:
+        self._node = node
+        self.record, self.memory = np.zeros(1, NODE), np.zeros(1, NODE_MEMORY)
+
+    def take(self) -> bool:
+        """Read the node. False for one that does anything else than its daily work."""
+        node, m = self._node, self.memory[0]
+        drive, sense = node._drive, node._sense
+        watched = [consumer for consumer in node._consumers if consumer.cob_id is not None]
+        if (
+            node.state is not NmtState.OPERATIONAL
+            or node._holds
+            or node._sync_expected is None
+            or not drive.is_usual
+            or not sense.is_usual
+            or len(watched) > _WATCHED_MOST
+            or node.emergency.is_waiting
+        ):
+            return False
+        self._take_settings()
+        errors = [e.quiet_from_us for e in (node._sync_errors, node._drive_errors) if e.present]
+        m["good_us"] = min(errors, default=NEVER_US)
+        m["drive_deadline_us"], m["beat_us"] = _time(node._drive_deadline.due_us), _time(node._heartbeat.alarm.due_us)
+        m["consumer_us"] = _time(watched[0].alarm.due_us) if watched else NEVER_US
+        m["sync_us"], m["cycle_us"], m["due_us"] = sense.sync_us, sense.cycle_us, _time(sense.due_us)
+        m["output"], m["is_pending"] = node.outputs, drive.pending is not None
+        m["pending"] = drive.pending or 0
+        m["drive_counter"], m["drive_crc"] = drive.counter, drive.crc
+        m["sync_expected"] = node._sync_expected[0] if node._sync_expected else 0
+        m["count"], m["sense_counter"], m["sense_crc"] = sense.counts, sense.counter, sense.crc
+        return True
+
+    def _take_settings(self) -> None:
+        node, c = self._node, self.record[0]
+        c["drive_id"], c["sense_id"] = node._drive_pdo.cob_id, node._sense_pdo.cob_id
+        c["drive_crc_start"], c["sense_crc_start"] = crc_start(int(c["drive_id"])), crc_start(int(c["sense_id"]))
+        c["sync_id"] = node.od[0x1005, 0] & 0x7FF
+        c["heartbeat_id"], c["flags"] = 0x700 + node.node_id, node._flags
+        c["consumer_id"], c["consumer_time_us"] = -1, 0
+        for consumer in node._consumers:
+            if consumer.cob_id is not None:
+                c["consumer_id"], c["consumer_time_us"] = consumer.cob_id, consumer.time_us
+        c["limit"], c["step_max"], c["sync_overflow"] = node._drive._limit, node._step_max, node.od[0x1019, 0]
+        c["turnaround_us"], c["drive_timeout_us"] = node._sense.turnaround_us, node._drive_timeout_us
+        c["beat_period_us"] = node._heartbeat.beat_period_us
+
+    def put(self) -> None:
+        """What has become of the node's state; `take` had said yes."""
+        node, m = self._node, self.memory[0]
+        drive, sense = node._drive, node._sense
+        node._drive_deadline.due_us, node._heartbeat.alarm.due_us = _due(m["drive_deadline_us"]), _due(m["beat_us"])
+        for consumer in node._consumers:
+            if consumer.cob_id is not None:
+                consumer.alarm.due_us = _due(m["consumer_us"])
+        sense.sync_us, sense.cycle_us = int(m["sync_us"]), int(m["cycle_us"])
+        a, b, c = m["output"].tolist()
+        node.outputs = a, b, c
+        node._silent_syncs = 0
+        node._sync_expected = bytes((int(m["sync_expected"]),)) if self.record["sync_overflow"][0] else b""
+        a, b, c = m["pending"].tolist()
+        drive.pending = (a, b, c) if m["is_pending"] else None
+        drive.counter, drive.crc = int(m["drive_counter"]), int(m["drive_crc"])
+        a, b, c = m["count"].tolist()
+        sense.counts = sense._sent = a, b, c
+        sense.counter, sense.crc = int(m["sense_counter"]), int(m["sense_crc"])
+
+
+def _time(due_us: int | None) -> int:
+    return NEVER_US if due_us is None else due_us
+
+
+def _due(time_us: np.int64) -> int | None:
+    return None if time_us >= NEVER_US else int(time_us)

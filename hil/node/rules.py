@@ -1,0 +1,156 @@
+"""The node's part of a tick in which all is as it should be, compiled: SYNC, drive PDO, sense PDO.
+
+Each kernel looks before it acts. What is out of the ordinary it leaves alone and says so: that is for the node itself.
+A payload is its bytes as an integer of 64 bits, the first one lowest.
+"""
+
+from typing import Final
+
+import numpy as np
+from numba import njit
+from numpy.typing import NDArray
+
+from hil.node.crc import STEP, crc8h2f
+
+Records = NDArray[np.void]
+
+NODE = np.dtype(
+    [
+        ("sync_id", "i4"),
+        ("drive_id", "i4"),
+        ("sense_id", "i4"),
+        ("heartbeat_id", "i4"),
+        ("consumer_id", "i4"),  # whose heartbeat is waited for
+        ("flags", "i4"),  # of the frames that it sends
+        ("drive_crc_start", "i4"),  # what the identifier and the constants of the CRC leave, for seven bytes behind it
+        ("sense_crc_start", "i4"),
+        ("limit", "i4"),  # largest count
+        ("step_max", "i4"),
+        ("sync_overflow", "i4"),  # SYNCs count from 1 to this; 0: they don't
+        ("turnaround_us", "i8"),
+        ("drive_timeout_us", "i8"),
+        ("beat_period_us", "i8"),
+        ("consumer_time_us", "i8"),
+    ],
+    align=True,
+)
+
+NODE_MEMORY = np.dtype(
+    [
+        ("drive_deadline_us", "i8"),
+        ("beat_us", "i8"),  # when the heartbeat is due
+        ("consumer_us", "i8"),  # when the one that is waited for is
+        ("good_us", "i8"),  # from here on a good frame ends an error that is present
+        ("sync_us", "i8"),  # of the last SYNC
+        ("cycle_us", "i8"),  # between the last two
+        ("due_us", "i8"),  # of the frame in the turn-around; NEVER_US: there is none
+        ("output", "i4", (3,)),  # what the converters have
+        ("pending", "i4", (3,)),
+        ("is_pending", "i4"),
+        ("drive_counter", "i4"),  # of the last frame with a correct CRC
+        ("drive_crc", "i4"),
+        ("sync_expected", "i4"),
+        ("count", "i4", (3,)),  # last sample
+        ("sense_counter", "i4"),
+        ("sense_crc", "i4"),
+    ],
+    align=True,
+)
+
+NEVER_US: Final = 1 << 62
+LENGTH: Final = 8  # of a process PDO with counter and CRC
+_CRC_BYTES: Final = 7
+_STEP: Final = np.frombuffer(STEP, np.uint8)
+
+
+def crc_start(cob_id: int) -> int:
+    """CRC of the identifier with seven bytes of 0 behind it: a CRC is linear, so the payload's own is added to it."""
+    return crc8h2f(cob_id.to_bytes(2, "little") + bytes(_CRC_BYTES))
+
+
+@njit(cache=True, error_model="numpy")
+def crc_of(start: int, word: int) -> int:
+    """CRC of a payload's first seven bytes."""
+    register = np.uint8(0)
+    for place in range(_CRC_BYTES):
+        register = _STEP[register ^ (word >> 8 * place & 0xFF)]
+    return int(np.int64(register) ^ start)
+
+
+@njit(cache=True, error_model="numpy")
+def next_alarm_us(memory: np.void) -> int:
+    """When the node acts by itself, if nothing comes before."""
+    return min(memory["drive_deadline_us"], memory["beat_us"], memory["consumer_us"])
+
+
+@njit(cache=True, error_model="numpy")
+def on_drive(config: np.void, memory: np.void, length: int, word: int, t_us: int) -> bool:
+    """A drive PDO. False, and nothing is done, for one that is refused or that ends an error."""
+    counter, crc = word >> 48 & 0xFF, word >> 56 & 0xFF
+    if length != LENGTH or crc != crc_of(config["drive_crc_start"], word) or t_us >= memory["good_us"]:
+        return False
+    if counter != memory["drive_counter"] + 1 & 0xFF:
+        return False
+    for place in range(3):
+        if word >> 16 * place & 0xFFFF > config["limit"]:
+            return False
+    for place in range(3):
+        memory["pending"][place] = word >> 16 * place & 0xFFFF
+    memory["is_pending"], memory["drive_counter"], memory["drive_crc"] = 1, counter, crc
+    return True
+
+
+@njit(cache=True, error_model="numpy")
+def on_sync(config: np.void, memory: np.void, length: int, word: int, t_us: int) -> bool:
+    """A SYNC: what is pending becomes the output, and a sample is due. False, and nothing is done, for one that is out
+    of step, finds nothing pending or would make too large a step.
+    """
+    overflow, counter = config["sync_overflow"], word & 0xFF
+    if length != (1 if overflow else 0) or counter != memory["sync_expected"]:
+        return False
+    if memory["is_pending"] == 0 or t_us >= memory["good_us"] or memory["due_us"] != NEVER_US:
+        return False
+    pending, output, step = memory["pending"], memory["output"], config["step_max"]
+    if pending[0] != 0 or pending[1] != 0 or pending[2] != 0:
+        for comb in range(3):
+            if not -step <= pending[comb] - output[comb] <= step:
+                return False
+    for comb in range(3):
+        output[comb] = pending[comb]
+    memory["sync_expected"] = counter % overflow + 1 if overflow else 0
+    memory["is_pending"] = 0
+    memory["drive_deadline_us"] = t_us + config["drive_timeout_us"]
+    memory["cycle_us"] = t_us - memory["sync_us"]
+    memory["sync_us"] = t_us
+    memory["due_us"] = t_us + config["turnaround_us"]
+    return True
+
+
+@njit(cache=True, error_model="numpy")
+def on_heartbeat(config: np.void, memory: np.void, length: int, word: int, t_us: int) -> bool:
+    """The controller's. False for one that says anything else than that it works."""
+    if length != 1 or word & 0xFF == 0:
+        return False
+    memory["consumer_us"] = t_us + config["consumer_time_us"]
+    return True
+
+
+@njit(cache=True, error_model="numpy")
+def answer(config: np.void, memory: np.void) -> int:
+    """The payload of the sense PDO, a number with sign."""
+    counter = np.int64(memory["sense_counter"]) + 1 & 0xFF
+    count, word = memory["count"], counter << 48
+    for place in range(3):
+        word |= (np.int64(count[place]) & 0xFFFF) << 16 * place
+    crc = crc_of(config["sense_crc_start"], word)
+    memory["due_us"], memory["sense_counter"], memory["sense_crc"] = NEVER_US, counter, crc
+    return int(word | ((crc ^ 0x80) - 0x80) << 56)
+
+
+@njit(cache=True, error_model="numpy")
+def rides(config: np.void, memory: np.void, t_us: int) -> bool:
+    """Whether the heartbeat goes along with the sense PDO, since behind the next one it would be too late."""
+    if t_us + memory["cycle_us"] < memory["beat_us"]:
+        return False
+    memory["beat_us"] = t_us + config["beat_period_us"]
+    return True
