@@ -13,17 +13,10 @@ from typing import Any
 from numba.core.caching import Cache
 from numba.core.runtime.nrt import rtsys
 
-_refreshing = Cache.load_overload
-
 
 def load_quickly() -> None:
     """From now on, in this process."""
     Cache.load_overload = _load
-
-
-def load_as_numba_does() -> None:
-    """As if ``load_quickly`` had never been called."""
-    Cache.load_overload = _refreshing
 
 
 def _load(cache: Any, signature: Any, target: Any) -> Any:

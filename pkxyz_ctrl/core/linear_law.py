@@ -17,12 +17,12 @@ ORDER_MAX = 24
 
 LINEAR_LAW = np.dtype(
     [
-        ("a", "f8", (ORDER_MAX, ORDER_MAX)),
-        ("b", "f8", (ORDER_MAX, 3)),
-        ("c", "f8", (3, ORDER_MAX)),
-        ("d", "f8", (3, 3)),
-        ("unwind", "f8", (ORDER_MAX, 3)),
         ("order", "i4"),
+        ("d", "f8", (3, 3)),
+        ("c", "f8", (3, ORDER_MAX)),
+        ("b", "f8", (ORDER_MAX, 3)),
+        ("unwind", "f8", (ORDER_MAX, 3)),
+        ("a", "f8", (ORDER_MAX, ORDER_MAX)),  # last: rows beyond the order are never looked at
     ],
     align=True,
 )

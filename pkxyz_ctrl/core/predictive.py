@@ -193,12 +193,12 @@ def comb_forces(
 
 @njit(cache=True, error_model="numpy")
 def forces_and_strokes(
-    law: np.void, rows: Array, e: Array, nu_n: Array, disturbance_n: Array, comb_n: Array, stroke_m: Array
-) -> bool:
+    law: np.void, rows: Array, e: Array, nu_n: Array, disturbance_n: Array, comb_n: Array, stroke_m: Array,
+    memory: Scratch,
+) -> bool:  # fmt: skip
     """Comb forces (n,3) that a plan nu (n,3) takes along rows (n+1, 9), with its e (n+1, 6), and strokes (n,3) at the
     ends of the intervals. False where the links do not reach.
     """
-    memory = scratch()
     for k in range(len(nu_n)):
         if not _interval(law, rows, e, nu_n, disturbance_n, k, comb_n[k], stroke_m[k], memory):
             return False
@@ -208,12 +208,12 @@ def forces_and_strokes(
 @njit(cache=True, error_model="numpy")
 def keeps_limits(
     law: np.void, rows: Array, e: Array, nu_n: Array, disturbance_n: Array, count: Array, lower_m: Array,
-    upper_m: Array, comb_n: Array, stroke_m: Array,
+    upper_m: Array, comb_n: Array, stroke_m: Array, memory: Scratch,
 ) -> bool:  # fmt: skip
     """Whether forces and strokes of a plan, as above, keep voltage and slew after the last counts (3,) and limits (n,3)
     of strokes. It ends at the first interval that does not.
     """
-    drive, volt, memory = law["drive"], np.empty(3), scratch()
+    drive, volt = law["drive"], np.empty(3)
     gain, most = drive["force_gain_n_per_v2"], drive["volt_per_count"] * drive["count_max"]
     step = drive["volt_per_count"] * drive["count_slew_max"]
     for i in range(3):

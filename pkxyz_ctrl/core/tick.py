@@ -49,16 +49,19 @@ LAW = np.dtype(
         ("estimator", filtering.ESTIMATOR),
         ("feedback", feedback.FEEDBACK),
         ("set_points", set_point_model.SET_POINTS),
-        ("linear", linear_law.LINEAR_LAW),
-        ("youla", youla.YOULA),
-        ("adaptation", adaptation.ADAPTATION),
         ("drive", voltage.DRIVE),
-        ("predictive", predictive.PREDICTIVE),
         ("kind", "i4"),  # OPEN_LOOP, STATE_FEEDBACK, LINEAR or PREDICTIVE
         ("delay_periods", "i4"),  # periods from a sample to the start of the action that it causes: 1 or 2
+        ("youla", youla.YOULA),
+        ("adaptation", adaptation.ADAPTATION),
+        ("linear", linear_law.LINEAR_LAW),
+        ("predictive", predictive.PREDICTIVE),
     ],
     align=True,
 )
+"""What only some laws have stands last, so that a board need not hold it for the others: no kernel looks at ``linear``
+unless ``kind`` is LINEAR, nor beyond the rows of ``a`` that the order has.
+"""
 
 DELAY_MAX = set_point_model.DELAY_MAX
 
@@ -99,7 +102,6 @@ MEMORY = np.dtype(
         ("linear", linear_law.LINEAR_STATE),
         ("youla", youla.YOULA_STATE),
         ("set_point_model", set_point_model.SET_POINT_MODEL),
-        ("adaptation", adaptation.ADAPTATION_STATE),
         ("plan_n", "f8", (3,)),  # force at the platform that a plan adds to the feed-forward of this tick
         ("plan_known", "i4"),
         ("solver_iterations", "i4"),  # of this tick's plan; 0 without one, negative if it was not used
@@ -116,6 +118,7 @@ MEMORY = np.dtype(
         ("landing", "i4"),  # 1: the stage is led down; instead of the feedback acts ...
         ("landing_share", "f8"),  # ... so much of its last force
         ("scratch", SCRATCH),
+        ("adaptation", adaptation.ADAPTATION_STATE),  # last: without adaptation nobody looks at it
     ],
     align=True,
 )
@@ -158,7 +161,8 @@ def estimate(law: np.void, memory: np.void, has_measurement: bool) -> None:
         )
     position, w, w_change = scratch["position_m"], scratch["w_n"], scratch["w_change_n"]
     acting, acted, start = scratch["acting_n"], scratch["acted_n"], scratch["state"]
-    ahead, told, none = state["ahead"], learnt["told_n"], scratch["nothing"]
+    ahead, none = state["ahead"], scratch["nothing"]
+    told = learnt["told_n"] if online else none
     for i in range(9):
         start[i] = state["filtered"][i]
     for i in range(3):
@@ -205,7 +209,7 @@ def act(law: np.void, memory: np.void, now: Array, after: Array, later: Array) -
     multiply3_transposed(j, force, applied)
     for i in range(3):
         memory["slack_n"][i] = demand[i] - applied[i]
-    if memory["active_set_steps"] > 1 or memory["landing"] != 0:
+    if law["adaptation"]["on"] != 0 and (memory["active_set_steps"] > 1 or memory["landing"] != 0):
         adaptation.disturb(memory["adaptation"])
     if kind != PREDICTIVE:
         _follow(law, memory)
@@ -250,7 +254,8 @@ def release(law: np.void, memory: np.void) -> None:
     memory["landing"] = 0
     linear_law.clear(memory["linear"])
     youla.clear(memory["youla"])
-    adaptation.clear(memory["adaptation"])
+    if law["adaptation"]["on"] != 0:
+        adaptation.clear(memory["adaptation"])
     set_point_model.set_out(law["estimator"], memory["set_point_model"], memory["scratch"]["nothing"])
 
 
@@ -276,7 +281,8 @@ def set_position(law: np.void, memory: np.void, position_m: Array) -> None:
         memory["estimate"]["ahead"][i] = known
     for i in range(3):
         memory["estimate"]["innovation_m"][i] = 0.0
-    adaptation.clear(memory["adaptation"])
+    if law["adaptation"]["on"] != 0:
+        adaptation.clear(memory["adaptation"])
 
 
 @njit(cache=True, error_model="numpy")

@@ -59,25 +59,17 @@ def solve(between: Array, memory: Work, q: Array, lower: Array, upper: Array, ro
     _values_without_limits(between, q, value)
     for rounds in range(1, rounds_max + 1):
         if new < 0:
-            new = _passed_most(value, lower, upper)
+            new = _passed_most(value, lower, upper, slope)
             if new < 0:
                 v[:] = value[: len(v)]
                 return rounds
             sign = 1.0 if value[new] > upper[new] else -1.0
             multiplier[count] = 0.0
-        for j in range(count):
-            release[j] = 0.0
-        for k in range(count):
-            share, row = between[new, held[k]], inverse[k]
-            for j in range(count):
-                release[j] += share * row[j]
+        _released(between[new], inverse, held, count, release)
         first, far = _first_released(multiplier, release, sign, count)
         for i in range(limits):
             slope[i] = between[new, i]
-        for k in range(count):
-            share, row = release[k], between[held[k]]
-            for i in range(limits):
-                slope[i] -= share * row[i]
+        _take_off(between, held, release, count, slope)
         if slope[new] > _OTHERS * between[new, new] and count < len(held):
             by = value[new] - upper[new] if sign > 0.0 else lower[new] - value[new]
             if by <= far * slope[new]:
@@ -102,20 +94,59 @@ def solve(between: Array, memory: Work, q: Array, lower: Array, upper: Array, ro
 @njit(cache=True, error_model="numpy")
 def _values_without_limits(between: Array, q: Array, value: Array) -> None:
     value[:] = 0.0
-    for j in range(len(q)):
+    n = len(q)
+    for j in range(0, n - n % 4, 4):
+        a, b, c, d = between[j], between[j + 1], between[j + 2], between[j + 3]
+        p, r, s, t = q[j], q[j + 1], q[j + 2], q[j + 3]
+        for i in range(len(value)):
+            value[i] = value[i] - p * a[i] - r * b[i] - s * c[i] - t * d[i]
+    for j in range(n - n % 4, n):
         for i in range(len(value)):
             value[i] -= q[j] * between[j, i]
 
 
 @njit(cache=True, error_model="numpy")
-def _passed_most(value: Array, lower: Array, upper: Array) -> int:
-    """The limit that A v (m,) passes by most; -1 if it keeps all."""
-    passed, most = -1, _PASSED
+def _released(row: Array, inverse: Array, held: NDArray[np.int64], count: int, out: Array) -> None:
+    """By which the multipliers of those held fall while that of the limit of this ``row`` of M grows."""
+    for j in range(count):
+        out[j] = 0.0
+    fours = count - count % 4
+    for k in range(0, fours, 4):
+        a, b, c, d = inverse[k], inverse[k + 1], inverse[k + 2], inverse[k + 3]
+        p, r, s, t = row[held[k]], row[held[k + 1]], row[held[k + 2]], row[held[k + 3]]
+        for j in range(count):
+            out[j] = out[j] + p * a[j] + r * b[j] + s * c[j] + t * d[j]
+    for k in range(fours, count):
+        a, p = inverse[k], row[held[k]]
+        for j in range(count):
+            out[j] += p * a[j]
+
+
+@njit(cache=True, error_model="numpy")
+def _take_off(between: Array, held: NDArray[np.int64], shares: Array, count: int, out: Array) -> None:
+    """Less the rows of M of those held times their shares; four at once, in the order of one after the other."""
+    fours = count - count % 4
+    for k in range(0, fours, 4):
+        a, b, c, d = between[held[k]], between[held[k + 1]], between[held[k + 2]], between[held[k + 3]]
+        p, r, s, t = shares[k], shares[k + 1], shares[k + 2], shares[k + 3]
+        for i in range(len(out)):
+            out[i] = out[i] - p * a[i] - r * b[i] - s * c[i] - t * d[i]
+    for k in range(fours, count):
+        a, p = between[held[k]], shares[k]
+        for i in range(len(out)):
+            out[i] -= p * a[i]
+
+
+@njit(cache=True, error_model="numpy")
+def _passed_most(value: Array, lower: Array, upper: Array, by: Array) -> int:
+    """The limit that A v (m,) passes by most; -1 if it keeps all. ``by`` (m,): by how much each is, afterwards."""
     for i in range(len(value)):
         above, below = value[i] - upper[i], lower[i] - value[i]
-        by = above if above > below else below
-        if by > most:
-            passed, most = i, by
+        by[i] = above if above > below else below
+    passed, most = -1, _PASSED
+    for i in range(len(by)):
+        if by[i] > most:
+            passed, most = i, by[i]
     return passed
 
 

@@ -1,7 +1,7 @@
 """The controller of one stage: driver, cycle and gate around one law. Frames in, frames out; time is handed in.
 
-It owns no clock and no bus. ``runtime`` drives it, whoever owns the time. What it does in a period is compiled, in
-``exchange``; here are the way to the start-up, and the words.
+It owns no clock and no bus. ``runtime`` drives it, whoever owns the time. What it does is compiled, in ``exchange``;
+here are the way to it, and the words.
 """
 
 from collections.abc import Callable
@@ -12,19 +12,19 @@ import numpy as np
 from numpy.typing import NDArray
 
 from pkxyz_ctrl.can.driver import AmplifierDriver, word_of
-from pkxyz_ctrl.can.driver_rules import FRESH, OUTGOING, OUTGOING_MOST, DriverState
+from pkxyz_ctrl.can.driver_rules import FRESH, OUTGOING, OUTGOING_MOST, START_UP, DriverState
 from pkxyz_ctrl.can.frame import Frame
-from pkxyz_ctrl.can.other_traffic import complaint, forget
-from pkxyz_ctrl.can.start_sequence import StartSequence
+from pkxyz_ctrl.can.other_traffic import complaint
+from pkxyz_ctrl.can.startup import Setting
 from pkxyz_ctrl.compiled.direct_call import direct
 from pkxyz_ctrl.config.bus import BusConfig, CanConfig
 from pkxyz_ctrl.core.demand import PREDICTIVE
 from pkxyz_ctrl.loop import exchange
-from pkxyz_ctrl.loop.exchange import BLOCKED, EXCHANGE, EXCHANGE_MEMORY
+from pkxyz_ctrl.loop.exchange import BLOCKED, EXCHANGE, EXCHANGE_MEMORY, NOT_RESTARTED, RESTARTED
 from pkxyz_ctrl.loop.period import period_of
 from pkxyz_ctrl.loop.reference import REFERENCE, standing_still
 from pkxyz_ctrl.safety.gate import GateConfig, TransmitGate
-from pkxyz_ctrl.safety.modes import Event, Mode, next_mode
+from pkxyz_ctrl.safety.modes import Event, Mode
 from pkxyz_ctrl.safety.trips import explain
 
 Send = Callable[[Frame], object]
@@ -49,7 +49,8 @@ class Controller:
     before follows a fault decision; ``port_complaint`` says, as ``; ...``, what stands in the way of frames.
     ``faults`` collects a sentence for each fault decision. ``record`` (1,) of ``exchange.EXCHANGE`` is all that it goes
     by, ``exchange`` (1,) of ``EXCHANGE_MEMORY`` all that it remembers; ``memory`` (1,) of ``cycle.MEMORY`` is the
-    cycle's part of that, ``row`` the bytes of its latest record. ``start_up`` in place of the driver's own.
+    cycle's part of that, ``row`` the bytes of its latest record. ``settings``: what the start-up goes by, in place of
+    ``startup.table``.
     """
 
     def __init__(
@@ -60,7 +61,7 @@ class Controller:
         send: Send,
         discard_unsent: Callable[[], object] = lambda: None,
         port_complaint: Callable[[], str] = lambda: "",
-        start_up: StartSequence | None = None,
+        settings: tuple[Setting, ...] = (),
     ) -> None:
         if bus.can is None:
             raise ValueError(f"bus {bus.name!r} has no [can]: nothing to control over")
@@ -69,7 +70,7 @@ class Controller:
         self.law, self.memory = part(self.record, "law"), part(self.exchange, "cycle")
         self.law[0] = law[0]
         self.driver = AmplifierDriver(
-            bus.can.driver, gate.count_slew_max, start_up, part(self.record, "driver"), part(self.exchange, "driver")
+            bus.can.driver, gate.count_slew_max, settings, part(self.record, "driver"), part(self.exchange, "driver")
         )
         self.gate = TransmitGate(gate, part(self.record, "gate"), part(self.exchange, "gate"))
         exchange.switch_on(self.exchange)
@@ -81,7 +82,6 @@ class Controller:
         self._mode = self.memory["mode"].data  # 40 ns for a look
         self._out = part(self.exchange, "driver", "out").view(np.uint8).data
         self.period_us = bus.period_us
-        self._restarting = False
         self._reference = standing_still()  # the latest that was handed in
         config, memory = self.record, self.exchange
         self._begin = direct(exchange.begin, config, memory, 0)
@@ -125,9 +125,8 @@ class Controller:
 
     def start(self, t_us: int) -> None:
         """Begin the start-up dialogue with the amplifier."""
-        forget(self.exchange["others"][0], t_us)
-        for frame in self.driver.start(t_us):
-            self.send(frame, t_us)
+        self.driver.emergencies.clear()
+        self._pass_on(exchange.start(self.record, self.exchange, t_us), t_us)
 
     def dialogue(self, frame: Frame | None, t_us: int) -> bool:
         """One step of the start-up: a frame that came, or None if none came for a
@@ -135,22 +134,16 @@ class Controller:
 
         Raises ``StartUpError``, also for a frame that our own gate blocks: nobody would ever answer it.
         """
-        driver = self.driver
         if frame is not None:
             self.receive(frame, t_us)
         else:
-            for each in driver.poll(t_us):
-                self.send(each, t_us)
+            self._pass_on(exchange.wait(self.record, self.exchange, t_us), t_us)
+        come_up = exchange.come_up(self.exchange)
         if self.exchange["blocked"][0]:
             raise StartUpError(self.faults[-1])
-        if driver.state is DriverState.FAILED:
-            raise StartUpError(f"{driver.failure}{self._complaints}")
-        if driver.state is DriverState.CONFIGURING and self.mode == Mode.BOOT:
-            self._apply(Event.NODE_FOUND)
-        if driver.state is not DriverState.OPERATIONAL:
-            return False
-        self._apply(Event.NODE_READY)
-        return True
+        if come_up < 0:
+            raise StartUpError(f"{self.driver.failure}{self._complaints}")
+        return bool(come_up)
 
     def stop(self, t_us: int) -> None:
         """0 V and pre-operational, whatever the mode."""
@@ -178,9 +171,10 @@ class Controller:
         """The tick begins: SYNC, on which the amplifier applies the last voltages and samples. In FAULT the node is
         taken out of operational besides.
         """
-        if self._mode[0] < _IDLE:
-            self._go_on_starting(t_us)
-        self._pass_on(self._begin(self.record, self.exchange, t_us), t_us)
+        told = self._begin(self.record, self.exchange, t_us)
+        self._pass_on(told, t_us)
+        if told & NOT_RESTARTED:
+            self.faults.append(f"start-up after a clear: {self.driver.failure}{self._complaints}")
 
     def receive(self, frame: Frame, t_us: int) -> bool:
         """Take a frame from the bus; True once this tick's sense values are there."""
@@ -189,8 +183,9 @@ class Controller:
         word = _word(data)[0] if length == 8 else word_of(data)
         told = self._on_frame(self.record, self.exchange, can_id, flags, length, word, t_us)
         if told > FRESH:
-            for reply in self.driver.told(frame, told, t_us):
-                self.send(reply, t_us)
+            self.driver.told(frame, told, t_us)
+            if told & START_UP:
+                self._pass_on(BLOCKED | int(self.exchange["driver"]["outgoing"][0, 0]), t_us)
         return bool(told & FRESH)
 
     def compute(self, reference: Records, overrun: int) -> None:
@@ -210,21 +205,15 @@ class Controller:
         """
         self._pass_on(self._finish(self.record, self.exchange, t_us, heartbeat_until_us), t_us)
 
-    def send(self, frame: Frame, t_us: int) -> None:
-        """Send a frame of the start-up, if the gate lets it pass; else the next tick is a fault."""
-        reason = self.gate.check(frame, self._mode[0], t_us)
-        if reason is None:
-            self._send(frame)
-            return
-        self.faults.append(reason)
-        self.exchange["blocked"] = 1
-
     def _pass_on(self, told: int, t_us: int) -> None:
         """Send what the compiled part wants to send and may; a voltage that may not be sent is 0 V in the next."""
         if told == 1:  # the short way, for speed
             data, can_id, flags, length, _ = _unpack(self._out, 0)
             self._send(_new_tuple(Frame, (can_id, data if length == 8 else data[:length], flags)))
             return
+        if told & RESTARTED:
+            self.gate.latched = ""
+            self.driver.emergencies.clear()
         for at in _PLACES[: told & BLOCKED - 1]:
             data, can_id, flags, length, reason = _unpack(self._out, at)
             frame = _new_tuple(Frame, (can_id, data[:length], flags))
@@ -235,33 +224,6 @@ class Controller:
                 self.faults.append(self.gate.blocked(frame, self._mode[0], reason, held[0], t_us))
 
     # -- modes ------------------------------------------------------------------------------------------------------
-
-    def _go_on_starting(self, t_us: int) -> None:
-        """After a clear: one step of the start-up at the beginning of a tick, without waiting for anything."""
-        driver, asked = self.driver, self.exchange[0]
-        if asked["restart_due"] or (asked["clearing"] and driver.state is DriverState.FAILED):
-            asked["restart_due"] = asked["clearing"] = 0
-            self._restarting = True
-            self.gate.clear()
-            frames = driver.start(t_us)
-        else:
-            frames = driver.poll(t_us)
-        for frame in frames:
-            self.send(frame, t_us)
-        if driver.state is DriverState.FAILED and self._restarting:
-            self._restarting = False
-            self.faults.append(f"start-up after a clear: {driver.failure}{self._complaints}")
-            asked["event"] = int(Event.NODE_LOST)
-        elif driver.state is DriverState.CONFIGURING or (
-            driver.state is DriverState.OPERATIONAL and self.mode == Mode.BOOT  # found and configured within one tick
-        ):
-            asked["event"] = int(Event.NODE_FOUND)
-        elif driver.state is DriverState.OPERATIONAL:
-            asked["event"] = int(Event.NODE_READY)
-
-    def _apply(self, event: Event) -> None:
-        """Let an event of the start-up act on the mode, before there are ticks."""
-        self._mode[0] = next_mode(self.mode, int(event))
 
     def _enter(self) -> None:
         if self.mode == Mode.FAULT:

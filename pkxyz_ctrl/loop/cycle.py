@@ -53,7 +53,6 @@ INPUT = np.dtype(
 
 LAW = np.dtype(
     [
-        ("tick", tick.LAW),
         ("limits", LIMITS),
         ("period_us", "i8"),
         ("homing_ticks", "i4"),
@@ -61,6 +60,7 @@ LAW = np.dtype(
         ("landing_ticks", "i4"),  # so long a stop leads down to rest
         ("autostart", "i4"),  # 1: home, enable and track by itself, as a scenario wants it
         ("quiet_holds", "i4"),  # 1: holds are quiet without being asked for
+        ("tick", tick.LAW),  # last, as in it what only some laws have
     ],
     align=True,
 )
@@ -68,7 +68,6 @@ LAW = np.dtype(
 MEMORY = np.dtype(
     [
         ("input", INPUT),
-        ("tick", tick.MEMORY),
         ("monitors", MONITOR_MEMORY),
         ("observation", OBSERVATION),
         ("row", ROW),
@@ -95,6 +94,7 @@ MEMORY = np.dtype(
         ("landing_age", "i4"),  # ticks of it that have passed
         ("landed_by", "i8"),  # Trip bits for which the stage is led down; 0: it was asked for
         ("held", "i4"),  # 1: somebody asked to hold, and the automatic start leaves it at that
+        ("tick", tick.MEMORY),  # last, as in it what only some laws have
     ],
     align=True,
 )
@@ -331,7 +331,9 @@ def _write_row(law: np.void, memory: np.void, trips: int, saturated: int) -> Non
     row["active_set_steps"] = state["active_set_steps"]
     row["solver_iterations"] = state["solver_iterations"]
     row["quiet"] = seen["quiet"]
-    row["warning"], row["warning_share"] = state["adaptation"]["cause"], state["adaptation"]["change"]
+    adapts = law["tick"]["adaptation"]["on"] != 0
+    row["warning"] = state["adaptation"]["cause"] if adapts else 0
+    row["warning_share"] = state["adaptation"]["change"] if adapts else 0.0
     for i in range(3):
         row["sense_count"][i] = seen["sense_count"][i]
         row["drive_count"][i] = state["count"][0, i]
@@ -341,7 +343,7 @@ def _write_row(law: np.void, memory: np.void, trips: int, saturated: int) -> Non
         row["estimate_m_per_s"][i] = estimate["filtered"][3 + i]
         row["disturbance_n"][i] = estimate["filtered"][6 + i]
         row["innovation_m"][i] = estimate["innovation_m"][i]
-        row["learnt_n"][i] = state["adaptation"]["added_n"][i]
+        row["learnt_n"][i] = state["adaptation"]["added_n"][i] if adapts else 0.0
         row["demand_n"][i] = state["demand_n"][i]
         row["slack_n"][i] = state["slack_n"][i]
         row["force_n"][i] = state["force_n"][i]

@@ -11,14 +11,24 @@ import numpy as np
 from numba import njit
 from numpy.typing import NDArray
 
-from pkxyz_ctrl.can import driver_rules, sense_input
-from pkxyz_ctrl.can.driver_rules import DRIVER, DRIVER_MEMORY, FRESH, drive, receive, release
+from pkxyz_ctrl.can import driver_rules, sense_input, start_sequence
+from pkxyz_ctrl.can.driver_rules import (
+    CONFIGURING,
+    DRIVER,
+    DRIVER_MEMORY,
+    FAILED,
+    FRESH,
+    RUNNING,
+    START_UP,
+    drive,
+    release,
+)
 from pkxyz_ctrl.can.other_traffic import TRAFFIC, forget, note
 from pkxyz_ctrl.can.sense_input import take
 from pkxyz_ctrl.loop import cycle as cycling
 from pkxyz_ctrl.safety import gate_rules
 from pkxyz_ctrl.safety.gate_rules import GATE, GATE_MEMORY, check
-from pkxyz_ctrl.safety.modes import NODE_EXPECTED, Event, Mode
+from pkxyz_ctrl.safety.modes import NODE_EXPECTED, Event, Mode, next_mode
 from pkxyz_ctrl.safety.trips import Trip
 
 Records = NDArray[np.void]
@@ -31,22 +41,28 @@ EXCHANGE_MEMORY = np.dtype(
         ("gate", GATE_MEMORY, (1,)),
         ("held_against", GATE_MEMORY, (1,)),  # what the gate remembered when it last blocked a drive frame
         ("others", TRAFFIC, (1,)),
-        ("cycle", cycling.MEMORY, (1,)),
         ("begun_us", "i8"),  # when the period began
         ("blocked", "i4"),  # 1: the gate has blocked a frame since the last period
         ("event", "i4"),  # asked for at the next period
         ("clearing", "i4"),  # 1: a clear was asked for, and is not done yet
         ("restart_due", "i4"),  # 1: the fault is cleared, driver and node start anew
+        ("is_restarting", "i4"),  # 1: that start is not done yet
         ("missed_ticks", "i4"),  # skipped, late on the wire, or without the sample that the node owed
+        ("cycle", cycling.MEMORY, (1,)),  # last, as in it what only some laws have
     ],
     align=True,
 )
 
 BLOCKED: Final = 1 << 8
 """Added to the number of frames where the gate blocks one of them."""
+RESTARTED: Final = 1 << 9
+"""Added by ``begin`` where gate, driver and node start anew."""
+NOT_RESTARTED: Final = 1 << 10
+"""Added by ``begin`` where that failed."""
 
 _CLEAR, _GATE_BLOCKED = int(Event.CLEAR), int(Trip.GATE_BLOCKED)
-_FAULT: Final = int(Mode.FAULT)
+_FOUND, _READY, _LOST = int(Event.NODE_FOUND), int(Event.NODE_READY), int(Event.NODE_LOST)
+_BOOT, _IDLE, _FAULT = int(Mode.BOOT), int(Mode.IDLE), int(Mode.FAULT)
 
 
 @njit(cache=True, error_model="numpy")
@@ -58,26 +74,91 @@ def switch_on(memory_array: Records) -> None:
 
 
 @njit(cache=True, error_model="numpy")
+def start(config_array: Records, memory_array: Records, t_us: int) -> int:
+    """The start-up begins, before there are periods. Returns the number of frames."""
+    config, memory = config_array[0], memory_array[0]
+    memory["driver"][0]["outgoing"] = 0
+    forget(memory["others"], t_us)
+    start_sequence.begin(config["driver"], memory["driver"], t_us)
+    return judge(config, memory, 0, t_us)
+
+
+@njit(cache=True, error_model="numpy")
+def wait(config_array: Records, memory_array: Records, t_us: int) -> int:
+    """To be called where no frame comes during the start-up, every few milliseconds. Returns the number of frames."""
+    config, memory = config_array[0], memory_array[0]
+    memory["driver"][0]["outgoing"] = 0
+    start_sequence.poll(config["driver"], memory["driver"], t_us)
+    return judge(config, memory, 0, t_us)
+
+
+@njit(cache=True, error_model="numpy")
+def come_up(memory_array: Records) -> int:
+    """After ``wait`` and ``on_frame`` during the start-up: 1 once the node is operational and periods may begin, -1 if
+    that failed, 0 until then.
+    """
+    memory = memory_array[0]
+    state, cycle = memory["driver"][0]["state"], memory["cycle"][0]
+    if state == FAILED or memory["blocked"] != 0:
+        return -1
+    if state == CONFIGURING and cycle["mode"] == _BOOT:
+        cycle["mode"] = next_mode(cycle["mode"], _FOUND)
+    if state != RUNNING:
+        return 0
+    cycle["mode"] = next_mode(cycle["mode"], _READY)
+    return 1
+
+
+@njit(cache=True, error_model="numpy")
 def begin(config_array: Records, memory_array: Records, t_us: int) -> int:
     """The period begins: SYNC, on which the amplifier applies the last voltages and samples. In FAULT the node is taken
-    out of operational besides, since 0 V in a drive frame acts at a SYNC only. Returns the number of frames.
+    out of operational besides, since 0 V in a drive frame acts at a SYNC only. After a clear it is started again, one
+    step a period. Returns the number of frames, with RESTARTED and NOT_RESTARTED.
     """
     config, memory = config_array[0], memory_array[0]
     memory["begun_us"] = t_us
     memory["driver"][0]["outgoing"] = 0
+    told = _go_on_starting(config, memory, t_us) if memory["cycle"][0]["mode"] < _IDLE else 0
     driver_rules.sync(config["driver"], memory["driver"], t_us)
     if memory["cycle"][0]["mode"] == _FAULT:
         release(config["driver"], memory["driver"], t_us)
-    return judge(config, memory, 0, t_us)
+    return told | judge(config, memory, 0, t_us)
+
+
+@njit(cache=True, error_model="numpy")
+def _go_on_starting(config: np.void, memory: np.void, t_us: int) -> int:
+    """After a clear: one step of the start-up at the beginning of a period, without waiting for anything."""
+    driver, told = memory["driver"][0], 0
+    if memory["restart_due"] != 0 or (memory["clearing"] != 0 and driver["state"] == FAILED):
+        memory["restart_due"] = memory["clearing"] = 0
+        memory["is_restarting"], told = 1, RESTARTED
+        gate_rules.clear(memory["gate"])
+        start_sequence.begin(config["driver"], memory["driver"], t_us)
+    else:
+        start_sequence.poll(config["driver"], memory["driver"], t_us)
+    state = driver["state"]
+    if state == FAILED and memory["is_restarting"] != 0:
+        memory["is_restarting"], memory["event"] = 0, _LOST
+        return told | NOT_RESTARTED
+    if state == CONFIGURING or (state == RUNNING and memory["cycle"][0]["mode"] == _BOOT):
+        memory["event"] = _FOUND  # also if it was found and configured within one period
+    elif state == RUNNING:
+        memory["event"] = _READY
+    return told
 
 
 @njit(cache=True, error_model="numpy")
 def on_frame(
     config_array: Records, memory_array: Records, can_id: int, flags: int, length: int, word: int, t_us: int
 ) -> int:
-    """A frame from the bus. Returns bits as ``driver_rules.receive``: FRESH once this period's sense values are in."""
+    """A frame from the bus. Returns bits as ``driver_rules.receive``: FRESH once this period's sense values are in,
+    START_UP where the start-up may have something to send.
+    """
     config, memory = config_array[0], memory_array[0]
-    told = receive(config["driver"], memory["driver"], can_id, flags, length, word, t_us)
+    memory["driver"][0]["outgoing"] = 0
+    told = start_sequence.on_frame(config["driver"], memory["driver"], can_id, flags, length, word, t_us)
+    if told & START_UP:
+        judge(config, memory, 0, t_us)
     if told & FRESH == 0:
         driver = config["driver"][0]
         note(memory["others"], driver["node_id"], driver["sense"][0]["pdo"][0]["cob_id"], can_id, t_us)

@@ -78,13 +78,15 @@ def plan(
     for k in range(n + 2):
         reference_row(law, memory, reference, tick["delay_periods"] + k, rows[k])
     predictive.deviation(tick, state, rows, error)
-    jump, nu, e = np.empty((n, 3)), np.empty((n, 3)), np.empty((n + 1, 6))
+    each, both = np.empty((8, n, 3)), np.empty((2, n + 1, 6))  # at once: each piece of memory takes its time
+    jump, nu, comb, stroke, low, high, about = each[0], each[1], each[2], each[3], each[4], each[5], each[6]
+    scratch = predictive.scratch()
+    e = both[0]
     jumps = predictive.jumps(tick["feedback"]["period_s"], rows[: n + 1], jump)
-    comb, stroke, low, high = np.empty((n, 3)), np.empty((n, 3)), np.empty((n, 3)), np.empty((n, 3))
     disturbance, count = state["estimate"]["ahead"][6:9], state["count"][0]
     predictive.stroke_limits(tick, rows, low, high)
     predictive.free_plan(tick, error, jump, jumps, e, nu)
-    if predictive.keeps_limits(tick, rows, e, nu, disturbance, count, low, high, comb, stroke):
+    if predictive.keeps_limits(tick, rows, e, nu, disturbance, count, low, high, comb, stroke, scratch):
         planned[:] = nu
         _hand_over(tick, state, rows, comb[0], 0)
         return predictive.FREE
@@ -92,14 +94,16 @@ def plan(
         planned[k] = planned[k + 1]
     planned[n - 1] = 0.0
     predictive.predict(tick, error, jump, planned, e)
-    if not predictive.forces_and_strokes(tick, rows, e, planned, disturbance, comb, stroke):
+    if not predictive.forces_and_strokes(tick, rows, e, planned, disturbance, comb, stroke, scratch):
         planned[:] = 0.0
         return predictive.NO_PLAN
     (q, lower, upper, v), (between, work) = vectors, solver
-    _pose(tick, count, error, jump, comb, stroke, low, high, e, planned, fixed, q, lower, upper)
+    each[7] = 0.0
+    predictive.predict(tick, error, jump, each[7], both[1])
+    _pose(tick, count, comb, stroke, low, high, e, planned, fixed, q, lower, upper, about, both[1], scratch)
     rounds = active_set.solve(between, work, q, lower, upper, tick["predictive"]["iterations_max"], v)
     if rounds > 0:
-        _adopt(tick, state, fixed[0], rows, error, v, planned, rounds)
+        _adopt(tick, state, fixed[0], rows, error, v, planned, rounds, scratch)
     else:
         state["solver_iterations"] = rounds
     return predictive.LIMITED
@@ -107,14 +111,15 @@ def plan(
 
 @njit(cache=True, error_model="numpy")
 def _pose(
-    law: np.void, count: Array, error: Array, jump: Array, comb: Array, stroke: Array, low: Array, high: Array,
-    e: Array, nu: Array, fixed: Any, q: Array, lower: Array, upper: Array,
+    law: np.void, count: Array, comb: Array, stroke: Array, low: Array, high: Array, e: Array, nu: Array, fixed: Any,
+    q: Array, lower: Array, upper: Array, about: Array, own: Array, scratch: predictive.Scratch,
 ) -> None:  # fmt: skip
-    """Vectors of the problem about a plan nu (n,3) that leads to e (n+1, 6) and takes comb forces (n,3)."""
+    """Vectors of the problem about a plan nu (n,3) that leads to e (n+1, 6) and takes comb forces (n,3); without one
+    it is ``own`` (n+1, 6), which becomes what v adds. ``about`` (n,3): the comb forces less v.
+    """
     pulls0, inverse0, jacobian0, scale = fixed
     n = len(nu)
-    v, about, added, own = np.empty(3), np.empty((n, 3)), np.empty(3), np.empty((n + 1, 6))
-    predictive.predict(law, error, jump, np.zeros((n, 3)), own)
+    v, added = scratch[2], scratch[3]
     predictive.slope(law, pulls0, own, q)
     for i in range(3 * n):
         q[i] *= scale
@@ -122,7 +127,7 @@ def _pose(
         multiply3_transposed(inverse0, nu[k], v)
         for i in range(3):
             about[k, i] = comb[k, i] - v[i]
-            own[k + 1, i] = e[k + 1, i] - own[k + 1, i]  # what v adds
+            own[k + 1, i] = e[k + 1, i] - own[k + 1, i]
         multiply3(jacobian0, own[k + 1, 0:3], added)
         for i in range(3):
             at = 6 * n - 3 + 3 * k + i
@@ -137,16 +142,17 @@ def _pose(
 
 @njit(cache=True, error_model="numpy")
 def _adopt(
-    tick: np.void, state: np.void, pulls0: Array, rows: Array, error: Array, v: Array, planned: Array, rounds: int
-) -> None:
+    tick: np.void, state: np.void, pulls0: Array, rows: Array, error: Array, v: Array, planned: Array, rounds: int,
+    scratch: predictive.Scratch,
+) -> None:  # fmt: skip
     """Make a solution v (3n,) this tick's plan."""
-    part, comb = np.empty(3), np.empty(3)
+    part, comb = scratch[2], np.empty(3)
     for k in range(len(planned)):
         for i in range(3):
             part[i] = v[3 * k + i] * FORCE_UNIT_N
         multiply3_transposed(pulls0, part, planned[k])
     disturbance = state["estimate"]["ahead"][6:9]
-    predictive.comb_forces(tick, rows[0], rows[1], error, planned[0], disturbance, comb, predictive.scratch())
+    predictive.comb_forces(tick, rows[0], rows[1], error, planned[0], disturbance, comb, scratch)
     _hand_over(tick, state, rows, comb, rounds)
 
 

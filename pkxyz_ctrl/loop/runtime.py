@@ -62,7 +62,15 @@ def start(clock: Clock, port: Port, controller: Controller) -> None:
 def run(
     clock: Clock, port: Port, controller: Controller, reference: Reference, ticks: int, record: Callable[[int], object]
 ) -> None:
-    """Run ``ticks`` periods from the next instant of ``clock``. The controller counts those that are missed.
+    """Run ``ticks`` periods from the next instant of ``clock``. The controller counts those that are missed."""
+    go_on(clock, port, controller, reference, range(ticks), record, clock.now_us + controller.period_us)
+
+
+def go_on(
+    clock: Clock, port: Port, controller: Controller, reference: Reference, ticks: range,
+    record: Callable[[int], object], t_us: int,
+) -> int:  # fmt: skip
+    """Run these ticks, the first of them at ``t_us``. Returns when the one behind them begins.
 
     Deadlines are absolute: a tick that begins late shifts no other, and ticks that are past are skipped whole. Other
     frames than the one that is waited for do not put the deadline off, however many there are.
@@ -71,8 +79,7 @@ def run(
     answer_us, heartbeat_us = controller.can.sense_deadline_us, controller.can.heartbeat_deadline_us
     begin, receive, compute, finish = controller.begin, controller.receive, controller.compute, controller.finish
     wait_until, spend, receive_frame, unsent = clock.wait_until, clock.spend, port.receive, port.unsent
-    t_us = clock.now_us + period_us
-    for tick in range(ticks):
+    for tick in ticks:
         wait_until(t_us)
         overrun = 0
         if clock.now_us - t_us >= period_us:
@@ -90,3 +97,4 @@ def run(
         finish(clock.now_us, t_us + heartbeat_us)
         record(tick)
         t_us += period_us
+    return t_us

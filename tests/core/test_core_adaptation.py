@@ -56,7 +56,7 @@ def needed_n(device: Stage, row):
     return device.energy_gradient(row[:3]) + c @ row[3:6] + device.mass_kg * row[6:9]
 
 
-@settings(max_examples=20, deadline=None)
+@settings(max_examples=20)
 @given(st.integers(0, 2**32 - 1))
 def test_what_each_error_lacks_is_what_a_stage_with_that_error_would_need(seed):
     """The oracle is ``Stage`` with a calibration, differentiated numerically."""
@@ -89,7 +89,7 @@ def test_what_each_error_lacks_is_what_a_stage_with_that_error_would_need(seed):
     assert found[:, adaptation.DAMPING] == pytest.approx(law["feedback"]["damping_n_s_per_m"] @ row[3:6], abs=1e-12)
 
 
-@settings(max_examples=20, deadline=None)
+@settings(max_examples=20)
 @given(st.integers(0, 2**32 - 1))
 def test_without_forgetting_it_is_least_squares_with_what_was_known_beforehand(seed):
     """numpy solves the same from all of it at once."""

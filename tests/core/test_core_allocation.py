@@ -44,7 +44,7 @@ def bounds(draw):
     return lower * draw(st.sampled_from([0.0, 1.0])), lower + width
 
 
-@settings(max_examples=300, deadline=None)
+@settings(max_examples=300)
 @given(WORKSPACE, st.tuples(*[st.floats(-1, 1)] * 3), SIZES, bounds())
 def test_optimal_feasible_and_in_bounded_tries(strokes_m, direction, size_n, limits):
     jacobian, demand, (lower, upper) = jacobian_at(strokes_m), np.array(direction) * size_n, limits
@@ -61,7 +61,7 @@ def test_optimal_feasible_and_in_bounded_tries(strokes_m, direction, size_n, lim
         assert tries > 1
 
 
-@settings(max_examples=100, deadline=None)
+@settings(max_examples=100)
 @given(WORKSPACE, st.tuples(*[st.floats(-1, 1)] * 3), bounds())
 def test_asking_for_what_was_given_gives_the_same(strokes_m, direction, limits):
     jacobian, (lower, upper) = jacobian_at(strokes_m), limits

@@ -9,9 +9,8 @@ from scipy.stats import chi2
 
 from pkxyz_ctrl.core import estimator as filtering
 from pkxyz_ctrl.core import tick
-from pkxyz_ctrl.design.law import amplifier_time_constant_s
 from pkxyz_ctrl.design.laws.estimator_gain import measurement_matrix, measurement_noise, process_noise
-from pkxyz_ctrl.design.model.plant_model import linearise, sample
+from pkxyz_ctrl.design.model.plant_model import amplifier_time_constant_s, linearise, sample
 
 SIZE = np.repeat([1e-6, 1e-3, 1e-4], 3)  # of position, velocity and disturbance, for comparing relative to something
 

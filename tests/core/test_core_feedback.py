@@ -20,7 +20,7 @@ def polynomial(state, jerk, t):
     return np.concatenate([p + v * t + a * t**2 / 2 + jerk * t**3 / 6, v + a * t + jerk * t**2 / 2, a + jerk * t])
 
 
-@settings(max_examples=100, deadline=None)
+@settings(max_examples=100)
 @given(
     st.tuples(*[st.floats(-1, 1)] * 9).map(np.array),
     st.tuples(*[st.floats(-300, 300)] * 3).map(np.array),
@@ -71,7 +71,7 @@ def authority_at(strokes_m):
     return feedback.authority(tick_law()["feedback"], inverse, stage().energy_gradient(position))
 
 
-@settings(max_examples=100, deadline=None)
+@settings(max_examples=100)
 @given(st.tuples(*[st.floats(-2e-6, 25e-6)] * 3).map(np.array))
 def test_authority_follows_the_weakest_comb(strokes_m):
     share = authority_at(strokes_m)
@@ -98,7 +98,7 @@ def on_the_reference(row):
     return law, memory
 
 
-@settings(max_examples=100, deadline=None)
+@settings(max_examples=100)
 @given(
     st.tuples(*[st.floats(6e-6, 20e-6)] * 3).map(np.array),
     st.tuples(*[st.floats(-1, 1)] * 6).map(np.array),

@@ -34,7 +34,7 @@ def test_the_error_of_a_newton_step_is_quadratic():
         assert errors[-1] < 3e-9
 
 
-@settings(max_examples=100, deadline=None)
+@settings(max_examples=100)
 @given(STROKES, st.tuples(*[st.floats(-1, 1)] * 3).map(np.array))
 def test_a_micrometre_of_prediction_error_leaves_nanometres_and_30_nm_less_than_a_picometre(strokes_m, direction):
     at = exact(strokes_m)
@@ -53,7 +53,7 @@ def test_where_the_jacobian_is_singular_nothing_moves():
     assert np.array_equal(start, flat)
 
 
-@settings(max_examples=150, deadline=None)
+@settings(max_examples=150)
 @given(
     STROKES, st.tuples(*[st.floats(-200e-9, 200e-9)] * 3).map(np.array), st.tuples(*[st.floats(-50e-15, 50e-15)] * 3)
 )

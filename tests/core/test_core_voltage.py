@@ -32,7 +32,7 @@ def convert(drive, force_n, last, carry_v):
     return count
 
 
-@settings(max_examples=400, deadline=None)
+@settings(max_examples=400)
 @given(
     st.lists(st.tuples(HOSTILE, HOSTILE, HOSTILE), min_size=1, max_size=8),
     COUNTS,
@@ -63,7 +63,7 @@ def test_what_is_too_much_is_the_most(force):
     assert convert(drive, [force] * 3, np.full(3, 20_000, np.int32), np.zeros(3)).tolist() == [30_000] * 3
 
 
-@settings(max_examples=200, deadline=None)
+@settings(max_examples=200)
 @given(COUNTS)
 def test_counts_to_forces_and_back(count):
     """Every count is found again from the force that it gives, exactly, with nothing left to carry."""
@@ -76,7 +76,7 @@ def test_counts_to_forces_and_back(count):
         assert np.abs(carry).max() <= 1e-12 * 200
 
 
-@settings(max_examples=200, deadline=None)
+@settings(max_examples=200)
 @given(st.tuples(*[st.floats(0, 2.6e-3)] * 3), COUNTS, st.integers(1, MOST), st.integers(1, MOST))
 def test_a_force_within_the_limits_is_met_to_half_a_count(fractions, last, slew, most):
     """What ``force_limits`` promises, ``counts_for_forces`` keeps: inside them only the rounding is left."""

@@ -33,7 +33,7 @@ def force_of(law, state, innovation_m, share=1.0):
     return out
 
 
-@settings(max_examples=30, deadline=None)
+@settings(max_examples=30)
 @given(st.integers(1, youla.TAPS_MAX), st.integers(0, 2**32 - 1))
 def test_the_force_is_the_convolution_of_taps_and_innovations(count, seed):
     """Over three times round the ring."""

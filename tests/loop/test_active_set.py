@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 import scipy.optimize
-from hypothesis import given, settings
+from hypothesis import given
 from hypothesis import strategies as st
 
 from pkxyz_ctrl.loop import active_set
@@ -36,7 +36,6 @@ def forces_of_limits(hessian, rows, q, lower, upper, v):
     return scipy.optimize.nnls(np.array(at).T, slope)[1] if at else np.linalg.norm(slope)
 
 
-@settings(deadline=None)
 @given(seeds, st.sampled_from([0.05, 1.0, 20.0]))
 def test_no_point_between_the_limits_is_better(seed, tight):
     """Kuhn and Tucker's conditions, which are sufficient where the problem is convex."""
@@ -55,7 +54,6 @@ def test_where_no_limit_is_met_it_is_a_linear_system_and_one_round():
     assert v == pytest.approx(np.linalg.solve(hessian, -q), rel=1e-10)
 
 
-@settings(deadline=None)
 @given(seeds)
 def test_limits_that_exclude_each_other_are_told(seed):
     """A row twice, once held above what the other allows."""
@@ -67,7 +65,6 @@ def test_limits_that_exclude_each_other_are_told(seed):
     assert np.isnan(v).all()
 
 
-@settings(deadline=None)
 @given(seeds)
 def test_rows_that_depend_on_each_other_are_no_trouble(seed):
     """Each limit three times, and the sum of two: what is held must stay independent."""

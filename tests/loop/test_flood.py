@@ -23,6 +23,8 @@ from pkxyz_ctrl.loop.runtime import start
 from pkxyz_ctrl.safety.modes import Mode
 from pkxyz_ctrl.safety.trips import Trip
 
+pytestmark = pytest.mark.at_rate
+
 TICKS, FLOOD_FROM, READ_US = 1200, 800, 7
 STALE = 5  # ticks without a sense frame that are a fault: stale_count of the shipped controllers
 FOREIGN = Frame(0x123, bytes(8), True, True)
@@ -47,7 +49,7 @@ class FloodedPort:
 
 def flooded_rows():
     """Rows (n,), the controller and the times at which ticks of a flooded run had read their last frame."""
-    rig, found, ends_us = LockstepRig(shortened(setup(), TICKS)), [], []
+    rig, found, ends_us = LockstepRig(shortened(setup(), TICKS), whole_ticks=False), [], []
     port = rig.port = FloodedPort(rig.port, rig.clock)
     compute = rig.controller.compute
 

@@ -52,7 +52,7 @@ class Down:
 
 
 def test_a_fault_names_the_interface_that_is_down():
-    rig, rows = LockstepRig(shortened(setup(), TICKS)), []
+    rig, rows = LockstepRig(shortened(setup(), TICKS), whole_ticks=False), []
     port = rig.port = Down(rig.port, rig.clock)
     shipped = rig.setup
     controller = rig.controller = Controller(

@@ -43,7 +43,7 @@ class Late:
 def rows_when(late):
     """(n,) of ROW, and what the run says, of a loop that oversleeps; ``late``: periods by the tick's instant."""
     found = []
-    rig = LockstepRig(shortened(setup(), TICKS))
+    rig = LockstepRig(shortened(setup(), TICKS), whole_ticks=False)
     real = rig.clock
     rig.clock = Late(real, rig.setup.bus.period_us, late)
     blocks = Blocks(
@@ -69,7 +69,7 @@ def test_one_fewer_than_allowed_is_survived_and_one_more_is_a_fault():
     assert fault.startswith("at 0.1052 s: ")
 
 
-@settings(max_examples=12, deadline=None)
+@settings(max_examples=12)
 @given(st.dictionaries(st.integers(300, TICKS), st.integers(1, 4), max_size=6))
 def test_the_fault_comes_where_the_bucket_is_full(late):
     """Each missed tick adds one, each good one takes 1/leak away; independent bookkeeping in whole leaks."""

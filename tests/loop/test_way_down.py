@@ -12,7 +12,7 @@ from pkxyz_ctrl.loop import landing
 numbers = st.floats(-1.0, 1.0)
 
 
-@settings(max_examples=60, deadline=None)
+@settings(max_examples=60)
 @given(numbers, numbers, numbers, st.floats(-0.1, 0.999), st.sampled_from([0.001, 0.005, 0.05]))
 def test_the_path_is_the_polynomial_of_7th_order_from_a_state_to_rest(x, v, a, u, duration_s):
     """x in um, v in um / T, a in um / T^2, so that each has its part; no jerk at either end."""

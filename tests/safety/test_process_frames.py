@@ -224,7 +224,7 @@ def test_every_receiver_is_tried() -> None:
 
 
 @pytest.mark.parametrize("kind", [Controller, Gate])
-@settings(max_examples=100, deadline=None)
+@settings(max_examples=100)
 @given(periods=st.lists(st.lists(st.integers(-4, 4), max_size=3), max_size=40))
 def test_whatever_comes_only_what_is_due_is_used(kind: type[Receiver], periods: list[list[int]]) -> None:
     """``periods``: which frames come, counted from the one that is due.

@@ -62,7 +62,7 @@ def clamp16(value: int) -> int:
     return max(-32768, min(32767, value))
 
 
-@settings(max_examples=150, deadline=None)
+@settings(max_examples=150)
 @given(traffic())
 def test_random_traffic_never_moves_the_combs_beyond_limits(
     actions: list[tuple[str, int, int, tuple[int, ...]]],

@@ -134,7 +134,7 @@ def test_safe_cycles_by_mode(mode: int) -> None:
     assert next_safe_cycles(1 << 30, mode, True, True) == 1 << 30
 
 
-@settings(max_examples=200, deadline=None)
+@settings(max_examples=200)
 @given(st.lists(st.tuples(st.booleans(), st.booleans()), max_size=40))
 def test_safe_cycles_are_those_since_the_last_unsafe_one(ticks: list[tuple[bool, bool]]) -> None:
     """Oracle: look back to the last tick that was not safe."""
@@ -145,7 +145,7 @@ def test_safe_cycles_are_those_since_the_last_unsafe_one(ticks: list[tuple[bool,
         assert cycles == k - max(unsafe, default=-1)
 
 
-@settings(max_examples=200, deadline=None)
+@settings(max_examples=200)
 @given(st.lists(st.tuples(st.booleans(), st.integers(0, len(Event) - 1)), max_size=60))
 def test_loop_closes_only_after_homing_since_the_last_boot(choices: list[tuple[bool, int]]) -> None:
     """Whoever asks through ``enable_event`` cannot close the loop on offsets of another life.

@@ -273,7 +273,7 @@ def test_silence_is_called_stale_at_the_fifth_tick() -> None:
     assert [bench.tick(missing) for _ in range(5)] == [0, 0, 0, 0, Trip.SENSE_STALE]
 
 
-@settings(max_examples=60, deadline=None)
+@settings(max_examples=60)
 @given(
     st.lists(st.tuples(st.sampled_from(Mode), st.booleans(), st.booleans()), min_size=1, max_size=60),
     st.integers(1, 6),

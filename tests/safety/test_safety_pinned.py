@@ -239,7 +239,7 @@ def test_limits_of_the_monitors() -> None:
     }  # fmt: skip
     assert limits["safe_cycles"] == 10
     assert (limits["residual_max_m"], limits["unexplained_force_max_n"]) == (0.7e-6, 0.8e-3)
-    assert (limits["force_change_max_n"], limits["force_change_share"]) == (40e-6, 0.4)
+    assert (limits["force_change_max_n"], limits["force_change_share"]) == (40e-6, 0.47)
     assert limits["innovation_share_m_per_n"] == 1.5e-3
     assert limits["force_forget_share"] == pytest.approx(200e-6 / 2e-3, rel=1e-12)
     assert limits["force_trend_share"] == pytest.approx(200e-6 / 0.03, rel=1e-12)

@@ -81,7 +81,7 @@ def scripts(draw: st.DrawFn) -> list[Tick]:
     return draw(st.lists(st.tuples(level, fate, fate), min_size=4, max_size=30))
 
 
-@settings(max_examples=300, deadline=None)
+@settings(max_examples=300)
 @example([(1, "arrives", "arrives"), (1, "lost", "arrives"), (1, "arrives", "lost")])
 @given(scripts())
 def test_no_script_of_losses_makes_a_step_beyond_slew(script: list[Tick]) -> None:
