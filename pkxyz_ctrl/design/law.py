@@ -19,7 +19,7 @@ from pkxyz_ctrl.design.laws.estimator_gain import kalman_gain, measurement_matri
 from pkxyz_ctrl.design.laws.regulator import cost_to_go, regulator_gain
 from pkxyz_ctrl.design.model.discrete_law import LawError
 from pkxyz_ctrl.design.model.loop_plant import held_force_softening, loop_plant
-from pkxyz_ctrl.design.model.plant_model import LinearStage, SampledStage, linearise, sample
+from pkxyz_ctrl.design.model.plant_model import LinearStage, SampledStage, amplifier_time_constant_s, linearise, sample
 from pkxyz_ctrl.design.noise_shaping import FIRST_ORDER, shaping_between_modes
 from pkxyz_ctrl.loop import cycle
 from pkxyz_ctrl.stage import Stage
@@ -72,11 +72,6 @@ def design_law(stage: Stage, controller: ControllerConfig, bus: BusConfig, *, au
     law["autostart"] = autostart
     law.flags.writeable = False
     return law
-
-
-def amplifier_time_constant_s(stage: Stage) -> float:
-    """Time constant of the amplifier's first-order approach to a new voltage."""
-    return 1.0 / (2.0 * math.pi * stage.config.amplifier.bandwidth_hz)
 
 
 def _felt_stiffness(stage: Stage, model: LinearStage) -> Array:

@@ -4,8 +4,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from pkxyz_ctrl.core.demand import LINEAR, OPEN_LOOP
-from pkxyz_ctrl.design.lqg_equivalent import lqg_equivalent, set_point_gain
-from pkxyz_ctrl.design.model.discrete_law import DiscreteLaw, LawError
+from pkxyz_ctrl.design.lqg_equivalent import lqg_in_parts, set_point_gain
+from pkxyz_ctrl.design.model.discrete_law import DiscreteLaw, LawError, TappedLaw
 from pkxyz_ctrl.design.model.loop_plant import NOMINAL, Perturbation
 from pkxyz_ctrl.stage import Stage
 
@@ -21,13 +21,21 @@ def law_about(
     It is read from the numbers that the tick runs on, not designed again. Raises ``LawError`` for a law that only
     feeds forward: it closes no loop.
     """
+    parts = law_in_parts(stage, law, strokes_m, perturbation)
+    return parts.whole() if isinstance(parts, TappedLaw) else parts
+
+
+def law_in_parts(
+    stage: Stage, law: NDArray[np.void], strokes_m: Array, perturbation: Perturbation = NOMINAL
+) -> DiscreteLaw | TappedLaw:
+    """The same, a filter of taps apart: for whoever asks many loops, and can do without its states."""
     numbers = law["tick"][0]
     kind = int(numbers["kind"])
     if kind == OPEN_LOOP:
         raise LawError("this law only feeds forward: there is no loop, hence no margin; choose another controller")
     if kind == LINEAR:
         return _linear(stage, law, np.asarray(strokes_m, dtype=np.float64))
-    return lqg_equivalent(stage, law, strokes_m, perturbation)
+    return lqg_in_parts(stage, law, strokes_m, perturbation)
 
 
 def _linear(stage: Stage, law: NDArray[np.void], strokes_m: Array) -> DiscreteLaw:

@@ -12,7 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from pkxyz_ctrl.core.demand import PREDICTIVE
-from pkxyz_ctrl.design.model.discrete_law import DiscreteLaw
+from pkxyz_ctrl.design.model.discrete_law import DiscreteLaw, TappedLaw
 from pkxyz_ctrl.design.model.loop_plant import NOMINAL, Perturbation, held_force_softening
 from pkxyz_ctrl.stage import Stage
 
@@ -31,6 +31,14 @@ def lqg_equivalent(
     The stage is the controller's belief. The perturbation of the real one only matters through the forces that the
     controller thinks it holds the point with.
     """
+    parts = lqg_in_parts(stage, law, strokes_m, perturbation)
+    return parts.whole() if isinstance(parts, TappedLaw) else parts
+
+
+def lqg_in_parts(
+    stage: Stage, law: NDArray[np.void], strokes_m: Array, perturbation: Perturbation = NOMINAL
+) -> DiscreteLaw | TappedLaw:
+    """The same; a Youla filter, where there is one, stays beside the rest."""
     numbers = law["tick"][0]
     filter_, feedback, delay = numbers["estimator"], numbers["feedback"], int(numbers["delay_periods"])
     position = stage.forward_kinematics(np.asarray(strokes_m, dtype=np.float64))
@@ -47,7 +55,10 @@ def lqg_equivalent(
     if numbers["kind"] != PREDICTIVE:
         equivalent = replace(equivalent, set_point_gain=set_point_gain(numbers))
     taps = numbers["youla"]["tap_n_per_m"][: int(numbers["youla"]["taps"])]
-    return with_taps(equivalent, filter_, share * taps) if len(taps) else equivalent
+    if not len(taps):
+        return equivalent
+    late = np.zeros((3, equivalent.order - 9))
+    return TappedLaw(equivalent, np.hstack([seen_by(filter_), late]), share * taps)
 
 
 def set_point_gain(numbers: np.void) -> Array:
@@ -90,24 +101,3 @@ def _assemble(filter_: np.void, softening: Array, gains: Array, delay: int, peri
 def seen_by(filter_: np.void) -> Array:
     """H (3,9): what a sample shows of the filter's state, x - tau v."""
     return np.hstack([np.eye(3), -filter_["sense_delay_s"] * np.eye(3), np.zeros((3, 3))])
-
-
-def with_taps(law: DiscreteLaw, filter_: np.void, taps: Array) -> DiscreteLaw:
-    """The equivalent ``law`` with a Youla filter of ``taps`` (n,3) in N/m beside it: the innovations of the last n - 1
-    samples are states, too, and the filter knows the force that follows from them.
-    """
-    order, late = law.order, 3 * (len(taps) - 1)
-    innovation = np.zeros((3, order + late))
-    innovation[:, :9] = -seen_by(filter_)
-    force = np.zeros((3, order + late))  # over states; what is seen now adds taps[0]
-    force[:, order:] = np.hstack([np.diag(tap) for tap in taps[1:]])
-    force += taps[0][:, None] * innovation
-    a, b = np.zeros((order + late, order + late)), np.zeros((order + late, 3))
-    a[:order, :order], b[:order] = law.a, law.b
-    a[9:12] -= force
-    b[9:12] -= np.diag(taps[0])
-    if late:
-        a[order : order + 3], b[order : order + 3] = innovation, np.eye(3)
-        a[order + 3 :, order : order + late - 3] = np.eye(late - 3)
-    c = np.hstack([law.c, np.zeros((3, late))]) + force
-    return replace(law, a=a, b=b, c=c, d=law.d + np.diag(taps[0]), order_max=order + late)

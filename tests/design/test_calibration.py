@@ -69,7 +69,7 @@ few = st.floats(-0.1, 0.1)
 each = st.tuples(few, few, few).map(np.array)
 
 
-@settings(deadline=None, max_examples=25)
+@settings(max_examples=25)
 @given(each, each, each, few, few, st.floats(-0.02, 0.06), each.map(lambda g: 0.1 * g))
 def test_the_plants_own_numbers_are_found(comb, leaf, crank, link, mass, lift, sense):
     """From its equations, which share nothing with the fit; relative to its mass, with the sense gains known."""
@@ -105,7 +105,7 @@ def strokes_under(plant, squared_v2):
     return q
 
 
-@settings(deadline=None, max_examples=10)
+@settings(max_examples=10)
 @given(st.integers(0, 2**32 - 1))
 def test_standard_errors_are_those_of_the_errors(seed):
     """Noise of 0.1 % on what ODD would show: each number within 5 of its standard errors, none absurdly wide."""
@@ -184,7 +184,7 @@ def test_each_chain_has_its_own_sense_comb():
     assert odd().sense_capacitance(np.zeros(3)) == pytest.approx(stage().sense_capacitance(np.zeros(3)), rel=1e-15)
 
 
-@settings(deadline=None, max_examples=30)
+@settings(max_examples=30)
 @given(st.tuples(st.floats(-8e-6, 8e-6), st.floats(-8e-6, 8e-6), st.floats(0.0, 30e-6)).map(np.array))
 def test_springs_of_each_chain_are_one_energy(position_m):
     assert_derivative(odd().potential_energy, odd().energy_gradient, position_m, step=2e-6, rtol=1e-8, floor=1e-4)

@@ -13,7 +13,7 @@ from pkxyz_ctrl.config.files import ConfigError, load
 from pkxyz_ctrl.config.stage import StageConfig
 from pkxyz_ctrl.core.linear3 import inverse3
 from pkxyz_ctrl.design.drive_limits import count_max, slew_counts
-from pkxyz_ctrl.design.law import amplifier_time_constant_s, design_law
+from pkxyz_ctrl.design.law import design_law
 from pkxyz_ctrl.design.laws.estimator_gain import (
     measurement_matrix,
     measurement_noise,
@@ -22,7 +22,7 @@ from pkxyz_ctrl.design.laws.estimator_gain import (
 )
 from pkxyz_ctrl.design.laws.regulator import regulator_gain
 from pkxyz_ctrl.design.model.design_error import DesignError
-from pkxyz_ctrl.design.model.plant_model import linearise, sample
+from pkxyz_ctrl.design.model.plant_model import amplifier_time_constant_s, linearise, sample
 from pkxyz_ctrl.stage import Stage
 
 BUSES = ["fd_5k", "classic_2k", "local_20k"]

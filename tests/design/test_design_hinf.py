@@ -72,7 +72,7 @@ def test_it_is_the_hankel_norm_of_the_coprime_factors():
     )
 
 
-@settings(max_examples=25, deadline=None)
+@settings(max_examples=25)
 @given(st.integers(0, 10_000), st.integers(1, 5), st.integers(1, 2), st.integers(1, 2), st.floats(1.02, 2.0))
 def test_any_plant_gets_what_the_hankel_norm_says(seed, order, inputs, outputs, factor):
     """Optimum by two ways; the controller stabilises; its norm is below gamma and not below the optimum."""

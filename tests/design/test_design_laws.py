@@ -69,7 +69,7 @@ def test_wrong_matrices_are_named(name, bad):
         DiscreteLaw(PERIOD, **matrices)
 
 
-@settings(max_examples=30, deadline=None)
+@settings(max_examples=30)
 @given(st.floats(0.01, 2.0), st.floats(100.0, 8000.0), st.sampled_from(["tustin", "zoh"]))
 def test_sampling_is_scipys_and_prewarping_exact(zeta, w, method):
     system = control.ss(control.tf([w, w * w], [1.0, 2 * zeta * w, w * w]))
@@ -103,7 +103,7 @@ def test_stacked_axes_do_not_see_each_other():
 # -- PI and notches ---------------------------------------------------------------------------------------------------
 
 
-@settings(max_examples=8, deadline=None)
+@settings(max_examples=8)
 @given(st.floats(3.0, 12.0), st.floats(0.0, 400e-6), st.floats(0.3, 1.0), st.sampled_from(["fd_5k", "classic_2k"]))
 def test_pi_notch_has_the_gain_margin_that_was_asked_for(margin_db, integral_time_s, damping, bus_name):
     """On the whole plant, by its eigenvalues: stable just below the margin and not just above it."""
@@ -215,7 +215,7 @@ def test_matrices_of_transfer_functions_and_state_space_are_the_same_law():
     assert np.array_equal(discrete_law(control.ss(law.a, law.b, law.c, law.d, True), PERIOD).d, law.d)
 
 
-@settings(max_examples=8, deadline=None)
+@settings(max_examples=8)
 @given(st.floats(1.0, 4000.0))
 def test_what_is_accepted_is_stable_and_what_is_refused_is_not_or_just_so(gain):
     law = discrete_law(integrator(STIFF * gain), PERIOD)

@@ -113,7 +113,7 @@ def test_a_device_that_cannot_be_is_refused():
 # -- margins against python-control, axis by axis ---------------------------------------------------------------------
 
 
-@settings(max_examples=5, deadline=None)
+@settings(max_examples=5)
 @given(st.floats(3.0, 12.0), st.floats(0.0, 300e-6), st.floats(0.4, 1.0), st.integers(0, 2))
 def test_margins_of_one_axis_are_those_of_python_control(margin_db, integral_time_s, damping, i):
     """Uncoupled at the centre of the workspace, so an axis is a loop with one input: of order 9."""
@@ -194,7 +194,7 @@ def test_every_factor_within_the_disk_is_borne_and_one_on_it_is_not():
     assert alpha <= 1 / worst * 1.0001  # the search finds no smaller one than the least
 
 
-@settings(max_examples=6, deadline=None)
+@settings(max_examples=6)
 @given(st.integers(0, 10_000))
 def test_the_structured_norm_is_the_largest_radius_over_all_phases(seed):
     """mu = max over diagonal unitary U of rho(U M): a lower bound that is reached, against the upper one."""
@@ -219,7 +219,7 @@ def test_mimo_figures_are_those_of_a_dense_sweep():
     assert found.bandwidth_hz == pytest.approx(frequency[np.argmax(size >= HALF_POWER)], abs=0.21)
 
 
-@settings(max_examples=10, deadline=None)
+@settings(max_examples=10)
 @given(st.integers(0, 2**32 - 1))
 def test_the_sensitivity_of_many_frequencies_is_the_inverse_of_one_and_the_loop(seed):
     """By the Schur form against (I + L)^-1 from two linear systems; and its poles against the eigenvalues."""

@@ -8,8 +8,7 @@ from loop_rig import MIDDLE, bus, stage
 from scipy.integrate import solve_ivp
 from sim_rig import config, plant
 
-from pkxyz_ctrl.design.law import amplifier_time_constant_s
-from pkxyz_ctrl.design.model.plant_model import linearise, sample
+from pkxyz_ctrl.design.model.plant_model import amplifier_time_constant_s, linearise, sample
 from sim.motion.mechanics import acceleration
 
 TAU_S = amplifier_time_constant_s(stage())

@@ -180,7 +180,7 @@ def laws(draw):
     return DiscreteLaw(PERIOD, a * sizes[:, None] / sizes, b * sizes[:, None], c / sizes, d)
 
 
-@settings(max_examples=60, deadline=None)
+@settings(max_examples=60)
 @given(laws())
 def test_without_authority_every_law_comes_to_rest(law):
     """A - U C, which is what is left of a law none of whose force is given, forgets; unstable laws do so too."""
@@ -195,7 +195,7 @@ def test_where_there_is_much_feedthrough_it_is_hanus():
     assert unwinding(law, plant()) == pytest.approx(b @ np.linalg.inv(d), rel=1e-3)
 
 
-@settings(max_examples=40, deadline=None)
+@settings(max_examples=40)
 @given(laws(), st.floats(0.0, 1.0), st.integers(0, 2**32 - 1))
 def test_the_kernel_is_the_law_at_that_authority(law, share, seed):
     """Ten steps of the compiled law against numpy."""

@@ -25,27 +25,22 @@ def closed_loop(plant: LoopPlant, law: DiscreteLaw) -> Array:
     return np.block([[plant.a - plant.b @ law.d @ plant.c, -plant.b @ law.c], [law.b @ plant.c, law.a]])
 
 
-class Sensitivity:
-    """S(f) of a plant with a law: a function of frequencies (m,) in Hz, with values (m, 3, 3).
+class Transfer:
+    """I + C (z I - A)^-1 B of a system: a function of frequencies (m,) in Hz, with values (m, p, q)."""
 
-    Raises ``LawError`` where their periods differ.
-    """
-
-    def __init__(self, plant: LoopPlant, law: DiscreteLaw) -> None:
-        a = closed_loop(plant, law)
+    def __init__(self, a: Array, enters: Array, leaves: Array, period_s: float) -> None:
         # balanced, as states of all sizes are turned into one another: forces, positions, velocities
         balanced, (scale, _) = scipy.linalg.matrix_balance(a, permute=False, separate=True)
-        self._triangle, turn = scipy.linalg.schur(balanced, output="complex")
+        self._triangle, turn = scipy.linalg.schur(balanced, output="complex", check_finite=False)
         self.poles: Complex = np.asarray(np.diag(self._triangle))
-        """(n,) of the loop"""
-        enters = np.vstack([-plant.b @ law.d, law.b]) / scale[:, None]
-        leaves = np.hstack([plant.c, np.zeros((len(plant.c), law.order))]) * scale
-        self._enters, self._leaves = turn.conj().T @ enters, np.ascontiguousarray(leaves @ turn)
-        self._period_s = plant.period_s
+        """(n,) of the system"""
+        self._enters = turn.conj().T @ (enters / scale[:, None])
+        self._leaves = np.ascontiguousarray((leaves * scale) @ turn)
+        self._period_s = period_s
 
     @property
     def spectral_radius(self) -> float:
-        """Below 1 the loop is stable."""
+        """Below 1 it is stable."""
         return float(np.abs(self.poles).max())
 
     def __call__(self, frequency_hz: Array) -> Complex:
@@ -53,6 +48,16 @@ class Sensitivity:
         s = np.empty((len(z), len(self._leaves), self._enters.shape[1]), np.complex128)
         _substitute_back(self._triangle, self._enters, self._leaves, z, s)
         return s
+
+
+class Sensitivity(Transfer):
+    """S(f) of a plant with a law: values (m, 3, 3), and the loop's poles. Raises ``LawError`` where their periods
+    differ.
+    """
+
+    def __init__(self, plant: LoopPlant, law: DiscreteLaw) -> None:
+        enters, leaves = np.vstack([-plant.b @ law.d, law.b]), np.hstack([plant.c, np.zeros((len(plant.c), law.order))])
+        super().__init__(closed_loop(plant, law), enters, leaves, plant.period_s)
 
 
 _TOGETHER = 32
@@ -64,9 +69,15 @@ def _substitute_back(triangle: Complex, enters: Complex, leaves: Complex, z: Com
     """out (m, p, q) = I + leaves (z I - triangle)^-1 enters for each z (m,)."""
     n, inputs = enters.shape
     re, im = np.empty((n, inputs, _TOGETHER)), np.empty((n, inputs, _TOGETHER))
+    over_re, over_im = np.empty(_TOGETHER), np.empty(_TOGETHER)
+    total_re, total_im = np.empty(_TOGETHER), np.empty(_TOGETHER)
     for first in range(0, len(z), _TOGETHER):
         some = z[first : first + _TOGETHER]
         for k in range(n - 1, -1, -1):
+            for f in range(len(some)):
+                u, v = some[f].real - triangle[k, k].real, some[f].imag - triangle[k, k].imag
+                size = 1.0 / (u * u + v * v)
+                over_re[f], over_im[f] = u * size, -v * size
             for i in range(inputs):
                 x, y = re[k, i], im[k, i]
                 for f in range(len(some)):
@@ -77,12 +88,16 @@ def _substitute_back(triangle: Complex, enters: Complex, leaves: Complex, z: Com
                         x[f] += a * u[f] - b * v[f]
                         y[f] += a * v[f] + b * u[f]
                 for f in range(len(some)):
-                    value = complex(x[f], y[f]) / (some[f] - triangle[k, k])
-                    x[f], y[f] = value.real, value.imag
-        for f in range(len(some)):
-            for o in range(len(leaves)):
-                for i in range(inputs):
-                    total = complex(1.0 if o == i else 0.0)
-                    for k in range(n):
-                        total += leaves[o, k] * complex(re[k, i, f], im[k, i, f])
-                    out[first + f, o, i] = total
+                    u, v = x[f], y[f]
+                    x[f] = u * over_re[f] - v * over_im[f]
+                    y[f] = u * over_im[f] + v * over_re[f]
+        for o in range(len(leaves)):
+            for i in range(inputs):
+                total_re[:], total_im[:] = 1.0 if o == i else 0.0, 0.0
+                for k in range(n):
+                    a, b, x, y = leaves[o, k].real, leaves[o, k].imag, re[k, i], im[k, i]
+                    for f in range(len(some)):
+                        total_re[f] += a * x[f] - b * y[f]
+                        total_im[f] += a * y[f] + b * x[f]
+                for f in range(len(some)):
+                    out[first + f, o, i] = complex(total_re[f], total_im[f])

@@ -7,7 +7,7 @@ feed-forward. Platform axes x, y, z.
 """
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import control
 import numpy as np
@@ -64,6 +64,45 @@ class DiscreteLaw:
     def order(self) -> int:
         """Number of states."""
         return len(self.a)
+
+
+@dataclass(frozen=True)
+class TappedLaw:
+    """A law with a filter of taps over its innovations beside it, as two parts: w = -(C x + D e + sum of tap_k i(-k)),
+    i = e - H x, of the innovations now and before. The law is told the force that follows from both (``told_from``).
+
+    ``whole`` is the same as one law, whose order the taps make several times as large.
+    """
+
+    law: DiscreteLaw
+    seen: Array
+    """H (3,n): what a sample shows of the law's state"""
+    taps: Array
+    """(k,3) of each axis, in N/m, the newest first"""
+
+    def whole(self) -> DiscreteLaw:
+        """With the innovations of the last k - 1 samples as states."""
+        law, order, late = self.law, self.law.order, 3 * (len(self.taps) - 1)
+        innovation = np.hstack([-self.seen, np.zeros((3, late))])
+        force = np.zeros((3, order + late))  # over states; what is seen now adds taps[0]
+        force[:, order:] = np.hstack([np.diag(tap) for tap in self.taps[1:]])
+        force += self.taps[0][:, None] * innovation
+        a, b = np.zeros((order + late, order + late)), np.zeros((order + late, 3))
+        a[:order, :order], b[:order] = law.a, law.b
+        a[self.told] -= force
+        b[self.told] -= np.diag(self.taps[0])
+        if late:
+            a[order : order + 3], b[order : order + 3] = innovation, np.eye(3)
+            a[order + 3 :, order : order + late - 3] = np.eye(late - 3)
+        c = np.hstack([law.c, np.zeros((3, late))]) + force
+        return replace(law, a=a, b=b, c=c, d=law.d + np.diag(self.taps[0]), order_max=order + late)
+
+    @property
+    def told(self) -> slice:
+        """The states that are told the force. Raises ``LawError`` for a law that is told none."""
+        if self.law.told_from is None:
+            raise LawError("a filter of taps needs a law that is told what force was given")
+        return slice(self.law.told_from, self.law.told_from + 3)
 
 
 def siso(system: control.lti.LTI) -> control.StateSpace:

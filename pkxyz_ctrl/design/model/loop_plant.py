@@ -19,7 +19,7 @@ import scipy.linalg
 from numpy.typing import ArrayLike, NDArray
 
 from pkxyz_ctrl.config.bus import BusConfig
-from pkxyz_ctrl.design.model.plant_model import linearise
+from pkxyz_ctrl.design.model.plant_model import amplifier_time_constant_s, linearise
 from pkxyz_ctrl.stage import Stage
 
 Array = NDArray[np.float64]
@@ -103,7 +103,11 @@ def loop_plant(stage: Stage, bus: BusConfig, strokes_m: ArrayLike, perturbation:
     rows = stage.pulls(model.position_m).T
     comb_error = rows @ np.diag(1.0 + np.array(perturbation.comb_gain)) @ np.linalg.inv(rows)
     device = _Device(
-        stiffness, damping, mass, comb_error, _amplifier_s(stage) / (1.0 + perturbation.amplifier_bandwidth)
+        stiffness,
+        damping,
+        mass,
+        comb_error,
+        amplifier_time_constant_s(stage) / (1.0 + perturbation.amplifier_bandwidth),
     )
     a, b, c = device.continuous(stage.sense_delay_s, perturbation)
     a, b = _sampled(a, b, bus.period_s, bus.delay_periods * bus.period_s + perturbation.delay_s)
@@ -129,10 +133,6 @@ def held_force_softening(stage: Stage, position_m: Array, force_n: Array | None 
         g += force[i] * np.outer(across, across) * crank**2 / (crank**2 - offset**2) ** 1.5
         g[2, 2] += force[i] * link**2 / (link**2 - height**2) ** 1.5
     return g
-
-
-def _amplifier_s(stage: Stage) -> float:
-    return 1.0 / (2.0 * math.pi * stage.config.amplifier.bandwidth_hz)
 
 
 @dataclass(frozen=True)

@@ -71,6 +71,11 @@ class SampledStage:
     gamma_lag: Array  # (9,3)
 
 
+def amplifier_time_constant_s(stage: Stage) -> float:
+    """Time constant of the amplifier's first-order approach to a new voltage."""
+    return 1.0 / (2.0 * math.pi * stage.config.amplifier.bandwidth_hz)
+
+
 def sample(model: LinearStage, period_s: float, amplifier_time_constant_s: float) -> SampledStage:
     """Exact sampling: the matrix exponential of [A B B; 0 0 0; 0 0 -1/tau], whose
     last block is the amplifier's approach.
