@@ -10,15 +10,16 @@ from functools import partial
 from pathlib import Path
 
 import canopen
+import cluster_plan
 import config_tables
 import fault_codes
 import limit_table
 import mode_tables
 import wire_tables
+from object_tables import object_table, pdo_table
 
 from hil.conformance.run import CHECKS
 from hil.faults.catalogue import KINDS, PARTS
-from pkxyz_ctrl.can.wire_doc import object_table, pdo_table
 from pkxyz_ctrl.instrument.motor_record import FIELDS
 from pkxyz_ctrl.instrument.scpi import HEADERS
 from pkxyz_ctrl.mechanics.published import entries
@@ -160,8 +161,14 @@ def measured(name: str) -> str:
     return str(blocks[name])
 
 
+def plan() -> str:
+    """What many devices take on many machines."""
+    return table(["what", "how known", "value"], cluster_plan.rows())
+
+
 BUILT = {
     "rooms": rooms,
+    "plan": plan,
     **{name: partial(measured, name) for name in ("quality", "beside", "speed", "share", "parts", "floor")},
     "trips": fault_codes.trips_table,
     "stops": fault_codes.stops_table,

@@ -43,18 +43,18 @@ def montecarlo(
     tolerances: str = "wide",
     out: str | Path,
     workers: int | None = None,
-    dask: str | None = None,
-    dask_tls: str | Path | None = None,
+    cluster: str | None = None,
+    cluster_tls: str | Path | None = None,
     on_progress: Progress = lambda done, total: None,
 ) -> SampledPlants:
     """Run a scenario on ``plants`` plants sampled from a tolerances file, each seeded by its own number.
 
     Results are kept in ``out``/results.jsonl at once: called again it goes on, also after an interruption, which is
     passed on only where nothing is done yet. ``workers``: processes, by default as many as cores; a program that uses
-    more than one starts under ``if __name__ == "__main__":``. ``dask``: address of a cluster's scheduler to work on
-    instead; ``dask_tls``: folder of its certificates, as ``cluster_at`` wants them. Raises ``ConfigError``.
+    more than one starts under ``if __name__ == "__main__":``. ``cluster``: address of a cluster's scheduler to work on
+    instead; ``cluster_tls``: folder of its certificates, as ``cluster_at`` wants them. Raises ``ConfigError``.
     """
-    cluster = cluster_at(dask, dask_tls)
+    spread = cluster_at(cluster, cluster_tls)
     loaded = scenario if isinstance(scenario, Scenario) else load_scenario(scenario)
     study = Study(loaded, load("tolerances", tolerances, Tolerances))
     folder = Path(out)
@@ -62,7 +62,7 @@ def montecarlo(
     results = Results(folder / "results.jsonl", study)
     seeds, interrupted = range(first_seed, first_seed + plants), False
     try:
-        run_study(study, seeds, results, workers or cores(), cluster, on_progress)
+        run_study(study, seeds, results, workers or cores(), spread, on_progress)
     except KeyboardInterrupt:
         interrupted = True
     found = tuple(results.found[seed] for seed in seeds if seed in results.found)

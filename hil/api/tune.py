@@ -8,9 +8,10 @@ from pathlib import Path
 import optuna
 
 from hil.studies.spread.cluster import cluster_at
+from hil.studies.spread.trials import judged
 from hil.studies.tune.search import Problem, load_problem
 from hil.studies.tune.taps import FoundTaps, TapsSearch, asks_for_taps, find_taps, write_taps
-from hil.studies.tune.tuning import Best, best, importances, judged, nearest, open_study, search, write_controller
+from hil.studies.tune.tuning import Best, best, importances, nearest, open_study, search, write_controller
 from pkxyz_ctrl.config.files import ConfigError, load
 from pkxyz_ctrl.io.realtime import cores
 
@@ -65,19 +66,19 @@ def tune(
     out: str | Path = "tuned",
     workers: int | None = None,
     seed: int = 1,
-    dask: str | None = None,
-    dask_tls: str | Path | None = None,
+    cluster: str | None = None,
+    cluster_tls: str | Path | None = None,
     storage: str | None = None,
     on_progress: Progress = lambda done, total: None,
 ) -> Tuned:
     """Add trials to a search for a law's weights, with margins as constraints, and write the best controller file.
 
     ``search_file``: a shipped search's name or a TOML file. The study is kept in ``out``/study.db, or the database at
-    the URL ``storage``: called again it goes on. ``workers``: processes, by default as many as cores; ``dask``: address
-    of a cluster's scheduler to work on instead; ``dask_tls``: folder of its certificates, as ``cluster_at`` wants them.
+    the URL ``storage``: called again it goes on. ``workers``: processes, by default as many as cores; ``cluster``:
+    address of a scheduler to work on instead; ``cluster_tls``: folder of its certificates, as ``cluster_at`` wants.
     Raises ``ConfigError``, also for a search of taps.
     """
-    cluster = cluster_at(dask, dask_tls)
+    spread = cluster_at(cluster, cluster_tls)
     if asks_for_taps(str(search_file)):
         raise ConfigError(f"{search_file}: asks for taps, which are found at once, without trials: hil.tune_taps")
     problem = load_problem(str(search_file))
@@ -87,7 +88,7 @@ def tune(
     interrupted = False
     if trials:
         try:
-            search(study, problem, trials, workers or cores(), cluster, on_progress)
+            search(study, problem, trials, workers or cores(), spread, on_progress)
         except KeyboardInterrupt:
             interrupted = True
     found = best(study, problem)

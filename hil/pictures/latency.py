@@ -6,7 +6,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 from matplotlib.axes import Axes
 
-from hil.pictures.style import dress, legend, save, sheet
+from hil.pictures.style import SERIES, dress, legend, save, sheet
 
 if TYPE_CHECKING:
     from hil.studies.latency import Latency
@@ -25,11 +25,12 @@ def draw_latency(measured: "Latency", path: Path) -> None:
 def draw_lateness(plot: Axes, histograms: dict[str, list[int]], x_label: str = "1 + lateness  (µs)") -> None:
     """Histograms by whole microseconds as steps, both axes logarithmic."""
     longest = 1
-    for name, counts in histograms.items():
+    for (name, counts), colour in zip(histograms.items(), SERIES, strict=False):
         filled = [late_us for late_us, count in enumerate(counts) if count]
         if filled:
             longest = max(longest, filled[-1] + 1)
-            plot.step(np.arange(len(counts)) + 1, np.asarray(counts, float), where="mid", linewidth=1.1, label=name)
+            at_us = np.arange(len(counts)) + 1
+            plot.step(at_us, np.asarray(counts, float), where="mid", color=colour, linewidth=1.1, label=name)
     plot.set_xscale("log")
     plot.set_yscale("log")
     plot.set_xlim(1, 1.2 * longest + 1)

@@ -33,8 +33,9 @@ def draw_bode(
             style = {"color": INK, "marker": ".", "ms": 3, "ls": "none", "alpha": 0.7}
             _curves(panels[:, column], measured.response(), column, style)
         panels[0, column].set_title(name if column < 3 else "MIMO: singular values", fontsize=TITLE_PT)
-        bound(panels[2, column], HALF_POWER)
-        bound(panels[2, column], 2.0, style=":")
+        first_hz = 1.05 * nominal.frequency_hz[0]
+        bound(panels[2, column], HALF_POWER, "-3 dB", first_hz)
+        bound(panels[2, column], 2.0, "2", first_hz, style=":")
     frequency = nominal.frequency_hz
     for (row, column), axes in np.ndenumerate(panels):
         axes.set_xscale("log")
@@ -72,7 +73,8 @@ def draw_nyquist(
     path: Path, title: str, nominal: LoopResponse, changed: Sequence[LoopResponse], measured: MeasuredLoop | None
 ) -> None:
     """The loop of each axis about -1; shaded is what a disk margin of 0.6 keeps clear, dashed where |S| is 2."""
-    figure = sheet(12.5, 4.6, f"{title}: loop of an axis, the others closed")
+    key = "shaded: disk margin below 0.6, dashed: |S| above 2"
+    figure = sheet(12.5, 4.6, f"{title}: loop of an axis, the others closed ({key})")
     turn = np.exp(1j * np.linspace(0.0, 2.0 * np.pi, 300))
     edge = -(1.0 + 0.3 * turn) / (1.0 - 0.3 * turn)  # of L that some factor of the disk takes to -1
     for i, axes in enumerate(figure.subplots(1, 3)):

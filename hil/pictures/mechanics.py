@@ -1,4 +1,4 @@
-"""The paper's figures redrawn, and those of the design tools. Lengths in um on every axis."""
+"""The paper's figures redrawn, and those of the design tools. Lengths in µm on every axis."""
 
 import math
 from pathlib import Path

@@ -5,7 +5,7 @@ from pathlib import Path
 
 import numpy as np
 
-from hil.pictures.style import BLUE, VERMILION, dress, save, sheet
+from hil.pictures.style import BLUE, VERMILION, dress, save, sheet, whole_numbers
 from hil.studies.montecarlo import FIGURES, Result, Study
 
 
@@ -19,6 +19,7 @@ def draw_montecarlo(study: Study, results: Sequence[Result], path: Path) -> None
         axes.hist(values, bins=min(40, max(5, len(values) // 5)), color=BLUE)
         words = "Ms" if name == "peak_s" else f"{name.replace('_', ' ').removesuffix(' nm')} ({unit})"
         dress(axes, words, "plants", grid="y")
+        whole_numbers(axes.yaxis)
     held = [r for r in results if r.rms_error_nm is not None]
     sampled = [study.tolerances.sample(r.seed) for r in held]
     errors = [r.rms_error_nm for r in held]

@@ -24,6 +24,7 @@ Array = NDArray[np.float64]
 
 _ENVELOPES = 2500  # more points than the picture has pixels across
 _PATH_POINTS = 6000
+_LEAST_SPAN_UM = 0.2  # of a position's row: its scale has room for two decimals
 _FLAT = 8.0  # an axis whose largest error is this much smaller than another's gets a scale of its own
 
 
@@ -109,6 +110,10 @@ def _draw_position(plot: Axes, signals: Signals, axis: int) -> None:
         _plot_envelope(plot, signals.t_s, low, high, colour, width, label)
     plot.set_ylabel(f"{'xyz'[axis]}  (µm)")
     plot.margins(y=0.14)
+    low_um, high_um = plot.get_ylim()
+    if high_um - low_um < _LEAST_SPAN_UM:  # an axis that stands still: its noise is in the row of its error
+        middle_um = (low_um + high_um) / 2
+        plot.set_ylim(middle_um - _LEAST_SPAN_UM / 2, middle_um + _LEAST_SPAN_UM / 2)
     if axis == 2:
         legend(plot, "lower right", columns=2)
 

@@ -5,8 +5,10 @@ from typing import Any, Literal
 
 from matplotlib import rc_context
 from matplotlib.axes import Axes
+from matplotlib.axis import Axis
 from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
+from matplotlib.ticker import MaxNLocator
 
 # Okabe and Ito's palette, told apart with any colour vision
 BLUE, VERMILION, GREEN = "#0072B2", "#D55E00", "#009E73"
@@ -57,6 +59,11 @@ def dress(plot: Axes, x_label: str = "", y_label: str = "", title: str = "", *, 
     if grid != "":
         plot.grid(True, which="major", axis=grid, color=GRID, linewidth=0.6)
         plot.set_axisbelow(True)
+
+
+def whole_numbers(axis: Axis) -> None:
+    """Ticks at whole numbers alone, for what is counted: half a plant would be a riddle."""
+    axis.set_major_locator(MaxNLocator(integer=True))
 
 
 def dress_space(plot: Any, *labels: str) -> None:

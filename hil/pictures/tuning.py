@@ -6,9 +6,10 @@ import numpy as np
 import optuna
 from matplotlib.axes import Axes
 
-from hil.pictures.style import BLUE, FAINT, VERMILION, dress, legend, save, sheet
+from hil.pictures.style import BLUE, FAINT, VERMILION, dress, legend, save, sheet, whole_numbers
+from hil.studies.spread.trials import judged
 from hil.studies.tune.search import Problem
-from hil.studies.tune.tuning import finished, judged
+from hil.studies.tune.tuning import finished
 
 _WORDS = {
     "rms_error_nm": "rms error while scanning, mean of the plants (nm)",
@@ -23,6 +24,7 @@ def draw_tuning(study: optuna.Study, problem: Problem, importance: dict[str, flo
     plot = figure.subplots()
     _draw_history(plot, study, held, problem.maximise)
     dress(plot, "trial", _WORDS[problem.search.objective])
+    whole_numbers(plot.xaxis)
     save(figure, folder / "history.png")
     if not importance:
         return

@@ -36,9 +36,9 @@ def require_simulated(bus: "BusConfig", command: str) -> None:
         )
 
 
-Dask = Annotated[
+ClusterAddress = Annotated[
     str | None, typer.Option(metavar="ADDRESS", help="Scheduler of a Dask cluster to work on instead: tls://HOST:PORT.")
 ]
-DaskTls = Annotated[
+ClusterTls = Annotated[
     Path | None, typer.Option(metavar="DIR", help="Folder with ca.pem, cert.pem and key.pem for a scheduler at tls://.")
 ]

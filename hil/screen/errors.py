@@ -31,9 +31,9 @@ def one_line_errors() -> Iterator[None]:
 
 
 @contextmanager
-def amplifier_errors(bus: "BusConfig", given: str | None) -> Iterator[None]:
+def amplifier_errors(bus: "BusConfig", named: str | None) -> Iterator[None]:
     """End the command with a line where the amplifier doesn't start (exit code 1, with what to start on this machine,
-    for the bus that was ``given``), and with 128 + signal where somebody asked for the end.
+    for the bus as the user ``named`` it), and with 128 + signal where somebody asked for the end.
     """
     from hil.lanes.ending import Ended
     from pkxyz_ctrl.loop.controller import StartUpError
@@ -42,7 +42,7 @@ def amplifier_errors(bus: "BusConfig", given: str | None) -> Iterator[None]:
         yield
     except StartUpError as error:
         on_this_machine = bus.can is not None and bus.can.interface == "pkxyz-unix"
-        hint = f"; here the amplifier is another process: is `pkxyz plant --bus {given or bus.name}` running?"
+        hint = f"; here the amplifier is another process: is `pkxyz plant --bus {named or bus.name}` running?"
         print(f"pkxyz: {error}{hint if on_this_machine else ''}", file=sys.stderr)
         raise typer.Exit(1) from None
     except Ended as end:

@@ -6,6 +6,7 @@ from typing import TYPE_CHECKING
 
 if TYPE_CHECKING:
     from hil.runs.metrics import RowFigures
+    from hil.runs.summary import LoopFigures
 
 
 def error_lines(rows: "RowFigures", errors_are_of: str) -> Iterator[str]:
@@ -25,6 +26,15 @@ def error_lines(rows: "RowFigures", errors_are_of: str) -> Iterator[str]:
 def lacking_lines(protections: Iterable[str]) -> Iterator[str]:
     """A line for each protection that the amplifier of a run does not give."""
     yield from (f"the amplifier lacks a protection: {words}" for words in protections)
+
+
+def loss_lines(loop: "LoopFigures") -> Iterator[str]:
+    """A line for each kind of frame or row that did not get through at rate, with how many."""
+    from hil.runs.metrics import METRICS
+
+    for name in ("refused_frames", "dropped_frames", "blocked_frames", "lost_rows"):
+        if count := getattr(loop, name):
+            yield f"lost: {count} {METRICS[name].removesuffix(', at rate')}"
 
 
 def where_to_read(faults: Iterable[str]) -> str | None:

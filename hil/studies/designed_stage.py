@@ -6,9 +6,10 @@ import tomlkit
 
 from pkxyz_ctrl.config.files import ConfigError, plain
 from pkxyz_ctrl.config.refused import reason
-from pkxyz_ctrl.mechanics.selection import Requirements, Selection
+from pkxyz_ctrl.config.stage import StageConfig
+from pkxyz_ctrl.mechanics.selection import Requirements
 
-HEAD = "Dimensions selected by `pkxyz design` from requirements: the point of the feasible region"
+HEAD = "Dimensions selected by `pkxyz design` from requirements:"
 
 
 def require_replaceable(path: Path) -> None:
@@ -20,14 +21,14 @@ def require_replaceable(path: Path) -> None:
         raise ConfigError(f"--out: {path}: is no stage file that could be replaced; give another file") from None
 
 
-def write_stage_file(selection: Selection, need: Requirements, path: Path) -> None:
-    """Write ``selection`` so that ``Stage.load(path)`` gives the same device. Raises
-    ``ConfigError`` if it can't be written.
+def write_stage_file(stage: StageConfig, need: Requirements, path: Path, which: str) -> None:
+    """Write ``stage`` so that ``Stage.load(path)`` gives the same device; ``which`` of all that keep the requirements
+    it is. Raises ``ConfigError`` if it can't be written.
     """
-    data = plain(selection.config)
+    data = plain(stage)
     document = tomlkit.document()
     document.add(tomlkit.comment(HEAD))
-    document.add(tomlkit.comment("where the product of the margins is largest."))
+    document.add(tomlkit.comment(f"{which}."))
     document.add("name", data.pop("name"))
     for section, values in data.items():
         table = tomlkit.table()

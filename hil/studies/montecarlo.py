@@ -4,9 +4,8 @@ Plant n is sampled by seed n, which also seeds its noise, so any of them runs ag
 """
 
 import dataclasses
-import json
 import math
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
@@ -19,10 +18,9 @@ from hil.runs.metrics import Metrics
 from hil.runs.scenario import Scenario, resolve
 from hil.studies.margins.loop import Loop
 from hil.studies.spread.cluster import Cluster
-from hil.studies.spread.workers import as_done, with_constant, worker_pool
+from hil.studies.spread.kept import Kept
+from hil.studies.spread.missing import work_out_missing
 from pkxyz_ctrl.config import files as config
-from pkxyz_ctrl.config.files import ConfigError
-from pkxyz_ctrl.config.refused import reason
 from pkxyz_ctrl.design.margins.tolerances import Tolerances
 from pkxyz_ctrl.design.model.loop_plant import Perturbation
 from pkxyz_ctrl.stage import Stage
@@ -30,6 +28,9 @@ from sim.config import PlantConfig
 
 FIGURES = {"rms_error_nm": "nm", "hold_noise_nm": "nm", "peak_s": ""}
 """Figures of a plant that distributions are shown of, with their units. Of axes, the worst one."""
+
+PLANTS_AT_ONCE = 64
+"""That a worker is handed, at most: a second of work."""
 
 
 @dataclass(frozen=True)
@@ -119,37 +120,13 @@ def run_one(study: Study, seed: int) -> Result:
     )
 
 
-class Results:
-    """The file of results: a line of JSON for each plant, after one that says what study it is."""
+class Results(Kept[int, Result]):
+    """The file of results, by the plants' seeds."""
 
     def __init__(self, path: Path, study: Study) -> None:
-        """Read what is there. Raises ``ConfigError`` for another study's file; a line cut off at the end is dropped."""
-        self._path = path
-        self.found: dict[int, Result] = {}
+        """Raises ``ConfigError``, as ``Kept`` does."""
         head = {"digest": study.digest(), "scenario": study.scenario.config.name, "tolerances": study.tolerances.name}
-        try:
-            lines = path.read_text(encoding="utf-8").splitlines(keepends=True) if path.exists() else []
-            complete = [line for line in lines if line.endswith("\n")]
-            if complete and json.loads(complete[0]).get("digest") != head["digest"]:
-                raise ConfigError(
-                    f"{path}: holds results of another study (a file of it has changed since); give another --out"
-                )
-            for line in complete[1:]:
-                result = Result(**json.loads(line))
-                self.found[result.seed] = result
-            path.write_text("".join(complete) or json.dumps(head) + "\n", encoding="utf-8")
-        except (ValueError, TypeError, AttributeError) as error:
-            if isinstance(error, ConfigError):
-                raise
-            raise ConfigError(f"{path}: is not a file of results: {error}; give another --out") from None
-        except OSError as error:
-            raise ConfigError(f"{path}: {reason(error)}; give another --out") from None
-
-    def add(self, result: Result) -> None:
-        """Keep a result, at once."""
-        self.found[result.seed] = result
-        with self._path.open("a", encoding="utf-8") as file:
-            file.write(json.dumps(vars(result), allow_nan=False) + "\n")
+        super().__init__(path, head, lambda result: result.seed, lambda data: Result(**data), vars)
 
 
 def run_study(
@@ -161,19 +138,7 @@ def run_study(
     on_progress: Callable[[int, int], None] = lambda done, total: None,
 ) -> None:
     """Run the seeds that have no result yet. Interrupted, it keeps those that are done."""
-    left = [seed for seed in seeds if seed not in results.found]
-    done = len(seeds) - len(left)
-    on_progress(done, len(seeds))
-    if not left:
-        return
-    with worker_pool(workers, cluster) as (pool, width):
-        for n, (_, result) in enumerate(_all_done(pool, width, study, left), start=1):
-            results.add(result)
-            on_progress(done + n, len(seeds))
-
-
-def _all_done(pool: Any, width: int, study: Study, seeds: list[int]) -> Iterator[tuple[int, Result]]:
-    return as_done(pool, width, with_constant(run_one, study), seeds, ahead=width)
+    work_out_missing(run_one, study, seeds, results, workers, cluster, on_progress, at_once=PLANTS_AT_ONCE)
 
 
 def summary(results: Sequence[Result]) -> dict[str, Any]:

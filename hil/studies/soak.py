@@ -21,7 +21,7 @@ from hil.lanes.blocks import Blocks
 from hil.lanes.lockstep import LockstepRig
 from hil.lanes.setup import Setup
 from hil.recording.recording import Recording, RecordingWriter
-from hil.runs.scenario import load_scenario
+from hil.runs.scenario import Scenario, load_scenario
 from hil.studies.faults.matrix import CASES, NODE_MS
 from hil.studies.faults.outcome import DISCHARGED_V, RISE_V, largest_rise_v, largest_step_v
 from pkxyz_ctrl.safety.modes import MAY_ENERGISE, Mode
@@ -79,6 +79,11 @@ class Soaked:
         return not self.problems
 
 
+def soaked_scenario(law: str) -> Scenario:
+    """The scan that is soaked, under a law of ``configs/controllers`` or of a file. Raises ``ConfigError``."""
+    return load_scenario(SCENARIO, controller=law)
+
+
 def random_faults(duration_s: float, seed: int) -> tuple[Fault, ...]:
     """Faults from power-on to shortly before the end: every kind of the matrix but two."""
     dice = random.Random(seed)
@@ -95,17 +100,19 @@ def random_faults(duration_s: float, seed: int) -> tuple[Fault, ...]:
 def soak(
     duration_s: float,
     seed: int,
-    law: str,
+    scenario: Scenario,
     folder: Path,
     *,
     keep: bool = False,
     rows_each: int = _ROWS_EACH,
     on_progress: Callable[[int, int], None] = lambda done, total: None,
 ) -> Soaked:
-    """Run for ``duration_s`` of stage time, or until Ctrl-C. Raises ``RecordingError`` when the disk fails."""
-    scenario = load_scenario(SCENARIO, controller=law, seed=seed)
+    """Run for ``duration_s`` of stage time, or until Ctrl-C; ``scenario`` names law and device, ``seed`` that of noise
+    and faults. Raises ``RecordingError`` when the disk fails.
+    """
+    law = scenario.controller.name
     setup = dataclasses.replace(
-        scenario.setup(), duration_s=duration_s, clear_s=CLEAR_S, faults=random_faults(duration_s, seed)
+        scenario.setup(), seed=seed, duration_s=duration_s, clear_s=CLEAR_S, faults=random_faults(duration_s, seed)
     )
     rig = LockstepRig(setup)
     soaked = Soaked(seed, law, setup.ticks, faults=len(setup.faults))

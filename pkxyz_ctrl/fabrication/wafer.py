@@ -107,6 +107,13 @@ def sample_devices(process: Process, seed: int, first: int, count: int) -> Sampl
     return whole.take(slice(first - begin * dies, first - begin * dies + count))
 
 
+def sample_numbered(process: Process, seed: int, numbers: NDArray[np.int64]) -> Sampled:
+    """Devices of any numbers (n,), in their order."""
+    dies = dies_per_wafer(process)
+    wafers, at = np.unique(numbers // dies, return_inverse=True)
+    return sample_wafers(process, seed, wafers.tolist()).take(at * dies + numbers % dies)
+
+
 def _of_wafer(seed: int, wafer: int, root: Array) -> tuple[Array, Array, Array, Array]:
     """``Deviates`` of a wafer's dies, sources last."""
     rng = np.random.Generator(np.random.Philox(np.random.SeedSequence(seed, spawn_key=(wafer,))))

@@ -143,6 +143,7 @@ def test_checks_that_do_not_hold_are_exit_code_1_in_a_folder_that_may_be_replace
 
 
 @pytest.mark.slow
+@pytest.mark.at_rate
 def test_ctrl_c_keeps_what_was_recorded(tmp_path):
     path = changed(tmp_path, ("duration_s = 1.1", "duration_s = 3600.0"))
     process = subprocess.Popen(

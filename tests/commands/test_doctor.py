@@ -7,6 +7,8 @@ from command_line import pkxyz
 
 from hil.commands.doctor import adapters, governor, how_many_cores, kernel, python
 
+pytestmark = pytest.mark.at_rate
+
 
 def put(folder, name, text):
     (folder / name).parent.mkdir(parents=True, exist_ok=True)

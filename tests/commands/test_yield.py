@@ -18,7 +18,7 @@ def pkxyz(capsys, monkeypatch, *words):
 
 def test_a_study_leaves_table_summary_and_picture_and_any_device_again(capsys, monkeypatch, tmp_path):
     monkeypatch.chdir(tmp_path)
-    words = ("yield", "--devices", 300, "--loops", 3, "--sensitivity", 64, "--workers", 1, "--json")
+    words = ("yield", "--devices", 300, "--loops", 3, "--sensitivity", 64, "--workers", 1, "--identified", "--json")
     code, shown = pkxyz(capsys, monkeypatch, *words)
     assert (code, shown.err) == (0, "")
     data = json.loads(shown.out)
@@ -27,7 +27,7 @@ def test_a_study_leaves_table_summary_and_picture_and_any_device_again(capsys, m
     assert 0.0 <= data["shares"]["ok"]["low"] <= data["shares"]["ok"]["value"] <= data["shares"]["ok"]["high"]
     assert data["causes"]["total_index_and_error"].keys() == {*data["shares"]}
     assert json.loads((tmp_path / "yield" / "summary.json").read_text()) == data
-    assert data["loops"]["known"]["devices"] == 3
+    assert data["loops"]["known"]["devices"] == data["loops"]["identified"]["devices"] == 3
     left = sorted(p.name for p in (tmp_path / "yield").iterdir())
     assert left == ["devices", "loops", "loops.png", "summary.json", "wafer.png"]
     code, shown = pkxyz(capsys, monkeypatch, "yield", "--alone", 123, "--json")

@@ -9,6 +9,7 @@ from synthetic_rows import START_TICKS, default_scenario, metadata, tracking_row
 from hil.bus.frame_time import frame_duration_ns
 from hil.bus.load_trace import read_bus_trace
 from hil.lanes.lane import Lane
+from hil.pictures import report
 from hil.pictures.report import draw_report, read_signals
 from hil.recording.recording import Recording, RecordingWriter
 from hil.runs.metrics import Metrics, Verdict, bound_words
@@ -72,6 +73,26 @@ def test_a_picture_is_drawn_however_the_run_ended(tmp_path, kept):
     assert width == 1600
     assert 900 <= height <= 1200
     assert summary.ok is (kept == slice(None))
+
+
+@pytest.mark.parametrize("still", [(), (1,), (0, 1, 2)], ids=["raster", "y stands still", "all stand still"])
+def test_no_label_lies_on_the_numbers_of_its_scale(tmp_path, monkeypatch, still):
+    rows, drawn = tracking_rows(), []
+    for axis in still:
+        noise = rows["position_m"][:, axis] - rows["reference_m"][:, axis]
+        rows["reference_m"][:, axis] = rows["reference_m"][-1, axis]
+        rows["position_m"][:, axis] = rows["reference_m"][:, axis] + noise
+    recorded(tmp_path / "r.parquet", rows)
+    monkeypatch.setattr(report, "save", lambda figure, path: drawn.append(figure))
+    draw_report(tmp_path / "r.parquet", None, summary_of(rows), tmp_path / "report.png")
+    drawn[0].canvas.draw()
+    labelled = [plot for plot in drawn[0].axes if plot.get_ylabel() and plot.name == "rectilinear"]
+    assert len(labelled) == 8
+    for plot in labelled:
+        low, high = sorted(plot.get_ylim())
+        numbers = [t.get_window_extent() for t in plot.get_yticklabels() if low <= t.get_position()[1] <= high]
+        label = plot.yaxis.label.get_window_extent()
+        assert label.x1 < min(box.x0 for box in numbers), plot.get_ylabel()
 
 
 def test_bus_load_over_time_is_that_of_the_frames(tmp_path):

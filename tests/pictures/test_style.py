@@ -6,7 +6,8 @@ from pathlib import Path
 
 import pytest
 
-from hil.pictures.style import AXIS, COMB, SERIES, bound, dress, legend, save, sheet
+from hil.pictures.latency import draw_lateness
+from hil.pictures.style import AXIS, COMB, SERIES, bound, dress, legend, save, sheet, whole_numbers
 
 ROOT = Path(__file__).parents[2]
 DRAWING = sorted(
@@ -26,6 +27,9 @@ SHADES = {
 """Colours that mean something in one picture alone: a law's, degrees of lateness, the area under a line, a share half
 way between bad and good.
 """
+
+WRITTEN_TO_PAGES = {"docs/figures/bus_timing.py": 5, "docs/figures/faults.py": 1}
+"""Strings with units that scripts write into tables of the docs, where micro is a u."""
 
 
 def style_of_its_own(source: str) -> list[str]:
@@ -60,9 +64,56 @@ def test_no_picture_has_a_style_of_its_own(path):
     assert len(colours) == SHADES.get(str(path.relative_to(ROOT)), 0), colours
 
 
+def in_plain_letters(source: str) -> list[str]:
+    """Strings with a unit in which micro is a u, or a root is rt; docstrings don't count, since nobody draws them."""
+    tree = ast.parse(source)
+    docstrings = {
+        id(node.body[0].value)
+        for node in ast.walk(tree)
+        if isinstance(node, ast.Module | ast.ClassDef | ast.FunctionDef)
+        and node.body
+        and isinstance(node.body[0], ast.Expr)
+    }
+    return [
+        node.value
+        for node in ast.walk(tree)
+        if isinstance(node, ast.Constant)
+        and isinstance(node.value, str)
+        and id(node) not in docstrings
+        and re.search(r"(?<![\w$])u[mVsgN](?!\w)|rtHz", node.value)
+    ]
+
+
+def test_units_in_plain_letters_are_found():
+    source = (
+        '"""In um."""\ndef f(n):\n    """In us."""\n    g("x (um)", f"{n} us", "nm/rtHz", "µm, V/√Hz, sum, um_of")\n'
+    )
+    assert sorted(in_plain_letters(source)) == [" us", "nm/rtHz", "x (um)"]
+
+
+@pytest.mark.parametrize("path", [*DRAWING, *(ROOT / "docs" / "drawings").glob("*.py")], ids=lambda path: path.name)
+def test_pictures_write_micro_and_roots_as_such(path):
+    """As the glossary says: µm in pictures, um on the screen and in pages."""
+    found = in_plain_letters(path.read_text(encoding="utf-8"))
+    assert len(found) == WRITTEN_TO_PAGES.get(str(path.relative_to(ROOT)), 0), found
+
+
 def test_axes_and_combs_are_never_told_by_the_same_colour():
     assert not set(AXIS) & set(COMB)
     assert len(set(SERIES)) == len(SERIES)
+
+
+def test_what_is_counted_has_whole_numbers_on_its_scale():
+    plot = sheet(4, 3).subplots()
+    plot.plot([0, 1, 2], [0, 2, 1])
+    whole_numbers(plot.yaxis)
+    assert all(tick == round(tick) for tick in plot.get_yticks())
+
+
+def test_histograms_of_lateness_have_the_colours_of_series():
+    plot = sheet(4, 3).subplots()
+    draw_lateness(plot, {"wake-up": [5, 1], "cycle": [0, 4], "other": [1, 1]})
+    assert [line.get_color() for line in plot.get_lines()] == list(SERIES[:3])
 
 
 @pytest.mark.parametrize("kind", ["png", "svg", "pdf"])
@@ -72,7 +123,7 @@ def test_the_same_picture_has_the_same_bytes(tmp_path, kind):
         plot = figure.subplots()
         plot.plot([1, 2], [3, 5], label="line")
         bound(plot, 4.0, "four", 1.0)
-        dress(plot, "x (um)", "y (um)")
+        dress(plot, "x (µm)", "y (µm)")
         legend(plot)
         save(figure, tmp_path / f"{name}.{kind}")
     assert (tmp_path / f"a.{kind}").read_bytes() == (tmp_path / f"b.{kind}").read_bytes()

@@ -34,6 +34,8 @@ from pkxyz_ctrl.design.model.discrete_law import LawError
 from pkxyz_ctrl.design.model.loop_plant import Perturbation, loop_plant
 from pkxyz_ctrl.loop.cycle import MEMORY
 
+pytestmark = pytest.mark.at_rate
+
 ROOT = Path(__file__).parents[2]
 PERIOD_TICKS = 250
 SETTLED_TICKS = 70
@@ -194,7 +196,7 @@ def test_a_loop_is_excited_over_a_bus_to_another_process(tmp_path):
     words = ["margins", "--measured", "--bus", slow, "--controller", patient_law(tmp_path), "--periods", "5", "--json"]
     with served(slow):
         done = subprocess.run(
-            [sys.executable, "-m", "hil", *map(str, words)], cwd=tmp_path, capture_output=True, text=True, timeout=300,
+            [sys.executable, "-m", "hil", *map(str, words)], cwd=tmp_path, capture_output=True, text=True, timeout=1200,
             check=False, env={**os.environ, "PYTHONPATH": str(ROOT)},
         )  # fmt: skip
     assert done.returncode == 0, done.stderr

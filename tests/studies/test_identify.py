@@ -145,7 +145,7 @@ def test_lanes_give_the_same_bits():
 # -- the parts, without a loop --------------------------------------------------------------------------------------
 
 
-@settings(deadline=None, max_examples=30)
+@settings(max_examples=30)
 @given(st.floats(-3.0, 3.0), st.floats(0.5, 20.0), st.floats(-1.0, 1.0), st.integers(0, 2**32 - 1))
 def test_what_drifts_is_no_tone(ramp, seconds, bend, seed):
     """A ramp, a parabola and an exponential of seconds beside tones of 1: the tones stand to 1e-4 of what drifts."""
@@ -185,7 +185,7 @@ def sampled_response(f, hz, damping, shapes_in, shapes_out, lag, period_s, delay
     return c @ np.linalg.solve(z[:, None, None] * np.eye(6) - phi, through) * z[:, None, None] ** -delay_periods
 
 
-@settings(deadline=None, max_examples=4)
+@settings(max_examples=4)
 @given(st.floats(0.0, 0.9), st.floats(0.005, 0.1), st.floats(0.005, 0.08), st.integers(1, 2), st.integers(0, 2**32 - 1))
 def test_the_fit_is_exact_where_there_is_no_noise(lag, split, damping, delay_periods, seed):
     rng = np.random.default_rng(seed)
@@ -237,7 +237,7 @@ def seen_by_an_instrument(gain, origin_m, commanded_m):
     return stage().forward_kinematics(believed / gain) + origin_m
 
 
-@settings(deadline=None, max_examples=50)
+@settings(max_examples=50)
 @given(
     st.lists(st.floats(0.9, 1.1), min_size=3, max_size=3), st.lists(st.floats(-50e-6, 50e-6), min_size=3, max_size=3)
 )

@@ -127,7 +127,7 @@ def test_cases_are_every_change_at_every_point_with_names_that_tell_them_apart()
     assert cases[0].strokes_m == pytest.approx(MIDDLE)
 
 
-@settings(deadline=None, max_examples=200)
+@settings(max_examples=200)
 @given(st.integers(0, 2**32 - 1))
 def test_what_is_sampled_lies_within_the_tolerances_and_is_the_same_again(seed):
     t = wide()

@@ -3,6 +3,8 @@
 import json
 
 import pytest
+from hypothesis import given
+from hypothesis import strategies as st
 from loop_rig import setup
 from typer.testing import CliRunner
 
@@ -10,7 +12,18 @@ from hil.cli import app
 from hil.pictures.montecarlo import draw_montecarlo
 from hil.recording.recording import Recording
 from hil.runs.scenario import load_scenario
-from hil.studies.montecarlo import Result, Results, Study, changed_plant, run_one, run_study, summary, worst
+from hil.studies.montecarlo import (
+    PLANTS_AT_ONCE,
+    Result,
+    Results,
+    Study,
+    changed_plant,
+    run_one,
+    run_study,
+    summary,
+    worst,
+)
+from hil.studies.spread.missing import pieces
 from pkxyz_ctrl.config.files import ConfigError, load
 from pkxyz_ctrl.design.margins.tolerances import Tolerances
 from pkxyz_ctrl.design.model.loop_plant import ParasiticMode, Perturbation
@@ -60,6 +73,14 @@ def test_electronics_and_modes_that_were_sampled_are_simulated():
     assert lab.flexible_modes == setup("lab").plant.flexible_modes
     assert lab.sense_bandwidth == setup("lab").plant.sense_bandwidth
     assert lab.sense_delay.delay_s == pytest.approx(40e-6)
+
+
+@given(st.integers(1, 5000), st.integers(1, 40))
+def test_pieces_are_all_plants_once_and_several_for_each_worker(plants, workers):
+    handed = pieces(range(plants), workers, PLANTS_AT_ONCE)
+    assert [seed for piece in handed for seed in piece] == list(range(plants))
+    assert max(map(len, handed)) <= PLANTS_AT_ONCE
+    assert len(handed) >= min(plants, 4 * workers)
 
 
 def test_a_study_goes_on_where_it_was_and_every_plant_runs_again_to_the_bit(tmp_path):

@@ -6,18 +6,19 @@ import pytest
 from hil.bus.endpoint import Endpoint
 from hil.faults.catalogue import KINDS
 from hil.faults.fault import parse
+from hil.lanes.lockstep import LockstepRig
 from hil.node.amplifier import AmplifierNode
 from hil.node.drive import DriveReceiver
 from hil.recording.recording import Recording
 from hil.runs.scenario import load_scenario
 from hil.studies.faults.outcome import RISE_V
-from hil.studies.soak import random_faults, soak
+from hil.studies.soak import random_faults, soak, soaked_scenario
 
 
 @pytest.fixture(scope="module")
 def soaked(tmp_path_factory):
     folder = tmp_path_factory.mktemp("soak")
-    return soak(5.0, 3, "lqg", folder, keep=True, rows_each=8192), folder
+    return soak(5.0, 3, soaked_scenario("lqg"), folder, keep=True, rows_each=8192), folder
 
 
 def test_nothing_is_lost_and_nothing_breaks(soaked):
@@ -84,7 +85,7 @@ def test_no_voltage_of_before_follows_a_blocked_bus(tmp_path, monkeypatch, missi
         monkeypatch.setattr(Endpoint, "flush", lambda self: None)
     if missing == "the node's part":
         monkeypatch.setattr(DriveReceiver, "demand_zero", lambda self: None)
-    found = soak(3.2, 1, "lqg", tmp_path)
+    found = soak(3.2, 1, soaked_scenario("lqg"), tmp_path)
     assert found.decisions >= 3
     assert found.problems == []
     assert 135.0 < found.voltage_max_v < 145.0
@@ -119,7 +120,8 @@ def applied_as_shipped(self, counts, t_us):
 def test_a_soak_sees_what_a_node_does_that_it_must_not(tmp_path, monkeypatch, part, defect, words):
     """Its verdicts are no wider than the limits: each of these passed while an amplifier's offset was allowed for."""
     monkeypatch.setattr(AmplifierNode, part, defect)
+    monkeypatch.setattr(LockstepRig, "_stretches", lambda *_: None)  # which call the node's compiled rules
     monkeypatch.setattr("hil.studies.soak.random_faults", lambda *_: (parse("bus.sync:drop@0.3"),))
     monkeypatch.setattr("hil.studies.soak.CLEAR_S", 10.0)
-    found = soak(0.5, 1, "lqg", tmp_path)
+    found = soak(0.5, 1, soaked_scenario("lqg"), tmp_path)
     assert any(words in problem for problem in found.problems), found.problems

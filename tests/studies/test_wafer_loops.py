@@ -16,7 +16,7 @@ from hil.studies.wafer.study import WaferStudy
 from pkxyz_ctrl.config.bound import Bound
 from pkxyz_ctrl.config.files import ConfigError
 from pkxyz_ctrl.fabrication.statics import pose, pose_of_strokes
-from pkxyz_ctrl.fabrication.wafer import dies_per_wafer
+from pkxyz_ctrl.fabrication.wafer import dies_per_wafer, sample_devices, sample_numbered
 from pkxyz_ctrl.stage import Stage
 from sim.parameters import rest_stiffness
 
@@ -103,6 +103,16 @@ def test_a_part_is_its_devices_one_on_each_wafer():
     assert all(part[name][3] == value for name, value in alone.items())
     assert set(asked.verdict_columns) <= part.keys()
     assert part["ok.shipped"].dtype == bool
+
+
+def test_devices_at_once_are_the_same_to_the_bit_as_each_alone():
+    asked = loops(known=False).wafers
+    numbers = np.array([7, 3, 4, 5000, 5001, 2])
+    some = asked.made(sample_numbered(asked.process, asked.seed, numbers))
+    for n, number in enumerate(numbers.tolist()):
+        alone = asked.made(sample_devices(asked.process, asked.seed, number, 1))
+        for name, values in vars(alone).items():
+            assert np.array_equal(vars(some.take(np.array([n])))[name], values), name
 
 
 def test_a_requirement_on_a_loop_that_is_none_is_refused():

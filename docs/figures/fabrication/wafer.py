@@ -28,7 +28,7 @@ def main() -> None:
     columns = study.columns(range(WAFERS))
     shares = {name.removeprefix("ok."): share_of(columns[name], columns["wafer"]) for name in study.requirement_columns}
     draw_wafer(process, columns, shares, causes(study, 4096), FOLDER / "wafer.png")
-    asked = ClosedLoops(study, load_scenario("raster"), True)
+    asked = ClosedLoops(study, load_scenario("raster"), known=True, identified=True)
     parts = [asked.part(number) for number in range(LOOPS // PART_DEVICES)]
     rows = {name: np.concatenate([part[name] for part in parts]) for name in parts[0]}
     shares = {name.removeprefix("ok."): share_of(rows[name], rows["device"]) for name in asked.verdict_columns}

@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 import typer
 
 from hil.lanes.lane import Lane
-from hil.screen.choices import Dask, DaskTls
+from hil.screen.choices import ClusterAddress, ClusterTls
 from hil.screen.first_run import say_if_compiling
 from hil.screen.outputs import folder_to_write
 from hil.screen.progress import progress_bar
@@ -29,8 +29,8 @@ def montecarlo(
     plant: Annotated[str | None, typer.Option(help="Name or file of the plant that is changed.")] = None,
     bus: Annotated[str | None, typer.Option(help="Name or file, instead of the scenario's.")] = None,
     workers: Annotated[int | None, typer.Option(min=1, help="Processes; default: as many as cores.")] = None,
-    dask: Dask = None,
-    dask_tls: DaskTls = None,
+    cluster: ClusterAddress = None,
+    cluster_tls: ClusterTls = None,
     alone: Annotated[
         int | None, typer.Option(metavar="SEED", min=0, help="Run this plant alone, with a recording and a report.")
     ] = None,
@@ -54,8 +54,8 @@ def montecarlo(
     say_if_compiling(quiet=as_json)
     with progress_bar("plants", quiet=as_json) as tell:
         found = sampled_plants(
-            loaded, plants=plants, first_seed=seed, tolerances=tolerances, out=out, workers=workers, dask=dask,
-            dask_tls=dask_tls, on_progress=tell,
+            loaded, plants=plants, first_seed=seed, tolerances=tolerances, out=out, workers=workers, cluster=cluster,
+            cluster_tls=cluster_tls, on_progress=tell,
         )  # fmt: skip
     data = found.summary | {
         "controller": loaded.controller.name, "scenario": loaded.config.name, "tolerances": tolerances,

@@ -4,23 +4,36 @@ import json
 import shutil
 import tempfile
 from pathlib import Path
-from typing import Annotated
+from typing import TYPE_CHECKING, Annotated, NoReturn
 
 import typer
 
+from hil.screen.choices import ClusterAddress, ClusterTls
 from hil.screen.first_run import say_if_compiling
 from hil.screen.outputs import folder_to_write, writing
 from hil.screen.progress import progress_bar
 from hil.screen.terminal import bad, say
 from pkxyz_ctrl.config.files import ConfigError
+from pkxyz_ctrl.io.realtime import cores
+
+if TYPE_CHECKING:
+    from hil.studies.soak import Soaked
+    from hil.studies.spread.cluster import Cluster
 
 
 def soak(
     minutes: Annotated[float, typer.Option(help="Of stage time.", min=0.01, max=600)] = 30.0,
     seed: Annotated[int, typer.Option(help="Of noise and faults.", min=0)] = 1,
+    runs: Annotated[
+        int,
+        typer.Option(min=1, help="With the seeds from --seed on; several are kept in --out, called again it goes on."),
+    ] = 1,
     law: Annotated[str, typer.Option(help="A controller's name or file.")] = "lqg",
+    workers: Annotated[int, typer.Option(help="Processes for several runs; 0: one for each core.", min=0)] = 0,
+    cluster: ClusterAddress = None,
+    cluster_tls: ClusterTls = None,
     out: Annotated[
-        Path | None, typer.Option(help="Folder for soak.json, soak.png and, with --keep, recordings.")
+        Path | None, typer.Option(help="Folder for soak.json, soak.png and, with --keep, recordings; or soaks.jsonl.")
     ] = None,
     keep: Annotated[bool, typer.Option("--keep", help="Keep the recordings, 100 MB a minute.")] = False,
     as_json: Annotated[bool, typer.Option("--json", help="Print JSON, and nothing else.")] = False,
@@ -29,17 +42,35 @@ def soak(
 
     Exit code 0 if not, 1 if so, 2 for bad input. Some minutes for half an hour.
     """
-    from hil.recording.recording import RecordingError
-    from hil.studies import soak as soaking
+    from hil.studies.soak import as_json as plain
+    from hil.studies.spread.cluster import cluster_at
 
     if keep and out is None:
         raise ConfigError("--keep: needs --out, the folder to keep the recordings in")
-    folder = _folder(out)
+    if runs > 1 or cluster is not None:
+        if keep:
+            raise ConfigError("--keep: of one run only; --seed says which")
+        _several(60.0 * minutes, range(seed, seed + runs), law, workers, cluster_at(cluster, cluster_tls), out, as_json)
+    soaked = _soaked(60.0 * minutes, seed, law, out, keep, as_json)
+    if as_json:
+        print(json.dumps(plain(soaked)))
+    else:
+        _tell(soaked)
+    raise typer.Exit(130 if soaked.interrupted else 0 if soaked.ok else 1)
+
+
+def _soaked(duration_s: float, seed: int, law: str, out: Path | None, keep: bool, as_json: bool) -> "Soaked":
+    """One run, with what is to be kept of it."""
+    from hil.recording.recording import RecordingError
+    from hil.studies import soak as soaking
+
+    scenario = soaking.soaked_scenario(law)
+    folder = Path(tempfile.mkdtemp(prefix="pkxyz-soak-")) if out is None else folder_to_write(out)
     say_if_compiling(quiet=as_json)
     try:
         with writing(folder):
             with progress_bar("soak", quiet=as_json) as tell:
-                soaked = soaking.soak(60.0 * minutes, seed, law, folder, keep=keep, on_progress=tell)
+                soaked = soaking.soak(duration_s, seed, scenario, folder, keep=keep, on_progress=tell)
             if out is not None:
                 from hil.pictures.faults import draw_soak
 
@@ -51,26 +82,49 @@ def soak(
     finally:
         if out is None:
             shutil.rmtree(folder, ignore_errors=True)
+    return soaked
+
+
+def _tell(soaked: "Soaked") -> None:
+    until = " until interrupted" if soaked.interrupted else ""
+    say(
+        f"{soaked.ticks} ticks{until}, {soaked.realtime_factor:.1f} times real time; {soaked.faults} faults, "
+        f"{soaked.decisions} decisions, {soaked.returns} times back to tracking",
+    )
+    say(
+        f"{soaked.recorded_ticks} ticks read back from the recordings; memory {soaked.memory_mb[0]:.0f} to "
+        f"{soaked.memory_mb[-1]:.0f} MB; at most {soaked.voltage_max_v:.1f} V, and {soaked.slew_max_v:.1f} V up "
+        "in a tick",
+    )
+    say("reasons: " + ", ".join(f"{name} {count}" for name, count in soaked.reasons.items()))
+    for problem in soaked.problems:
+        say(bad(problem))
+
+
+def _several(
+    duration_s: float, seeds: range, law: str, workers: int, cluster: "Cluster | None", out: Path | None, as_json: bool
+) -> NoReturn:
+    """Runs that are kept as they come."""
+    from hil.studies.soak import soaked_scenario
+    from hil.studies.soaks import KeptSoaks, soak_each, totals
+
+    asked = soaked_scenario(law), duration_s
+    folder = folder_to_write(out or Path("soaks"))
+    kept = KeptSoaks(folder / "soaks.jsonl", asked)
+    say_if_compiling(quiet=as_json)
+    with progress_bar("soaks", quiet=as_json) as tell:
+        soaks = soak_each(asked, seeds, workers or cores(), kept, cluster, tell)
+    found = totals(soaks) | {"law": law, "minutes_each": duration_s / 60.0, "interrupted": len(soaks) < len(seeds)}
+    (folder / "soak.json").write_text(json.dumps(found, indent=1) + "\n", encoding="utf-8")
     if as_json:
-        print(json.dumps(soaking.as_json(soaked)))
+        print(json.dumps(found))
     else:
-        until = " until interrupted" if soaked.interrupted else ""
         say(
-            f"{soaked.ticks} ticks{until}, {soaked.realtime_factor:.1f} times real time; {soaked.faults} faults, "
-            f"{soaked.decisions} decisions, {soaked.returns} times back to tracking",
+            f"{found['soaks']} of {len(seeds)} soaks, {found['ticks']} ticks, {found['recorded_ticks']} read back; "
+            f"{found['faults']} faults, {found['decisions']} decisions, {found['returns']} times back to tracking; at "
+            f"most {found['voltage_max_v']:.1f} V, and {found['slew_max_v']:.1f} V up in a tick"
         )
-        say(
-            f"{soaked.recorded_ticks} ticks read back from the recordings; memory {soaked.memory_mb[0]:.0f} to "
-            f"{soaked.memory_mb[-1]:.0f} MB; at most {soaked.voltage_max_v:.1f} V, and {soaked.slew_max_v:.1f} V up "
-            "in a tick",
-        )
-        say("reasons: " + ", ".join(f"{name} {count}" for name, count in soaked.reasons.items()))
-        for problem in soaked.problems:
-            say(bad(problem))
-    raise typer.Exit(130 if soaked.interrupted else 0 if soaked.ok else 1)
-
-
-def _folder(out: Path | None) -> Path:
-    if out is None:
-        return Path(tempfile.mkdtemp(prefix="pkxyz-soak-"))
-    return folder_to_write(out)
+        say("reasons: " + ", ".join(f"{name} {count}" for name, count in found["reasons"].items()))
+        for seed, problems in found["problems"].items():
+            say(bad(f"seed {seed}: {'; '.join(problems)}"))
+    raise typer.Exit(130 if found["interrupted"] else 0 if found["ok"] else 1)

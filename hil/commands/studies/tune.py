@@ -6,7 +6,7 @@ from typing import Annotated
 
 import typer
 
-from hil.screen.choices import Dask, DaskTls
+from hil.screen.choices import ClusterAddress, ClusterTls
 from hil.screen.first_run import say_if_compiling
 from hil.screen.outputs import folder_to_write
 from hil.screen.progress import progress_bar
@@ -18,8 +18,8 @@ def tune(
     search: Annotated[str, typer.Argument(help="A shipped search's name or a TOML file.")] = "lqg",
     trials: Annotated[int, typer.Option(min=0, help="How many to add to the study; 0 only shows it.")] = 100,
     workers: Annotated[int | None, typer.Option(min=1, help="Processes; default: as many as cores.")] = None,
-    dask: Dask = None,
-    dask_tls: DaskTls = None,
+    cluster: ClusterAddress = None,
+    cluster_tls: ClusterTls = None,
     storage: Annotated[
         str | None, typer.Option(metavar="URL", help="Database of the study; default: study.db in the folder.")
     ] = None,
@@ -51,7 +51,8 @@ def tune(
     say_if_compiling(quiet=as_json)
     with progress_bar(search, quiet=as_json) as tell:
         tuned = search_on(
-            search, trials=trials, out=out, workers=workers, seed=seed, dask=dask, dask_tls=dask_tls, storage=storage,
+            search, trials=trials, out=out, workers=workers, seed=seed, cluster=cluster,
+            cluster_tls=cluster_tls, storage=storage,
             on_progress=tell,
         )  # fmt: skip
     problem, found = tuned.problem, tuned.best

@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
-from hil.screen.choices import Dask, DaskTls
+from hil.screen.choices import ClusterAddress, ClusterTls
 from hil.screen.first_run import say_if_compiling
 from hil.screen.outputs import folder_to_write, writing
 from hil.screen.progress import progress_bar
@@ -35,11 +35,14 @@ def wafer_yield(
     scenario: Annotated[str, typer.Option(help="Name or file of what is run in the loop.")] = "raster",
     controller: Annotated[str | None, typer.Option(help="Name or file, instead of the scenario's.")] = None,
     known: Annotated[
-        bool, typer.Option("--known/--shipped", help="Also under a law for what an identification would find, or not.")
+        bool, typer.Option("--known/--shipped", help="Also under a law for the device as it is, or not.")
     ] = True,
+    identified: Annotated[
+        bool, typer.Option("--identified", help="Also under laws for what `pkxyz identify` finds of the device.")
+    ] = False,
     workers: Annotated[int | None, typer.Option(min=1, help="Processes; default: as many as cores.")] = None,
-    dask: Dask = None,
-    dask_tls: DaskTls = None,
+    cluster: ClusterAddress = None,
+    cluster_tls: ClusterTls = None,
     alone: Annotated[int | None, typer.Option(metavar="NUMBER", min=0, help="This device alone.")] = None,
     out: Annotated[
         Path, typer.Option(help="Folder for devices/ and loops/ (Parquet), summary.json and pictures.")
@@ -60,15 +63,15 @@ def wafer_yield(
     from pkxyz_ctrl.io.realtime import cores
 
     study = WaferStudy(load("processes", process, Process), load("stages", stage, StageConfig), seed)
-    closed = ClosedLoops(study, load_scenario(scenario, stage=stage, controller=controller), known)
+    closed = ClosedLoops(study, load_scenario(scenario, stage=stage, controller=controller), known, identified)
     if alone is not None:
         _alone({**(closed.device(alone) if loops else {}), **study.alone(alone)}, as_json=as_json)
         return
-    cluster = cluster_at(dask, dask_tls)
+    spread = cluster_at(cluster, cluster_tls)
     folder_to_write(out)
     if loops:
         say_if_compiling(quiet=as_json)
-    asked = _Asked(closed, devices, loops, sensitivity, workers or cores(), cluster, out, as_json)
+    asked = _Asked(closed, devices, loops, sensitivity, workers or cores(), spread, out, as_json)
     with writing(out):
         data = asked.worked()
     if as_json:
@@ -105,6 +108,8 @@ class _Asked:
             with progress_bar("devices", quiet=self.quiet) as tell:
                 run_study(study, parts_for(study.process, self.devices), table, self.workers, self.cluster, tell)
             if loops is not None:
+                if self.closed.identified:
+                    _ = self.closed.mean_modes  # once here, not in each worker
                 with progress_bar("loops", quiet=self.quiet) as tell:
                     run_study(self.closed, -(-self.loops // PART_DEVICES), loops, self.workers, self.cluster, tell)
             if self.sensitivity:
@@ -151,7 +156,11 @@ def _show(data: dict[str, Any]) -> None:
     print_whole(table)
     if data["loops"]:
         devices = next(iter(data["loops"].values()))["devices"]
-        say(f"in a closed loop, {devices} devices; as shipped, and with the law for the device as it is (known):")
+        say(f"in a closed loop, {devices} devices, each law designed for: the drawing (shipped), the device (known)")
+        if "identified.peak_s" in data["loops"]:
+            say(
+                "or what `pkxyz identify` finds of it from inside (identified), with an instrument outside (instrument)"
+            )
         table = plain_table("requirement", "met", "95 %", left=("95 %",))
         for name, share in data["loops"].items():
             words = name if "." in name else f"{name}, all of them and the device's own"

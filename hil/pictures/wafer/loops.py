@@ -1,4 +1,4 @@
-"""Sampled devices in a closed loop: what the shipped law makes of them, and one that knows the device."""
+"""Sampled devices in a closed loop: what the shipped law makes of them, and laws that know the device."""
 
 from collections.abc import Mapping
 from pathlib import Path
@@ -8,14 +8,19 @@ import numpy as np
 from matplotlib.axes import Axes
 from numpy.typing import NDArray
 
-from hil.pictures.style import BLUE, GREEN, bound, dress, legend, save, sheet
+from hil.pictures.style import BLUE, GREEN, ORANGE, VERMILION, bound, dress, save, sheet
 from hil.studies.wafer.closed_loop import ClosedLoops
 from hil.studies.wafer.shares import Share
 
 Columns = Mapping[str, NDArray[Any]]
 
-_COLOURS = {"shipped": BLUE, "known": GREEN}
-_LEGEND = {"shipped": "law as shipped", "known": "law for the device as it is"}
+_COLOURS = {"shipped": BLUE, "identified": ORANGE, "instrument": VERMILION, "known": GREEN}
+_LEGEND = {
+    "shipped": "law as shipped",
+    "identified": "as identified",
+    "instrument": "and with an instrument",
+    "known": "law for the device as it is",
+}
 _PANELS = {
     "peak_s": "Ms in the middle of the strokes",
     "error_about_mean_nm": "RMS error about its mean (nm)",
@@ -41,7 +46,9 @@ def draw_loops(asked: ClosedLoops, columns: Columns, shares: Mapping[str, Share]
         plot.set_xscale("linear" if key == "peak_s" else "log")
         plot.set_ylim(0.0, 101.0)
         dress(plot, words, "devices at most there (%)")
-    legend(panels[0], "lower right")
+    figure.legend(
+        *panels[0].get_legend_handles_labels(), frameon=False, loc="outside lower center", ncols=len(asked.laws)
+    )
     _over_height(panels[3], asked, columns)
     save(figure, path)
 
@@ -58,4 +65,4 @@ def _over_height(plot: Axes, asked: ClosedLoops, columns: Columns) -> None:
         plot.plot(1e6 * columns["handle_m"], error, ".", ms=5, color=_COLOURS[law], alpha=0.8)
     bound(plot, 5.0, "5 nm", float(1e6 * columns["handle_m"].min()))
     plot.set_yscale("log")
-    dress(plot, "handle thicker than drawn (um)", "RMS error (nm)")
+    dress(plot, "handle thicker than drawn (µm)", "RMS error (nm)")

@@ -32,7 +32,7 @@ Columns = Mapping[str, NDArray[Any]]
 
 _SHARE = LinearSegmentedColormap.from_list("share", [BAD, "#f2e6c9", GOOD])
 _SHADE = LinearSegmentedColormap.from_list("index", ["white", BLUE])
-_WORDS = {
+SOURCE_WORDS = {
     "layer_1_m": "layer 1 thickness", "layer_2_m": "layer 2 thickness", "handle_m": "handle thickness",
     "wafer_bow_m": "wafer bow", "etch_bias_m": "etch bias", "sidewall_rad": "sidewall lean", "comb_gap_m": "comb gap",
     "hinge_m": "hinge thickness", "alignment_x_m": "alignment x", "alignment_y_m": "alignment y",
@@ -42,7 +42,7 @@ _WORDS = {
     "top_v": "voltage of the top corner", "pull_in_m": "pull-in stroke", "snap_v": "snap voltage",
     "held_m": "strokes held", "comb_unlike": "combs unlike", "place": "place on the wafer", ALL: "all met",
 }  # fmt: skip
-_SCALES = {"_hz": (1.0, "Hz"), "_m": (1e6, "um"), "_v": (1.0, "V"), "quality_factor": (1.0, "")}
+_SCALES = {"_hz": (1.0, "Hz"), "_m": (1e6, "µm"), "_v": (1.0, "V"), "quality_factor": (1.0, "")}
 """How a figure is shown, by the end of its name; any other is relative, in per cent."""
 
 
@@ -149,8 +149,8 @@ def _heat(plot: Axes, found: Causes) -> None:
 
 
 def _words(name: str) -> str:
-    if name in _WORDS:
-        return _WORDS[name]
+    if name in SOURCE_WORDS:
+        return SOURCE_WORDS[name]
     return next((name.removesuffix(end) for end in ("_hz", "_m", "_v") if name.endswith(end)), name).replace("_", " ")
 
 

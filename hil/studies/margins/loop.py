@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 
 from hil.studies.margins.measured import MeasuredLoop
 from pkxyz_ctrl.config.bus import BusConfig
-from pkxyz_ctrl.design.law_about import law_about
+from pkxyz_ctrl.design.law_about import law_about, law_in_parts
 from pkxyz_ctrl.design.margins.margins import LoopResponse, Margins, loop_response, margins, peak_sensitivity
 from pkxyz_ctrl.design.margins.tolerances import Case
 from pkxyz_ctrl.design.model.loop_plant import NOMINAL, Perturbation, loop_plant
@@ -40,7 +40,7 @@ class Loop:
     def peak_sensitivity(self, case: Case) -> float:
         """Ms of the MIMO system for one case; infinite where it is unstable."""
         plant = loop_plant(self.stage, self.bus, case.strokes_m, case.perturbation)
-        return peak_sensitivity(plant, law_about(self.stage, self.law, case.strokes_m, case.perturbation))
+        return peak_sensitivity(plant, law_in_parts(self.stage, self.law, case.strokes_m, case.perturbation))
 
     def response(self, strokes_m: Array, frequency_hz: Array, perturbation: Perturbation = NOMINAL) -> LoopResponse:
         """L, S and T at frequencies (m,)."""

@@ -10,7 +10,7 @@ from urllib.parse import urlsplit
 from pkxyz_ctrl.config.files import ConfigError
 
 CERTIFICATES: Mapping[str, str] = {"tls_ca_file": "ca.pem", "tls_client_cert": "cert.pem", "tls_client_key": "key.pem"}
-"""Files of ``--dask-tls`` by what ``distributed.Security`` calls them."""
+"""Files of ``--cluster-tls`` by what ``distributed.Security`` calls them."""
 
 
 @dataclass(frozen=True)
@@ -32,27 +32,27 @@ class Cluster:
 
 
 def cluster_at(address: str | None, certificates: str | Path | None) -> Cluster | None:
-    """The cluster of ``--dask`` and ``--dask-tls``; None without an address.
+    """The cluster of ``--cluster`` and ``--cluster-tls``; None without an address.
 
     Raises ``ConfigError`` for one on another machine without TLS, and for certificates that are not there.
     """
     if address is None:
         if certificates is not None:
-            raise ConfigError("--dask-tls is for a scheduler: give its address with --dask tls://HOST:PORT")
+            raise ConfigError("--cluster-tls is for a scheduler: give its address with --cluster tls://HOST:PORT")
         return None
     is_encrypted = address.startswith("tls://")
     if is_encrypted and certificates is None:
-        raise ConfigError(f"--dask {address}: give the folder of its certificates with --dask-tls")
+        raise ConfigError(f"--cluster {address}: give the folder of its certificates with --cluster-tls")
     if certificates is not None and not is_encrypted:
-        raise ConfigError(f"--dask {address} does not ask for TLS: say tls:// where --dask-tls has certificates")
+        raise ConfigError(f"--cluster {address} does not ask for TLS: say tls:// where --cluster-tls has certificates")
     if not is_encrypted and not _is_this_machine(address):
         raise ConfigError(
-            f"--dask {address}: what crosses to another machine runs code here and there, so it needs TLS: start "
-            "scheduler and workers with certificates, and give tls://HOST:PORT and --dask-tls"
+            f"--cluster {address}: what crosses to another machine runs code here and there, so it needs TLS: start "
+            "scheduler and workers with certificates, and give tls://HOST:PORT and --cluster-tls"
         )
     for file in CERTIFICATES.values() if certificates is not None else ():
         if not (Path(certificates or "") / file).is_file():
-            raise ConfigError(f"--dask-tls: {certificates}: has no {file}")
+            raise ConfigError(f"--cluster-tls: {certificates}: has no {file}")
     return Cluster(address, None if certificates is None else Path(certificates))
 
 

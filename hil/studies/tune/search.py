@@ -20,7 +20,7 @@ from pkxyz_ctrl.config.controller import ControllerConfig
 from pkxyz_ctrl.config.files import ConfigError, FrozenModel
 from pkxyz_ctrl.design.hold_noise import hold_noise_m
 from pkxyz_ctrl.design.law import design_law
-from pkxyz_ctrl.design.law_about import law_about
+from pkxyz_ctrl.design.law_about import law_about, law_in_parts
 from pkxyz_ctrl.design.margins.margins import margins, peak_sensitivity
 from pkxyz_ctrl.design.margins.tolerances import Case, Tolerances
 from pkxyz_ctrl.design.model.design_error import DesignError
@@ -202,7 +202,7 @@ def _computed(search: SearchConfig, stage: Stage, bus: BusConfig, controller: Co
         return max(
             peak_sensitivity(
                 loop_plant(stage, bus, case.strokes_m, case.perturbation),
-                law_about(stage, law, case.strokes_m, case.perturbation),
+                law_in_parts(stage, law, case.strokes_m, case.perturbation),
             )
             for case in cases
         )

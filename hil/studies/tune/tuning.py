@@ -2,9 +2,6 @@
 database, so it can be continued, and shared by several machines.
 """
 
-import importlib.metadata
-import logging
-import warnings
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 from pathlib import Path
@@ -15,6 +12,7 @@ import optuna
 import tomlkit
 
 from hil.studies.spread.cluster import Cluster
+from hil.studies.spread.trials import stored_study, tell
 from hil.studies.spread.workers import as_done, with_constant, worker_pool
 from hil.studies.tune.search import Evaluation, Problem, evaluate, put
 from pkxyz_ctrl.config.files import ConfigError
@@ -39,29 +37,15 @@ def open_study(problem: Problem, storage: str, seed: int) -> optuna.Study:
     """The study of a problem in a database, made anew or continued. Raises ``ConfigError`` for a database that can't
     be had, and for a study of the same name with another problem.
     """
-    optuna.logging.set_verbosity(logging.WARNING)
-    warnings.filterwarnings("ignore", category=optuna.exceptions.ExperimentalWarning)
-    try:
-        study = optuna.create_study(
-            study_name=problem.search.name,
-            storage=storage,
-            direction="maximize" if problem.maximise else "minimize",
-            load_if_exists=True,
-        )
-        study.sampler = _sampler(seed, len(study.get_trials(deepcopy=False)))
-        digest = study.user_attrs.get("digest")
-        if digest is None:
-            study.set_user_attr("digest", problem.digest())
-            study.set_user_attr("version", importlib.metadata.version("pkxyz-ctrl"))
-            study.enqueue_trial(problem.start())
-    except Exception as error:  # SQLAlchemy's, the driver's and Optuna's own have nothing in common
-        line = (str(error).splitlines() or [type(error).__name__])[0]
-        raise ConfigError(f"--storage: {storage}: {line}; give the URL of a database that can be written") from None
-    if digest not in (None, problem.digest()):
-        raise ConfigError(
-            f"--storage: {storage}: its study {problem.search.name!r} is of another problem (the search file or a "
-            "file that it names has changed since); give another --storage, or another name in the search file"
-        )
+    study = stored_study(
+        problem.search.name,
+        storage,
+        problem.digest(),
+        [problem.start()],
+        maximise=problem.maximise,
+        asked=f"--storage: {storage}",
+    )
+    study.sampler = _sampler(seed, len(study.get_trials(deepcopy=False)))
     return study
 
 
@@ -94,7 +78,7 @@ def search(
         with worker_pool(workers, cluster) as (pool, width):
             valued = as_done(pool, width, with_constant(_valued, problem), choices())
             for done, ((number, _), evaluation) in enumerate(valued, start=1):
-                _tell(study, asked.pop(number), evaluation)
+                tell(study, asked.pop(number), evaluation)
                 on_progress(done, trials)
     finally:
         for trial in asked.values():
@@ -117,19 +101,6 @@ def rounded(value: float) -> float:
     return float(f"{value:.{_DIGITS - 1}e}")
 
 
-def _tell(study: optuna.Study, trial: optuna.Trial, evaluation: Evaluation) -> None:
-    for name, beyond in evaluation.constraints.items():
-        trial.set_constraint(name, beyond)
-    for name, value in evaluation.figures.items():
-        trial.set_user_attr(name, value if np.isfinite(value) else None)
-    if evaluation.reason:
-        trial.set_user_attr("reason", evaluation.reason)
-    if evaluation.value is None:
-        study.tell(trial, state=_STATE.PRUNED)
-    else:
-        study.tell(trial, evaluation.value)
-
-
 def best(study: optuna.Study, problem: Problem) -> Best | None:
     """None as long as no trial keeps every constraint."""
     kept = [t for t in study.get_trials(deepcopy=False) if t.state == _STATE.COMPLETE and _keeps(t)]
@@ -144,11 +115,6 @@ def best(study: optuna.Study, problem: Problem) -> Best | None:
 
 def _keeps(trial: Any) -> bool:
     return all(beyond <= 0.0 for beyond in trial.constraints.values())
-
-
-def judged(study: optuna.Study) -> list[optuna.trial.FrozenTrial]:
-    """Trials that came to a verdict: neither failed nor waiting."""
-    return [t for t in study.get_trials(deepcopy=False) if t.state in (_STATE.COMPLETE, _STATE.PRUNED)]
 
 
 def nearest(study: optuna.Study) -> dict[str, float]:

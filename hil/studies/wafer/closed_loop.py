@@ -1,14 +1,18 @@
 """Sampled devices in a closed loop: margins, and the error of a scenario on the fast lane.
 
 Device k of this part lies on wafer k, so that the devices are independent of each other. Each is run under the law as
-shipped, which knows the drawing only, and if asked also under the law designed for what an identification without
-error would find: springs, combs, sense combs and damping of this device, by the drawing's mass. Links are taken to be
-alike (their mean), which the plant's mechanism has them.
+shipped, which knows the drawing only, and if asked also under a law designed for
+
+- what `pkxyz identify` finds of it, from inside and with an instrument outside (``identified``);
+- what an identification without error would find: springs, combs, sense combs and damping, by the drawing's mass.
+
+Links are taken to be alike (their mean), which the plant's mechanism has them.
 """
 
 import math
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
+from functools import cached_property
 from typing import Any
 
 import numpy as np
@@ -19,18 +23,22 @@ from hil.lanes.lane import Lane
 from hil.lanes.setup import Setup
 from hil.runs.metrics import Metrics
 from hil.runs.scenario import Scenario, resolve
+from hil.studies.identify.identification import identify
+from hil.studies.wafer.identified import deviates, from_inside, with_instrument
 from hil.studies.wafer.study import WaferStudy, spread_die, within
 from pkxyz_ctrl.config import files as config
 from pkxyz_ctrl.config.calibration import Calibration
 from pkxyz_ctrl.config.files import ConfigError
 from pkxyz_ctrl.config.stage import StageConfig
+from pkxyz_ctrl.design.identification.modal_fit import FitError, ModalFit
 from pkxyz_ctrl.design.law import design_law
-from pkxyz_ctrl.design.law_about import law_about
+from pkxyz_ctrl.design.law_about import law_in_parts
 from pkxyz_ctrl.design.margins.margins import peak_sensitivity
 from pkxyz_ctrl.design.model.loop_plant import Perturbation, loop_plant
 from pkxyz_ctrl.fabrication.devices import Devices
-from pkxyz_ctrl.fabrication.process import SOURCES
-from pkxyz_ctrl.fabrication.wafer import dies_per_wafer, sample_devices
+from pkxyz_ctrl.fabrication.figures import figures
+from pkxyz_ctrl.fabrication.process import SOURCES, Spread
+from pkxyz_ctrl.fabrication.wafer import dies_per_wafer, sample_devices, sample_numbered, sizes
 from pkxyz_ctrl.stage import Stage
 from sim.config import Device, PlantConfig
 
@@ -38,7 +46,7 @@ Array = NDArray[np.float64]
 Triple = tuple[float, float, float]
 
 PART_DEVICES = 16
-LAWS = ("shipped", "known")
+LAWS = ("shipped", "identified", "instrument", "known")
 LOOP_FIGURES: dict[str, str] = {
     "peak_s": "largest singular value of the sensitivity, in the middle of the strokes; infinite: unstable",
     "error_nm": "RMS error of the scenario's scan, of the worst axis; infinite: ended in a fault",
@@ -54,7 +62,9 @@ class ClosedLoops:
     wafers: WaferStudy
     scenario: Scenario
     known: bool
-    """also under a law designed for each device"""
+    """also under a law designed for each device as it is"""
+    identified: bool = False
+    """also under laws designed for what an identification finds of it, from inside and with an instrument"""
 
     def __post_init__(self) -> None:
         names = [f"{law}.{figure}" for law in LAWS for figure in LOOP_FIGURES]
@@ -66,7 +76,9 @@ class ClosedLoops:
 
     def digest(self) -> str:
         """Of all that decides about a device's loop, its number apart."""
-        return config.digest({"wafers": self.wafers.digest(), "scenario": resolve(self.scenario), "known": self.known})
+        return config.digest(
+            {"wafers": self.wafers.digest(), "scenario": resolve(self.scenario), "laws": list(self.laws)}
+        )
 
     @property
     def columns(self) -> tuple[str, ...]:
@@ -82,7 +94,24 @@ class ClosedLoops:
     @property
     def laws(self) -> tuple[str, ...]:
         """Those of ``LAWS`` that are run."""
-        return LAWS if self.known else LAWS[:1]
+        asked = {"identified": self.identified, "instrument": self.identified, "known": self.known}
+        return tuple(law for law in LAWS if asked.get(law, True))
+
+    @cached_property
+    def mean_modes(self) -> ModalFit:
+        """What an identification fits to the process' mean device, run on the fast lane under the scenario's law."""
+        of = self.wafers
+        still = {name: Spread(mean=getattr(of.process, name).mean) for name in SOURCES}
+        mean = replace(of, process=of.process.model_copy(update=still))
+        truth = Truth(of.stage, of.as_drawn, mean.made(sample_devices(mean.process, of.seed, 0, 1)))
+        setup = truth.setup(self.scenario)
+        strokes = np.full(3, 0.5 * (of.stage.limits.stroke_min_m + of.stage.limits.stroke_max_m))
+        return identify(setup, strokes, Lane.FAST).modes
+
+    def drawn_peak_s(self) -> float:
+        """Ms of the drawing as drawn under the law as shipped."""
+        drawn = self.wafers.as_drawn
+        return Truth(self.wafers.stage, drawn, drawn).peak_sensitivity(self.scenario.setup())
 
     def numbers(self, part: int) -> NDArray[np.int64]:
         """Numbers of the devices of a part: one on each of its wafers."""
@@ -93,7 +122,7 @@ class ClosedLoops:
     def part(self, number: int) -> dict[str, NDArray[Any]]:
         """All that is kept of the devices of a part: ``device`` is k, ``number`` what it has in the wafers' table."""
         numbers = self.numbers(number)
-        rows = [self.device(int(n)) for n in numbers]
+        rows = self.devices(numbers)
         found = {name: np.array([row[name] for row in rows], dtype=np.float64) for name in rows[0]}
         first = number * PART_DEVICES
         return {
@@ -116,38 +145,62 @@ class ClosedLoops:
         }
 
     def device(self, number: int) -> dict[str, float]:
-        """Figures of one device by its number, its sizes (of the chains, the mean), and whether it meets what is asked
-        of it without a loop (``own``: 1 or 0).
+        """``devices`` of one."""
+        return self.devices(np.array([number]))[0]
+
+    def devices(self, numbers: NDArray[np.int64]) -> list[dict[str, float]]:
+        """Figures of devices by their numbers (n,), their sizes (of the chains, the mean), and whether each meets what
+        is asked of it without a loop (``own``: 1 or 0).
         """
         of = self.wafers
-        made = of.made(sample_devices(of.process, of.seed, number, 1))
-        truth = Truth(of.stage, of.as_drawn, made)
-        alone = of.alone(number)
-        found = {"own": float(alone["ok"]), **{name: float(np.mean(alone[name])) for name in SOURCES}}
-        for law in self.laws:
-            found |= {f"{law}.{name}": value for name, value in self._run(truth, number, law == "known").items()}
+        sampled = sample_numbered(of.process, of.seed, numbers)
+        size, made = sizes(of.process, sampled), of.made(sampled)
+        meets = of.verdicts(figures(of.stage, of.as_drawn, made))["ok"]
+        found = []
+        for n, number in enumerate(numbers.tolist()):
+            truth = Truth(of.stage, of.as_drawn, made.take(np.array([n])))
+            row = {"own": float(meets[n]), **{name: float(size[name][n].mean()) for name in SOURCES}}
+            for law in self.laws:
+                row |= {f"{law}.{name}": value for name, value in self._run(truth, number, law).items()}
+            found.append(row)
         return found
 
-    def _run(self, truth: "Truth", number: int, known: bool) -> dict[str, float]:
-        asked = replace(
-            self.scenario,
-            config=self.scenario.config.model_copy(update={"seed": number}),
-            plant=truth.plant(self.scenario.plant),
-        ).setup()
-        setup = replace(asked, stage=truth.stage if known else asked.stage, device=truth.device(asked.device))
-        if known:  # of no use to anybody else: not to be kept with the shipped ones
+    @cached_property
+    def _shipped_law(self) -> NDArray[np.void]:
+        return self.scenario.setup().law
+
+    def _believed(self, truth: "Truth", number: int, law: str) -> StageConfig:
+        """The stage file that a law is designed for."""
+        if law == "known":
+            return truth.stage
+        find = from_inside if law == "identified" else with_instrument
+        farad_per_count, rng = self.scenario.bus.analog.sense_farad_per_count, deviates(self.wafers.seed, number)
+        measured = find(self.wafers.stage, truth.itself, self.mean_modes, farad_per_count, rng)
+        return self.wafers.stage.model_copy(update={"calibration": measured})
+
+    def _run(self, truth: "Truth", number: int, law: str) -> dict[str, float]:
+        seeded = self.scenario.config.model_copy(update={"seed": number})
+        setup = truth.setup(replace(self.scenario, config=seeded))
+        if law == "shipped":
+            setup.__dict__["law"] = self._shipped_law
+        else:
+            try:
+                setup = replace(setup, stage=self._believed(truth, number, law))
+            except FitError:  # refused as no device of this drawing: there is no law for it
+                return dict.fromkeys(LOOP_FIGURES, math.inf)
+            # of no use to anybody else: not to be kept with the shipped ones
             setup.__dict__["law"] = design_law(Stage(setup.stage), setup.controller, setup.bus, autostart=True)
         metrics = Metrics(setup.trajectory, setup.bus.period_us)
         ran = lanes.run(setup, Lane.FAST, on_block=metrics.update)
-        figures = metrics.figures()
+        seen = metrics.figures()
 
         def worst(values: Mapping[str, float] | None) -> float:
             return math.inf if ran.faults or values is None else max(values.values())
 
         return {
             "peak_s": truth.peak_sensitivity(setup),
-            "error_nm": worst(figures.rms_error_nm),
-            "error_about_mean_nm": worst(figures.error_deviation_nm),
+            "error_nm": worst(seen.rms_error_nm),
+            "error_about_mean_nm": worst(seen.error_deviation_nm),
         }
 
 
@@ -180,6 +233,16 @@ class Truth:
             }
         )
 
+    @property
+    def itself(self) -> StageConfig:
+        """The same with links as they were made: all of the device, by the drawing's mass."""
+        return self.stage.model_copy(update={"geometry": self._drawing.geometry.model_copy(update=self._links())})
+
+    def setup(self, scenario: Scenario) -> Setup:
+        """A scenario on this device, under the law as shipped."""
+        asked = replace(scenario, plant=self.plant(scenario.plant)).setup()
+        return replace(asked, device=self.device(asked.device))
+
     def device(self, drawn: Device) -> Device:
         """Links as they were made, for the plant."""
         return drawn.model_copy(update={"geometry": drawn.geometry.model_copy(update=self._links())})
@@ -204,9 +267,7 @@ class Truth:
         limits = self._drawing.limits
         strokes = np.full(3, 0.5 * (limits.stroke_min_m + limits.stroke_max_m))
         belief = Stage(setup.stage)
-        itself = Stage(
-            self.stage.model_copy(update={"geometry": self._drawing.geometry.model_copy(update=self._links())})
-        )
+        itself = Stage(self.itself)
         believed = setup.stage.calibration or Calibration()
         pull = self._comb / self._mass / np.array(believed.comb_gain)
         seen = self._sense / np.array(believed.sense_gain)
@@ -215,7 +276,7 @@ class Truth:
         scale = np.linalg.solve(jacobian, seen[:, None] * jacobian)
         holds, thinks = (s.holding_forces(s.forward_kinematics(strokes)) for s in (itself, belief))
         # by how much the controller is off about the forces that hold the point
-        law = law_about(belief, setup.law, strokes, Perturbation(comb_gain=_triple(pull * thinks / holds - 1.0)))
+        law = law_in_parts(belief, setup.law, strokes, Perturbation(comb_gain=_triple(pull * thinks / holds - 1.0)))
         return peak_sensitivity(replace(plant, c=scale @ plant.c), law)
 
     def _links(self) -> dict[str, float | None]:

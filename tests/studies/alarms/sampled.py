@@ -90,7 +90,7 @@ def of_law(motion: str, law: str, devices: int) -> dict[str, Any]:
     """
     found: dict[str, Any] = {"law": law, "motion": motion, "devices": devices, "stopped": {}, "beyond": [], "false": []}
     try:
-        designed(motion, law)
+        assert designed(motion, law)[1].law is not None  # some stages are too slow or too stiff for a law
     except ConfigError as error:
         return found | {"refused": str(error)}
     for seed in range(1, devices + 1):
@@ -122,6 +122,9 @@ def main() -> None:
             found = of_law(motion, law, asked.devices)
             with asked.results.open("a", encoding="utf-8") as file:
                 file.write(json.dumps(found) + "\n")
+            if "refused" in found:
+                print(f"{law} in {motion}: {found['refused']}", flush=True)
+                continue
             print(
                 f"{law} in {motion}: {len(found['stopped'])} of {asked.devices} stopped, {len(found['beyond'])} beyond "
                 f"what they reach, false alarms: {len(found['false'])} {found['false'][:5]}", flush=True

@@ -16,13 +16,15 @@ from hil.studies.spread.processes import processes
 from hil.studies.spread.workers import as_done, worker_pool
 from pkxyz_ctrl.config.files import ConfigError
 
+pytestmark = pytest.mark.at_rate
+
 
 def openssl(folder, *words):
     subprocess.run(["openssl", *words], cwd=folder, check=True, capture_output=True)
 
 
 def certificates(folder, ca=None):
-    """A folder as --dask-tls wants it, signed by ``ca``'s authority, or by one of its own."""
+    """A folder as --cluster-tls wants it, signed by ``ca``'s authority, or by one of its own."""
     folder.mkdir()
     if ca is None:
         ca = folder
@@ -67,7 +69,7 @@ def test_work_crosses_encrypted_and_a_stranger_gets_nowhere(tmp_path):
 def test_plain_tcp_to_another_machine_is_refused_before_anything_is_written(address, tmp_path):
     for command in (tune, montecarlo, wafer_yield):
         with pytest.raises(ConfigError, match="needs TLS") as caught:
-            command(dask=address, out=tmp_path / "out")
+            command(cluster=address, out=tmp_path / "out")
         assert "\n" not in str(caught.value)
     assert list((tmp_path / "out").glob("*")) == []
 
@@ -88,7 +90,7 @@ def test_certificates_that_are_missing_or_of_no_use_are_told(tmp_path):
     for address, words in ((None, "give its address"), ("tcp://127.0.0.1:1", "say tls://")):
         with pytest.raises(ConfigError, match=words):
             cluster_at(address, tmp_path)
-    with pytest.raises(ConfigError, match="with --dask-tls"):
+    with pytest.raises(ConfigError, match="with --cluster-tls"):
         cluster_at("tls://127.0.0.1:1", None)
 
 
