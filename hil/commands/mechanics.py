@@ -213,14 +213,26 @@ def design(
     chains: Annotated[int, typer.Option(help="Chains whose out-of-plane hinges count, 1 or 3.")] = 1,
     stage: Annotated[str, typer.Option(help="Stage whose flexures and combs are taken.")] = "reconstructed",
     picture: Annotated[Path | None, typer.Option(help="PNG of the feasible region.")] = None,
+    for_yield: Annotated[
+        str | None,
+        typer.Option(metavar="PROCESS", help="Search the drawing of which most devices work."),
+    ] = None,
+    trials: Annotated[int, typer.Option(min=1, help="Drawings to try for --for-yield, in all.")] = 300,
+    devices: Annotated[int, typer.Option(min=8, help="Fresh devices that confirm it, in a closed loop.")] = 400,
+    workers: Annotated[int | None, typer.Option(min=1, help="Processes; default: as many as cores.")] = None,
     as_json: AsJson = False,
 ) -> None:
     """Dimensions from requirements (the paper's section IV),
     written as a stage file that `pkxyz sil --stage` runs.
+
+    With --for-yield the folder that --out names (designed/) gets chosen.toml and its runners-up, beside-N.toml. Call it
+    again to go on. Exit code 1 if no drawing keeps the requirements.
     """
+    from hil.commands.studies.design_for_yield import Asked
     from hil.studies.designed_stage import require_replaceable, write_stage_file
     from pkxyz_ctrl.config.stage import StageConfig
     from pkxyz_ctrl.elements.combs import voltage_for_force_v
+    from pkxyz_ctrl.io.realtime import cores
     from pkxyz_ctrl.mechanics.selection import Requirements, select
 
     template = load("stages", stage, StageConfig)
@@ -252,8 +264,10 @@ def design(
         )
         if need.voltage_max_v > 1000:
             raise ConfigError(f"voltage limit <= 1000 V is violated: {need.voltage_max_v:g} V")
+        if for_yield is not None:
+            Asked(need, template, for_yield, trials, devices, workers or cores(), out.with_suffix(""), as_json).run()
         chosen = select(need, template, name=out.stem)
-    write_stage_file(chosen, need, out)
+    write_stage_file(chosen.config, need, out, "the point where the product of the margins is largest")
     if picture is not None:
         from hil.pictures.mechanics import draw_selection
 

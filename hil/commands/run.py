@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 import typer
 
 from hil.screen.errors import amplifier_errors
-from hil.screen.figures import error_lines, lacking_lines, where_to_read
+from hil.screen.figures import error_lines, lacking_lines, loss_lines, where_to_read
 from hil.screen.first_run import say_if_compiling
 from hil.screen.terminal import note
 from pkxyz_ctrl.config.files import ConfigError
@@ -215,7 +215,8 @@ def _show(summary: "Summary", folder: Path) -> None:
         f"{summary.scenario} on {summary.bus}: {rows.ticks} ticks, {loop.missed_ticks} missed, woken "
         f"{late['p50']} us late in the middle, {late['p99_9']} us at p99.9, {late['max']} us at most"
     )
-    for line in (*error_lines(rows, loop.errors_are_of), *lacking_lines(loop.protections_lacking)):
+    said = (*error_lines(rows, loop.errors_are_of), *lacking_lines(loop.protections_lacking), *loss_lines(loop))
+    for line in said:
         print(line)
     for check in summary.checks:
         if check.ok is False:

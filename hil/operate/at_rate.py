@@ -79,7 +79,7 @@ class OperatedLoop:
         session.server_says(int(self._head["server"][0]))
         if session.wants_rows:
             self._take_rows()
-        session.after(row, self._given())
+        session.after(row, self._come())
         state = session.state
         state["commands"] = self._commands.next - 1
         state["frames"], state["wire_ns"] = self._counted.frames, self._counted.wire_ns
@@ -88,17 +88,17 @@ class OperatedLoop:
         self._frames.write(self._counted.of_tick.taken(int(row["tick"])))
         self._ticks.write(self._tick_bytes)
 
-    def _given(self) -> list[np.void]:
+    def _come(self) -> list[np.void]:
         """Commands that have come; a stop that anyone asked for is the first of them."""
-        given: list[np.void] = []
+        commands: list[np.void] = []
         if (stops := int(self._head["stop"][0])) != self._stops:
             self._stops = stops
-            given.append(new_command(Verb.STOP, 0)[0])
-        while len(given) < _COMMANDS_A_TICK and (command := self._commands.read()) is not None:
-            given.append(np.frombuffer(command, COMMAND)[0])
-            if given[-1]["verb"] == Verb.LAW:
+            commands.append(new_command(Verb.STOP, 0)[0])
+        while len(commands) < _COMMANDS_A_TICK and (command := self._commands.read()) is not None:
+            commands.append(np.frombuffer(command, COMMAND)[0])
+            if commands[-1]["verb"] == Verb.LAW:
                 self._take_law()
-        return given
+        return commands
 
     def _take_law(self) -> None:
         while (offered := self._laws.read()) is not None:

@@ -83,8 +83,8 @@ class Listening:
         error = state["seen_m"] - self._expected_m
         self._expected_m[:] = state["set_point_model"]["sample_m"][0]
         w = -(linear["c"] @ self.x + linear["d"] @ error)
-        given = state["set_point_model"]["fed_back_n"]
-        self.x = linear["a"] @ self.x + linear["b"] @ error + linear["unwind"] @ (w - given)
+        fed_back_n = state["set_point_model"]["fed_back_n"]
+        self.x = linear["a"] @ self.x + linear["b"] @ error + linear["unwind"] @ (w - fed_back_n)
 
 
 def _move_origin(before: np.void, after: np.void, state: np.void) -> None:

@@ -91,17 +91,18 @@ class Reader(_Ring):
             return None
         slot = bytes(self._slot(number))
         crc_at = self._crc_at
-        if int.from_bytes(slot[0:8], "little") != number or not _is_whole(slot, crc_at):
+        crc = int.from_bytes(slot[crc_at : crc_at + 4], "little")
+        if int.from_bytes(slot[0:8], "little") != number or zlib.crc32(slot[:crc_at]) != crc:
             return None
         self.next = number + 1
         return slot[self._record_at : self._record_at + self._record_bytes]
 
     def read_block(self, most: int) -> NDArray[np.void]:
         """Up to ``most`` next records (n,), copies; none where there is none, or it is not whole."""
-        blocks = [self._straight(most)]
-        if 0 < len(blocks[0]) < most:
-            blocks.append(self._straight(most - len(blocks[0])))
-        return np.concatenate(blocks) if len(blocks) > 1 else blocks[0]
+        block = self._straight(most)
+        if 0 < len(block) < most and len(rest := self._straight(most - len(block))):
+            return np.concatenate([block, rest])
+        return block
 
     def latest(self) -> NDArray[np.void] | None:
         """The newest whole record, (1,), whatever was read before; None if there is none."""
@@ -141,10 +142,10 @@ class Reader(_Ring):
         size, crc_at = self._size, self._crc_at
         data = bytearray(self._bytes[at * size : (at + count) * size])  # padding, too, which an array's copy leaves out
         copy = np.frombuffer(data, self._layout, count)
-        whole = 0
-        for number, seen in enumerate(copy["number"].tolist(), first):
+        whole, view = 0, memoryview(data)
+        for number, (seen, crc) in enumerate(zip(copy["number"].tolist(), copy["crc"].tolist(), strict=True), first):
             begin = whole * size
-            if seen != number or not _is_whole(data[begin : begin + size], crc_at):
+            if seen != number or zlib.crc32(view[begin : begin + crc_at]) != crc:
                 break
             whole += 1
         return copy["record"][:whole]
@@ -154,7 +155,3 @@ class Reader(_Ring):
         left_out = max(0, number - self.next)
         self.next = max(self.next, number)
         return left_out
-
-
-def _is_whole(slot: bytes | bytearray | memoryview, crc_at: int) -> bool:
-    return zlib.crc32(slot[:crc_at]) == int.from_bytes(slot[crc_at : crc_at + 4], "little")

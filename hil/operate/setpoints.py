@@ -203,9 +203,9 @@ class Setpoints:
 
     def _move_block(self) -> None:
         """What is still needed goes to the front, in place: the loop goes on reading the same rows."""
-        gone = self.row - self._base
+        played = self.row - self._base
         left = self._filled - self.row
-        self._rows[:left] = self._rows[gone : gone + left].copy()
+        self._rows[:left] = self._rows[played : played + left].copy()
         self._base = self.row
 
     def _sample(self, count: int) -> None:

@@ -24,7 +24,7 @@ PAGE = Path(__file__).parent / "page"
 CLIENTS_MOST = 32
 _ASKED_MOST = 1000
 """Messages of a client that wait for those before them."""
-_LOOK_S, _SHOW_S, _STATUS_S = 0.01, 1 / 30, 0.1
+_LOOK_S, _SHOW_S, _STATUS_S = 0.02, 1 / 30, 0.1
 _HEADERS = [
     (b"content-security-policy", b"default-src 'self'; style-src 'self' 'unsafe-inline'; img-src 'self' data: blob:"),
     (b"x-content-type-options", b"nosniff"),
@@ -70,8 +70,8 @@ def app_of(desk: Desk, token: str, hosts: frozenset[str]) -> Starlette:
 
     async def talk(socket: WebSocket) -> None:
         offered = socket.scope.get("subprotocols", [])
-        given = [name.removeprefix(TOKEN_PREFIX) for name in offered if name.startswith(TOKEN_PREFIX)]
-        if SUBPROTOCOL not in offered or not any(hmac.compare_digest(g.encode(), token.encode()) for g in given):
+        tokens = [name.removeprefix(TOKEN_PREFIX) for name in offered if name.startswith(TOKEN_PREFIX)]
+        if SUBPROTOCOL not in offered or not any(hmac.compare_digest(g.encode(), token.encode()) for g in tokens):
             await socket.close(4401)
             return
         if len(desk.clients) >= CLIENTS_MOST:

@@ -4,9 +4,32 @@ import asyncio
 import json
 from typing import Any
 
-from pkxyz_ctrl.client.protocol import Block, packed
+import numpy as np
+from numpy.typing import NDArray
+
+from pkxyz_ctrl.client.protocol import Block, Precision, packed
 
 SAID_MOST, _BLOCKS_MOST = 400, 4
+
+
+class Moment:
+    """Telemetry of the same ticks for all who look on. What several see alike is packed once."""
+
+    def __init__(self, first_tick: int, values: dict[str, NDArray[Any]]) -> None:
+        """``values``: (n,) or (n, 3) by field, of every field that can be asked for."""
+        self._first_tick, self._values = first_tick, values
+        self._packed: dict[tuple[tuple[str, ...], Precision, int], bytes] = {}
+
+    def __len__(self) -> int:
+        return len(next(iter(self._values.values())))
+
+    def of(self, fields: tuple[str, ...], precision: Precision, lost: int) -> bytes:
+        """Some fields as bytes, for one who has ``lost`` so many rows before them."""
+        key = (fields, precision, lost)
+        if key not in self._packed:
+            block = Block(self._first_tick, {name: np.asarray(self._values[name]) for name in fields}, lost)
+            self._packed[key] = packed(block, precision)
+        return self._packed[key]
 
 
 class Client:
@@ -16,7 +39,7 @@ class Client:
         self.number = number
         self.said: asyncio.Queue[str | bytes] = asyncio.Queue(SAID_MOST)
         self.fields: tuple[str, ...] = ()
-        self.precision: Any = "f4"
+        self.precision: Precision = "f4"
         self.tags: dict[int, Any] = {}
         self.lost = 0
         self._blocks = 0
@@ -33,12 +56,12 @@ class Client:
         except asyncio.QueueFull:
             self.is_hopeless = True
 
-    def show(self, block: Block) -> None:
-        """Queue a block of telemetry, or leave it out and count its rows."""
+    def show(self, moment: Moment) -> None:
+        """Queue what it has asked to see of telemetry, or leave it out and count its rows."""
         if not self.has_room:
-            self.lost += len(block)
+            self.lost += len(moment)
             return
-        self._give(packed(Block(block.first_tick, block.columns, self.lost), self.precision))
+        self._give(moment.of(self.fields, self.precision, self.lost))
         self.lost = 0
 
     @property

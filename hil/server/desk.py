@@ -12,7 +12,7 @@ from typing import Any
 import numpy as np
 
 from hil.operate.commands import FINAL, State, Verb
-from hil.server.client import Client
+from hil.server.client import Client, Moment
 from hil.server.designing import offer_of
 from hil.server.link import Answer, BusyError, Link
 from hil.server.messages import FIELDS, AskedWrongError, number, of_sample, shown, tag_of
@@ -23,7 +23,6 @@ from hil.server.saving import AFTER_S, BEFORE_S, NotSavedError, save
 from hil.server.setting import ASKED, Setting
 from hil.server.status import status_of
 from hil.server.stored_settings import SettingsStore
-from pkxyz_ctrl.client.protocol import Block
 from pkxyz_ctrl.config.files import ConfigError
 
 _AXES = ("x", "y", "z")
@@ -391,10 +390,10 @@ class Desk:
             return
         ticks, before = self.link.ticks, self.link.ticks.lost
         rows = ticks.read_block(most)
-        if not len(rows):
+        looking = [client for client in self.clients if client.fields]
+        if not len(rows) or not looking:
             return
-        first, values = int(rows["row"]["tick"][0]), of_sample(rows)
-        for client in self.clients:
-            if client.fields:
-                client.lost += ticks.lost - before
-                client.show(Block(first, {name: values[name] for name in client.fields}))
+        moment = Moment(int(rows["row"]["tick"][0]), of_sample(rows))
+        for client in looking:
+            client.lost += ticks.lost - before
+            client.show(moment)

@@ -16,6 +16,8 @@ from pkxyz_ctrl.safety.trips import explain
 ROWS_MOST = 30_000
 """Of a recording, the last ones: what the page keeps of telemetry, too."""
 _LISTED_MOST, _EVENTS_MOST = 100, 200
+_BURST_S = 0.1
+"""Missed ticks that are no farther apart than this belong together."""
 
 
 def listed(saves: Path) -> list[str]:
@@ -38,10 +40,12 @@ def opened(saves: Path, name: Any, fields: tuple[str, ...]) -> tuple[dict[str, A
         first = max(0, recording.ticks - ROWS_MOST)
         values = {field: recording.vector(field)[first:] for field in fields if field in (ROW.names or ())}
         tick, t_us = recording["tick"][first:], recording["t_us"][first:]
-        events = _events(*(recording[column][first:] for column in ("mode", "trips", "overrun", "tick")))
+        period_us = int(np.median(np.diff(t_us) // np.maximum(np.diff(tick), 1))) if len(tick) > 1 else 0
+        burst_ticks = round(1e6 * _BURST_S / period_us) if period_us else 0
+        mode, trips, overrun = (recording[column][first:] for column in ("mode", "trips", "overrun"))
+        events = _events(mode, trips, overrun, tick, burst_ticks)
     except RecordingError as error:
         raise AskedWrongError(str(error)) from None
-    period_us = int(np.median(np.diff(t_us) // np.maximum(np.diff(tick), 1))) if len(tick) > 1 else 0
     about = {
         "name": name, "ticks": len(tick), "period_us": period_us, "events": events, "left_out": first,
         "modes": sorted({Mode(int(m)).name for m in np.unique(recording["mode"])}),
@@ -49,13 +53,19 @@ def opened(saves: Path, name: Any, fields: tuple[str, ...]) -> tuple[dict[str, A
     return about, Block(int(tick[0]) if len(tick) else 0, values)
 
 
-def _events(mode: np.ndarray, trips: np.ndarray, overrun: np.ndarray, tick: np.ndarray) -> list[dict[str, Any]]:
-    """Changes of mode, trips and missed ticks, in order."""
+def _events(
+    mode: np.ndarray, trips: np.ndarray, overrun: np.ndarray, tick: np.ndarray, burst_ticks: int
+) -> list[dict[str, Any]]:
+    """Changes of mode, trips and missed ticks, in order; of bursts of missed ticks one event each."""
     changes = np.flatnonzero(np.diff(mode, prepend=mode[:1]))
     found = [(int(tick[n]), "mode", Mode(int(mode[n])).name) for n in changes]
     begun = np.flatnonzero(np.diff(trips, prepend=0) & trips)
     found += [(int(tick[n]), "fault", explain(int(trips[n]))) for n in begun]
-    found += [(int(tick[n]), "missed", f"{int(overrun[n])} ticks missed") for n in np.flatnonzero(overrun)]
+    late = np.flatnonzero(overrun)
+    for burst in np.split(late, np.flatnonzero(np.diff(tick[late]) > burst_ticks) + 1) if len(late) else ():
+        count, begin, end = int(overrun[burst].sum()), int(tick[burst[0]]), int(tick[burst[-1]])
+        words = f"{count} missed" + (f", tick {begin} to {end}" if end > begin else "")
+        found.append((begin, "missed", words))
     return [{"tick": at, "kind": kind, "words": words} for at, kind, words in sorted(found)[:_EVENTS_MOST]]
 
 

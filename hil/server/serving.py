@@ -107,7 +107,7 @@ def serve(served: Served, tell: Callable[[str], object]) -> int:
         config = uvicorn.Config(
             app_of(desk, token, hosts), log_level="error", access_log=False, ws_max_size=TEXT_MAX_BYTES,
             ws_max_queue=8, ws_ping_interval=10, ws_ping_timeout=30, limit_concurrency=128,
-            timeout_graceful_shutdown=1, lifespan="on",
+            timeout_graceful_shutdown=1, lifespan="on", ws_per_message_deflate=False,  # costs more than it carries
         )  # fmt: skip
         server = _Server(config)
         return _run(server, bound, children)

@@ -60,12 +60,12 @@ class Setting:
             wanted = self._store.back_to(str(message.get("digest", "")))
             words = f"back to {wanted.digest}"
         elif what == "limits":
-            given = {name: number(message, name, None) for name in MoveLimits.model_fields if name in message}
-            limits = parse(now.limits.model_dump() | given, MoveLimits, what)
+            changed = {name: number(message, name, None) for name in MoveLimits.model_fields if name in message}
+            limits = parse(now.limits.model_dump() | changed, MoveLimits, what)
             wanted, words = now.model_copy(update={"limits": limits}), "limits of moves"
         elif what == "settle":
-            given = {name: number(message, name, None) for name in SettleWindow.model_fields if name in message}
-            wanted = now.model_copy(update={"settle": parse(now.settle.model_dump() | given, SettleWindow, what)})
+            changed = {name: number(message, name, None) for name in SettleWindow.model_fields if name in message}
+            wanted = now.model_copy(update={"settle": parse(now.settle.model_dump() | changed, SettleWindow, what)})
             words = "settle window"
         else:
             wanted, words = now.model_copy(update={"frame": self._frame(what, message)}), "frame of the sample"
@@ -117,8 +117,8 @@ class Setting:
     def _frame(self, what: str, message: dict[str, Any]) -> SampleFrame:
         now = self._store.now.frame
         if what == "frame":
-            given = {name: message[name] for name in SampleFrame.model_fields if name in message}
-            return parse(now.model_dump() | given, SampleFrame, "frame")
+            changed = {name: message[name] for name in SampleFrame.model_fields if name in message}
+            return parse(now.model_dump() | changed, SampleFrame, "frame")
         try:
             points = np.array(message.get("points_m"), np.float64)
         except (ValueError, TypeError):

@@ -4,7 +4,6 @@ way back to each of them.
 A file of lines of JSON that only grows. Each line holds all settings, so that any of them is whole by itself.
 """
 
-import getpass
 import hashlib
 import json
 import os
@@ -114,14 +113,6 @@ def default_folder() -> Path:
     """Where settings are kept unless told otherwise: the user's folder for such things."""
     home = os.environ.get("XDG_CONFIG_HOME")
     return (Path(home) if home else Path.home() / ".config") / "pkxyz"
-
-
-def who_serves() -> str:
-    """The user of this process."""
-    try:
-        return getpass.getuser()
-    except (KeyError, OSError):
-        return str(os.getuid())
 
 
 def _read(file: Path) -> list[Change]:

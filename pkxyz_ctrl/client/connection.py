@@ -61,8 +61,8 @@ class Connection:
     async def done(self, verb: str, arguments: dict[str, Any], *, wait: bool = True) -> Command:
         """Ask, and wait for the end, or else until it runs. Raises ``RefusedError`` and ``AbortedError``."""
         tag, queue = self.asked()
-        given = {key: value for key, value in arguments.items() if value is not None}
-        await self.say({"do": verb, "tag": tag, **given})
+        told = {key: value for key, value in arguments.items() if value is not None}
+        await self.say({"do": verb, "tag": tag, **told})
         command = await self.until(queue, FINAL if wait else ("running", *FINAL))
         command.answers = None if wait else queue
         return command.require_done()

@@ -38,7 +38,7 @@ class Frames:
         self._backward, self._pixels = np.array(backward), pixels
         self._sums: dict[str, Array] = {}
         self._ticks = np.zeros((len(lines), pixels), np.int64)
-        self._given = 0
+        self._handed_over = 0
         self.count = int(self._frame[-1]) + 1
 
     def take(self, block: Block, fields: Sequence[str]) -> list[ScanFrame]:
@@ -59,9 +59,9 @@ class Frames:
             np.add.at(sums, (at, pixel), values[on_line])
         passed = float(row.max(initial=-1.0))
         found = []
-        while self._given < self.count and passed >= self._last[self._frame == self._given].max():
-            found.append(self._frame_of(self._given))
-            self._given += 1
+        while self._handed_over < self.count and passed >= self._last[self._frame == self._handed_over].max():
+            found.append(self._frame_of(self._handed_over))
+            self._handed_over += 1
         return found
 
     def _frame_of(self, number: int) -> ScanFrame:

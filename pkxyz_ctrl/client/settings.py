@@ -4,13 +4,15 @@ import getpass
 import os
 from collections.abc import Mapping
 from dataclasses import dataclass
-from typing import Any, Self
+from typing import Annotated, Any, Self
 
-Point = tuple[float, float, float]
+Metres = Annotated[float, "m"]
+"""Told where a call is completed."""
+Point = tuple[Metres, Metres, Metres]
 
 
 @dataclass(frozen=True)
-class Frame:
+class SampleCoordinates:
     """Where the sample lies on the stage: stage = origin + turn . scale . sample. All targets and positions are the
     sample's.
     """
@@ -22,7 +24,7 @@ class Frame:
     slope_x: float
     """how far the sample's plane rises along the stage's x, m/m"""
     slope_y: float
-    scale: Point
+    scale: tuple[float, float, float]
     """metres of the stage for each metre of the sample"""
 
 
@@ -42,7 +44,7 @@ class Change:
 class StageSettings:
     """They outlive the loop and the server."""
 
-    frame: Frame
+    frame: SampleCoordinates
     positions: Mapping[str, Point]
     """m, in the sample's coordinates"""
     velocity_m_per_s: float
@@ -64,7 +66,7 @@ class StageSettings:
         """From the server's words."""
         frame = data["frame"]
         return cls(
-            frame=Frame(**frame | {name: tuple(frame[name]) for name in ("origin_m", "scale")}),
+            frame=SampleCoordinates(**frame | {name: tuple(frame[name]) for name in ("origin_m", "scale")}),
             positions={name: (place[0], place[1], place[2]) for name, place in data["positions"].items()},
             **data["limits"], **data["settle"], digest=data["digest"],
             history=tuple(Change(**change) for change in data["history"]),

@@ -13,7 +13,7 @@ from pkxyz_ctrl.client.connection import FINAL, Connection
 from pkxyz_ctrl.client.protocol import Block
 from pkxyz_ctrl.client.reply import Command, NoStageError, StageError, Status
 from pkxyz_ctrl.client.scan import PATH_ROW, Frames, ScanFrame
-from pkxyz_ctrl.client.settings import Point, StageSettings, who
+from pkxyz_ctrl.client.settings import Metres, Point, StageSettings, who
 from pkxyz_ctrl.client.trigger import Trigger, beginning, column_of
 
 Axis = Literal["x", "y", "z"]
@@ -66,9 +66,9 @@ class AsyncStage:
 
     async def move_to(
         self,
-        x: float | None = None,
-        y: float | None = None,
-        z: float | None = None,
+        x: Metres | None = None,
+        y: Metres | None = None,
+        z: Metres | None = None,
         *,
         velocity_m_per_s: float | None = None,
         acceleration_m_per_s2: float | None = None,
@@ -85,9 +85,9 @@ class AsyncStage:
 
     async def move_by(
         self,
-        x: float | None = None,
-        y: float | None = None,
-        z: float | None = None,
+        x: Metres | None = None,
+        y: Metres | None = None,
+        z: Metres | None = None,
         *,
         velocity_m_per_s: float | None = None,
         acceleration_m_per_s2: float | None = None,
@@ -131,12 +131,12 @@ class AsyncStage:
         file, whose limits are the three below). The stage goes to its first point before.
         """
         source = {"scenario": scenario, "segments": segments, "table": table_csv}
-        given: dict[str, Any] = {key: value for key, value in source.items() if value is not None}
-        if len(given) != 1:
+        path: dict[str, Any] = {key: value for key, value in source.items() if value is not None}
+        if len(path) != 1:
             raise StageError("give one of scenario, segments and table_csv")
         if table_csv is not None:
-            given |= _limits(velocity_m_per_s, acceleration_m_per_s2, jerk_m_per_s3)
-        return await self._done("path", wait=wait, **given)
+            path |= _limits(velocity_m_per_s, acceleration_m_per_s2, jerk_m_per_s3)
+        return await self._done("path", wait=wait, **path)
 
     async def pause(self) -> Command:
         """Stop on the path, without leaving it."""
@@ -186,7 +186,7 @@ class AsyncStage:
         rotation_deg: float | None = None,
         slope_x: float | None = None,
         slope_y: float | None = None,
-        scale: Point | None = None,
+        scale: tuple[float, float, float] | None = None,
     ) -> Command:
         """Where the sample lies on the stage; what is left out stays. Nothing moves: all targets and positions are in
         the sample's coordinates from now on.
@@ -199,7 +199,7 @@ class AsyncStage:
         return await self._set("tilt_plane", points_m=[list(a_m), list(b_m), list(c_m)])
 
     async def name_position(
-        self, name: str, x: float | None = None, y: float | None = None, z: float | None = None
+        self, name: str, x: Metres | None = None, y: Metres | None = None, z: Metres | None = None
     ) -> Command:
         """Give a place a name, in m; axes left out are where the target is. Nothing moves."""
         return await self._set("name_position", name=name, x_m=x, y_m=y, z_m=z)
@@ -380,5 +380,5 @@ def connect_async(
 
 
 def _limits(v: float | None, a: float | None, j: float | None) -> dict[str, float]:
-    given = {"velocity_m_per_s": v, "acceleration_m_per_s2": a, "jerk_m_per_s3": j}
-    return {key: value for key, value in given.items() if value is not None}
+    limits = {"velocity_m_per_s": v, "acceleration_m_per_s2": a, "jerk_m_per_s3": j}
+    return {key: value for key, value in limits.items() if value is not None}

@@ -10,7 +10,7 @@ from pkxyz_ctrl.client.stage import AsyncStage, Axis
 AXES: tuple[Axis, ...] = ("x", "y", "z")
 
 
-class Pace(NamedTuple):
+class MotionLimits(NamedTuple):
     """Limits of a move of one axis."""
 
     velocity_m_per_s: float
@@ -21,7 +21,7 @@ class Pace(NamedTuple):
 @dataclass
 class _Move:
     axis: Axis
-    pace: Pace
+    limits: MotionLimits
     asked: "asyncio.Task[Command]"
 
     @property
@@ -51,14 +51,14 @@ class AxisMoves:
         self._has_control = False
         await self.stage.give_control()
 
-    async def move(self, axis: Axis, target_m: float, pace: Pace) -> Command:
+    async def move(self, axis: Axis, target_m: float, limits: MotionLimits) -> Command:
         """Bring an axis to a target, until the stage is in position; other axes go on to theirs, none of them faster
         than the slowest of those on their way. Raises ``RefusedError`` and ``AbortedError``.
         """
         await self.take_control()
-        slowest = Pace(*(min(each) for each in zip(pace, *(m.pace for m in self._moves), strict=True)))
+        slowest = MotionLimits(*(min(each) for each in zip(limits, *(m.limits for m in self._moves), strict=True)))
         asking = self.stage.move_to(*(target_m if each == axis else None for each in AXES), **slowest._asdict())
-        own = _Move(axis, pace, asyncio.create_task(asking))
+        own = _Move(axis, limits, asyncio.create_task(asking))
         self._moves.append(own)
         self._under_way += 1
         try:

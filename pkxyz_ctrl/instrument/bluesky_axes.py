@@ -11,7 +11,7 @@ from typing import Any
 from pkxyz_ctrl.client.plain import Stage, begun_in
 from pkxyz_ctrl.client.reply import Command, StageError
 from pkxyz_ctrl.client.stage import AsyncStage, Axis
-from pkxyz_ctrl.instrument.axis_moves import AXES, AxisMoves, Pace
+from pkxyz_ctrl.instrument.axis_moves import AXES, AxisMoves, MotionLimits
 
 
 class MoveStatus:
@@ -74,20 +74,20 @@ class StageAxis:
 
     def read_configuration(self) -> dict[str, dict[str, Any]]:
         """The limits of moves."""
-        values = zip(Pace._fields, self._stage.description["limits"], strict=True)
+        values = zip(MotionLimits._fields, self._stage.description["limits"], strict=True)
         return {f"{self.name}_{key}": {"value": value, "timestamp": time.time()} for key, value in values}
 
     def describe_configuration(self) -> dict[str, dict[str, Any]]:
         """Of what ``read_configuration`` gives."""
         about = {"source": "pkxyz:limits", "dtype": "number", "shape": []}
-        return {f"{self.name}_{key}": dict(about) for key in Pace._fields}
+        return {f"{self.name}_{key}": dict(about) for key in MotionLimits._fields}
 
     # -- what it does --------------------------------------------------------------------------------------------------
 
     def set(self, value: float) -> MoveStatus:
         """To a position in m; axes that are set together move together."""
-        pace = Pace(*self._stage.description["limits"])
-        return MoveStatus(begun_in(self._stage, lambda _: self._moves.move(self._axis, float(value), pace)))
+        limits = MotionLimits(*self._stage.description["limits"])
+        return MoveStatus(begun_in(self._stage, lambda _: self._moves.move(self._axis, float(value), limits)))
 
     def locate(self) -> dict[str, float]:
         """Where it should be, and where it is."""

@@ -12,7 +12,7 @@ from caproto import ChannelData
 
 from pkxyz_ctrl.client.reply import StageError, Status
 from pkxyz_ctrl.client.stage import Axis
-from pkxyz_ctrl.instrument.axis_moves import AXES, AxisMoves, Pace
+from pkxyz_ctrl.instrument.axis_moves import AXES, AxisMoves, MotionLimits
 from pkxyz_ctrl.instrument.records import Choice, Number, Whole, Words, raise_alarm
 
 UM: Final = 1e-6
@@ -69,7 +69,7 @@ class MotorRecord:
         self._soft = [-math.inf, math.inf]  # dial limits that somebody has set, in um
         described = moves.stage.description
         velocity, acceleration, jerk = described["limits"]
-        self._pace_most = Pace(velocity, acceleration, jerk)
+        self._limits = MotionLimits(velocity, acceleration, jerk)
         self._dial_target = 0.0
 
         def number(value: float = 0.0, **metadata: Any) -> Number:
@@ -137,7 +137,7 @@ class MotorRecord:
         try:
             if not low <= value <= high:
                 raise StageError(f"{self._axis} = {value:g} um, limits {low:g} to {high:g} um were set")
-            await self._moves.move(self._axis, value * UM, self._pace())
+            await self._moves.move(self._axis, value * UM, self._limits_of_a_move())
         except StageError as error:
             if self._moves.stops == stops:  # one that STOP ended has ended as it should
                 wrong = error
@@ -184,10 +184,12 @@ class MotorRecord:
         self._soft[1] = float(value) - self._offset
         await self.look(await self._moves.stage.next_status())
 
-    def _pace(self) -> Pace:
+    def _limits_of_a_move(self) -> MotionLimits:
         velocity = self._field["VELO"].value * UM
-        most = self._pace_most
-        return Pace(velocity, min(most.acceleration_m_per_s2, velocity / self._field["ACCL"].value), most.jerk_m_per_s3)
+        most = self._limits
+        return MotionLimits(
+            velocity, min(most.acceleration_m_per_s2, velocity / self._field["ACCL"].value), most.jerk_m_per_s3
+        )
 
     # -- what is told --------------------------------------------------------------------------------------------------
 

@@ -16,7 +16,7 @@ import numpy as np
 from pkxyz_ctrl.client.protocol import Block
 from pkxyz_ctrl.client.reply import AbortedError, Command, NoStageError, RefusedError, StageError
 from pkxyz_ctrl.client.stage import Axis
-from pkxyz_ctrl.instrument.axis_moves import AXES, AxisMoves, Pace
+from pkxyz_ctrl.instrument.axis_moves import AXES, AxisMoves, MotionLimits
 from pkxyz_ctrl.instrument.scpi_errors import ErrorQueue, ScpiError
 
 Answer = str | bytes | None
@@ -74,12 +74,12 @@ class ScpiSession:
         self.errors = ErrorQueue()
         self._moves, self._stage = moves, moves.stage
         self._running: set[asyncio.Task[None]] = set()
-        self._velocity_m_per_s = self._pace_most.velocity_m_per_s
+        self._velocity_m_per_s = self._motion_limits.velocity_m_per_s
         self._verbs = _forms()
 
     @property
-    def _pace_most(self) -> Pace:
-        return Pace(*self._stage.description["limits"])
+    def _motion_limits(self) -> MotionLimits:
+        return MotionLimits(*self._stage.description["limits"])
 
     async def answer_to(self, line: str) -> Answer:
         """What is sent back for a line. Raises ``NoStageError``."""
@@ -107,13 +107,13 @@ class ScpiSession:
             task.cancel()
         await asyncio.gather(*self._running, return_exceptions=True)
 
-    async def _do(self, head: str, given: list[str]) -> Answer:
+    async def _do(self, head: str, parameters: list[str]) -> Answer:
         verb = self._verbs.get(_plain(head))
         if verb is None:
             raise ScpiError(-113, head)
         try:
             do: Callable[[list[str]], Awaitable[Answer]] = getattr(self, f"_{verb}")
-            return await do(given)
+            return await do(parameters)
         except NoStageError:
             raise
         except StageError as error:
@@ -121,80 +121,80 @@ class ScpiSession:
 
     # -- common commands, system ---------------------------------------------------------------------------------------
 
-    async def _idn(self, given: list[str]) -> str:
-        _no_more_than(given, 0)
+    async def _idn(self, parameters: list[str]) -> str:
+        _no_more_than(parameters, 0)
         told = self._stage.description
         return f"pkxyz_ctrl,{told['stage']},{told['controller']},{version('pkxyz-ctrl')}".replace(" ", "_")
 
-    async def _rst(self, given: list[str]) -> None:
-        _no_more_than(given, 0)
-        await self._stop(given)
-        self._velocity_m_per_s = self._pace_most.velocity_m_per_s
+    async def _rst(self, parameters: list[str]) -> None:
+        _no_more_than(parameters, 0)
+        await self._stop(parameters)
+        self._velocity_m_per_s = self._motion_limits.velocity_m_per_s
 
-    async def _cls(self, given: list[str]) -> None:
-        _no_more_than(given, 0)
+    async def _cls(self, parameters: list[str]) -> None:
+        _no_more_than(parameters, 0)
         self.errors.clear()
 
-    async def _opc(self, given: list[str]) -> str:
-        await self._wai(given)
+    async def _opc(self, parameters: list[str]) -> str:
+        await self._wai(parameters)
         return "1"
 
-    async def _wai(self, given: list[str]) -> None:
-        _no_more_than(given, 0)
+    async def _wai(self, parameters: list[str]) -> None:
+        _no_more_than(parameters, 0)
         await asyncio.gather(*self._running)
 
-    async def _error(self, given: list[str]) -> str:
-        _no_more_than(given, 0)
+    async def _error(self, parameters: list[str]) -> str:
+        _no_more_than(parameters, 0)
         return self.errors.take()
 
-    async def _count(self, given: list[str]) -> str:
+    async def _count(self, parameters: list[str]) -> str:
         return str(len(self.errors))
 
-    async def _version(self, given: list[str]) -> str:
+    async def _version(self, parameters: list[str]) -> str:
         return "1999.0"
 
-    async def _control(self, given: list[str]) -> None:
-        await (self._moves.take_control() if _number(given, 0) else self._moves.give_control())
+    async def _control(self, parameters: list[str]) -> None:
+        await (self._moves.take_control() if _number(parameters, 0) else self._moves.give_control())
 
     # -- what is so ----------------------------------------------------------------------------------------------------
 
-    async def _state(self, given: list[str]) -> str:
+    async def _state(self, parameters: list[str]) -> str:
         return self._stage.status.activity
 
-    async def _words(self, given: list[str]) -> str:
+    async def _words(self, parameters: list[str]) -> str:
         status = self._stage.status
         return '"' + (status.last_fault or status.words).replace('"', "'").replace("\n", " ") + '"'
 
-    async def _in_position(self, given: list[str]) -> str:
+    async def _in_position(self, parameters: list[str]) -> str:
         return str(int((await self._stage.next_status()).in_position))
 
-    async def _position(self, given: list[str]) -> str:
-        return _axes_of((await self._stage.next_status()).position_m, given)
+    async def _position(self, parameters: list[str]) -> str:
+        return _axes_of((await self._stage.next_status()).position_m, parameters)
 
-    async def _target(self, given: list[str]) -> str:
-        return _axes_of((await self._stage.next_status()).target_m, given)
+    async def _target(self, parameters: list[str]) -> str:
+        return _axes_of((await self._stage.next_status()).target_m, parameters)
 
-    async def _limits(self, given: list[str]) -> str:
-        if len(given) != 1:
+    async def _limits(self, parameters: list[str]) -> str:
+        if len(parameters) != 1:
             raise ScpiError(-109, "an axis: X, Y or Z")
-        return ",".join(_text(v) for v in (await self._stage.next_status()).range_m[AXES.index(_axis(given[0]))])
+        return ",".join(_text(v) for v in (await self._stage.next_status()).range_m[AXES.index(_axis(parameters[0]))])
 
     # -- what moves ----------------------------------------------------------------------------------------------------
 
-    async def _move(self, given: list[str]) -> None:
-        if not given or len(given) % 2:
+    async def _move(self, parameters: list[str]) -> None:
+        if not parameters or len(parameters) % 2:
             raise ScpiError(-109, "an axis and a target in m: MOVE X,1e-6")
-        targets = {_axis(axis): _number(given, 2 * n + 1) for n, axis in enumerate(given[::2])}
+        targets = {_axis(axis): _number(parameters, 2 * n + 1) for n, axis in enumerate(parameters[::2])}
         await self._moves.take_control()
-        pace = self._pace_most._replace(velocity_m_per_s=self._velocity_m_per_s)
-        await self._begin(self._stage.move_to(**_named(targets), **pace._asdict(), wait=False))
+        limits = self._motion_limits._replace(velocity_m_per_s=self._velocity_m_per_s)
+        await self._begin(self._stage.move_to(**_named(targets), **limits._asdict(), wait=False))
 
-    async def _by(self, given: list[str]) -> None:
-        _no_more_than(given, 2)
-        way = {_axis(given[0] if given else ""): _number(given, 1)}
+    async def _by(self, parameters: list[str]) -> None:
+        _no_more_than(parameters, 2)
+        way = {_axis(parameters[0] if parameters else ""): _number(parameters, 1)}
         await self._moves.take_control()
-        pace = self._pace_most._replace(velocity_m_per_s=self._velocity_m_per_s)
-        await self._begin(self._stage.move_by(**_named(way), **pace._asdict(), wait=False))
+        limits = self._motion_limits._replace(velocity_m_per_s=self._velocity_m_per_s)
+        await self._begin(self._stage.move_by(**_named(way), **limits._asdict(), wait=False))
 
     async def _begin(self, asking: Awaitable[Command]) -> None:
         """What is refused is an error of the line itself; the end is waited for by *OPC?."""
@@ -209,50 +209,50 @@ class ScpiSession:
             if _TAKEN_UP not in str(error):
                 self.errors.put(_said(error))
 
-    async def _velocity(self, given: list[str]) -> str | None:
-        if not given:
+    async def _velocity(self, parameters: list[str]) -> str | None:
+        if not parameters:
             return _text(self._velocity_m_per_s)
-        velocity, most = _number(given, 0), self._pace_most.velocity_m_per_s
+        velocity, most = _number(parameters, 0), self._motion_limits.velocity_m_per_s
         if not 0.0 < velocity <= most:
             raise ScpiError(-222, f"velocity {velocity:g} m/s, limits 0 to {most:g} m/s")
         self._velocity_m_per_s = velocity
         return None
 
-    async def _stop(self, given: list[str]) -> None:
-        _no_more_than(given, 0)
+    async def _stop(self, parameters: list[str]) -> None:
+        _no_more_than(parameters, 0)
         await self._moves.stand_still()
 
-    async def _release(self, given: list[str]) -> None:
+    async def _release(self, parameters: list[str]) -> None:
         await self._stage.release()
 
-    async def _scan(self, given: list[str]) -> None:
-        if len(given) != 1:
+    async def _scan(self, parameters: list[str]) -> None:
+        if len(parameters) != 1:
             raise ScpiError(-109, "the name of a shipped scenario")
         await self._moves.take_control()
-        await self._begin(self._stage.follow(given[0].strip("\"'"), wait=False))
+        await self._begin(self._stage.follow(parameters[0].strip("\"'"), wait=False))
 
-    async def _plain_verb(self, verb: str, given: list[str]) -> None:
-        _no_more_than(given, 0)
+    async def _plain_verb(self, verb: str, parameters: list[str]) -> None:
+        _no_more_than(parameters, 0)
         await self._moves.take_control()
         await getattr(self._stage, verb)()
 
-    async def _home(self, given: list[str]) -> None:
-        await self._plain_verb("home", given)
+    async def _home(self, parameters: list[str]) -> None:
+        await self._plain_verb("home", parameters)
 
-    async def _enable(self, given: list[str]) -> None:
-        await self._plain_verb("enable", given)
+    async def _enable(self, parameters: list[str]) -> None:
+        await self._plain_verb("enable", parameters)
 
-    async def _disable(self, given: list[str]) -> None:
-        await self._plain_verb("disable", given)
+    async def _disable(self, parameters: list[str]) -> None:
+        await self._plain_verb("disable", parameters)
 
-    async def _park(self, given: list[str]) -> None:
-        await self._plain_verb("park", given)
+    async def _park(self, parameters: list[str]) -> None:
+        await self._plain_verb("park", parameters)
 
-    async def _clear(self, given: list[str]) -> None:
-        await self._plain_verb("clear", given)
+    async def _clear(self, parameters: list[str]) -> None:
+        await self._plain_verb("clear", parameters)
 
-    async def _capture(self, given: list[str]) -> bytes:
-        seconds = _number(given, 0)
+    async def _capture(self, parameters: list[str]) -> bytes:
+        seconds = _number(parameters, 0)
         if not 0.0 < seconds <= CAPTURE_MOST_S:
             raise ScpiError(-222, f"{seconds:g} s, limits 0 to {CAPTURE_MOST_S:g} s")
         return _block(await self._stage.capture(*_FIELDS, seconds=seconds))
@@ -303,23 +303,23 @@ def _named(values: dict[Axis, float]) -> dict[str, Any]:
     return {str(axis): value for axis, value in values.items()}
 
 
-def _number(given: list[str], n: int) -> float:
-    if len(given) <= n:
+def _number(parameters: list[str], n: int) -> float:
+    if len(parameters) <= n:
         raise ScpiError(-109)
     with contextlib.suppress(ValueError):
-        if math.isfinite(value := float(given[n])):
+        if math.isfinite(value := float(parameters[n])):
             return value
-    raise ScpiError(-104, f"{given[n]!r} is no number")
+    raise ScpiError(-104, f"{parameters[n]!r} is no number")
 
 
-def _no_more_than(given: list[str], most: int) -> None:
-    if len(given) > most:
-        raise ScpiError(-108, ",".join(given[most:]))
+def _no_more_than(parameters: list[str], most: int) -> None:
+    if len(parameters) > most:
+        raise ScpiError(-108, ",".join(parameters[most:]))
 
 
-def _axes_of(values: np.ndarray, given: list[str]) -> str:
-    _no_more_than(given, 1)
-    chosen = [AXES.index(_axis(given[0]))] if given else range(3)
+def _axes_of(values: np.ndarray, parameters: list[str]) -> str:
+    _no_more_than(parameters, 1)
+    chosen = [AXES.index(_axis(parameters[0]))] if parameters else range(3)
     return ",".join(_text(float(values[n])) for n in chosen)
 
 

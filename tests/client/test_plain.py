@@ -3,7 +3,7 @@
 import asyncio
 import inspect
 import threading
-from typing import Any, get_type_hints
+from typing import Annotated, Any, get_type_hints
 
 import pytest
 
@@ -27,6 +27,13 @@ def test_a_verb_keeps_its_arguments_its_words_and_what_it_returns(verb):
     assert inspect.getdoc(waited) == inspect.getdoc(asked)
     assert not inspect.iscoroutinefunction(waited)
     assert waited.__qualname__ == f"Stage.{verb}"
+
+
+@pytest.mark.parametrize("verb", ["move_to", "move_by", "name_position"])
+@pytest.mark.parametrize("axis", ["x", "y", "z"])
+def test_a_length_says_its_unit_where_a_call_is_completed(verb, axis):
+    length = get_type_hints(getattr(Stage, verb), include_extras=True)[axis]
+    assert length == Annotated[float, "m"] | None
 
 
 class Echo(AsyncStage):

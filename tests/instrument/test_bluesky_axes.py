@@ -17,6 +17,8 @@ from pkxyz_ctrl.client.plain import Stage
 from pkxyz_ctrl.client.reply import StageError
 from pkxyz_ctrl.instrument.bluesky_axes import StageAxis, axes
 
+pytestmark = pytest.mark.at_rate
+
 
 @pytest.fixture(scope="module")
 def stage(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Stage]:

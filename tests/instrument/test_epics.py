@@ -23,6 +23,8 @@ from ophyd_async.epics.motor import Motor, MotorLimitsError
 from pkxyz_ctrl.client.plain import Stage
 from pkxyz_ctrl.instrument.motor_record import FIELDS
 
+pytestmark = pytest.mark.at_rate
+
 PORT = int(os.environ["EPICS_CA_SERVER_PORT"])
 
 

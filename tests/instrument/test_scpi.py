@@ -16,6 +16,8 @@ from pkxyz_ctrl.instrument.axis_moves import AxisMoves
 from pkxyz_ctrl.instrument.scpi import HEADERS, LINE_MOST, ScpiSession
 from pkxyz_ctrl.instrument.scpi_errors import ErrorQueue, ScpiError
 
+pytestmark = pytest.mark.at_rate
+
 
 @pytest.fixture(scope="module")
 def address(tmp_path_factory: pytest.TempPathFactory) -> Iterator[str]:

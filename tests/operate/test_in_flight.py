@@ -23,7 +23,7 @@ def sampled(motion):
     return motion.sample(np.append(np.arange(0, motion.total_s, PERIOD_S), motion.total_s))
 
 
-@settings(max_examples=80, deadline=None)
+@settings(max_examples=80)
 @given(states, three(10e-6).map(np.array))
 def test_a_new_target_is_reached_from_any_state_inside_the_limits(state, target):
     motion = towards(state, target, LIMITS)
@@ -38,7 +38,7 @@ def test_a_new_target_is_reached_from_any_state_inside_the_limits(state, target)
     assert not len(jerk) or jerk.max() <= LIMITS.jerk_m_per_s3 * (1 + 1e-4)
 
 
-@settings(max_examples=60, deadline=None)
+@settings(max_examples=60)
 @given(states)
 def test_a_stop_comes_to_rest_and_stays(state):
     motion = to_rest(state, LIMITS)

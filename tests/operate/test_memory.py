@@ -1,9 +1,12 @@
 """Memory that a loop shares: whose it is."""
 
 import numpy as np
+import pytest
 
 from hil.operate.commands import ANSWER
 from hil.operate.memory import StageMemory
+
+pytestmark = pytest.mark.at_rate
 
 
 def _said(memory, words):

@@ -29,14 +29,14 @@ def is_held(position: np.ndarray) -> bool:
     return bool((strokes >= limits.stroke_min_m).all() and (strokes <= limits.stroke_max_m).all())
 
 
-@settings(max_examples=300, deadline=None)
+@settings(max_examples=300)
 @given(positions)
 def test_what_is_held_is_what_the_stage_says(position):
     assert REACH.holds(position) == is_held(position)
     assert (REACH.target_refusal(position) is None) == REACH.holds(position)
 
 
-@settings(max_examples=100, deadline=None)
+@settings(max_examples=100)
 @given(st.integers(0, 2), st.sampled_from([-1.0, 1.0]), st.floats(1e-6, 35e-6))
 def test_the_farthest_is_held_and_a_nanometre_more_is_not(axis, direction, z_m):
     start = np.array([0.0, 0.0, z_m])
@@ -47,7 +47,7 @@ def test_the_farthest_is_held_and_a_nanometre_more_is_not(axis, direction, z_m):
     assert not REACH.holds(start + (far_m + 1e-9) * step)
 
 
-@settings(max_examples=200, deadline=None)
+@settings(max_examples=200)
 @given(st.integers(0, 10_000))
 def test_motions_are_judged_as_trajectories_are(seed):
     """Random short motions about the middle, some too fast, some too far out."""

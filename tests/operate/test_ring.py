@@ -13,6 +13,8 @@ from hil.operate.commands import TICK
 from hil.operate.memory import StageMemory
 from hil.operate.ring import Reader, Writer, bytes_for, slot_of
 
+pytestmark = pytest.mark.at_rate
+
 RECORD = np.dtype([("n", "<u8"), ("x", "<f8", (7,))])
 
 
@@ -28,7 +30,7 @@ def number_of(data: bytes) -> int:
     return int(np.frombuffer(data, RECORD)["n"][0])
 
 
-@settings(max_examples=60, deadline=None)
+@settings(max_examples=60)
 @given(st.lists(st.integers(0, 9), max_size=40), st.integers(2, 9))
 def test_what_was_not_overwritten_is_read_in_order_and_the_rest_is_counted(bursts, slots):
     memory = ring(slots)

@@ -6,11 +6,14 @@ import subprocess
 import sys
 import time
 
+import pytest
 from patience import patient_bus, patient_law
 
 import pkxyz_ctrl
 from pkxyz_ctrl.client import place
 from pkxyz_ctrl.client.reply import RefusedError
+
+pytestmark = pytest.mark.at_rate
 
 
 def test_a_scan_runs_and_gives_way(tmp_path, monkeypatch):

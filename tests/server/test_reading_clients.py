@@ -3,9 +3,12 @@
 import asyncio
 
 import numpy as np
+import pytest
 
-from hil.server.client import Client
-from pkxyz_ctrl.client.protocol import Block
+from hil.server.client import Client, Moment
+from pkxyz_ctrl.client.protocol import Block, packed
+
+pytestmark = pytest.mark.at_rate
 
 
 def test_one_that_opens_recordings_and_reads_nothing_fills_no_memory():
@@ -16,10 +19,27 @@ def test_one_that_opens_recordings_and_reads_nothing_fills_no_memory():
         client.show_opened({"name": "x"}, block)
         shown += 1
     assert shown == 4
-    client.show(block)
+    client.fields, moment = ("estimate_m",), Moment(0, {"estimate_m": np.zeros((4, 3))})
+    client.show(moment)
     assert client.lost == 4
     for _ in range(2 * shown):
         asyncio.run(client.next_said())
     assert client.said.empty()
-    client.show(block)
+    client.show(moment)
     assert (client.lost, client.said.qsize()) == (0, 1)
+
+
+def test_what_clients_see_alike_is_packed_once_and_is_what_each_asked_for():
+    """By fields, precision and rows lost; each one's block is what it would be alone."""
+    values = {"estimate_m": np.arange(12.0).reshape(4, 3), "tick": np.arange(4)}
+    asked = [(("estimate_m",), "f4", 0), (("tick", "estimate_m"), "f8", 0), (("estimate_m",), "f4", 7)]
+    moment = Moment(5, values)
+    for fields, precision, lost in asked:
+        clients = [Client(n) for n in range(3)]
+        for client in clients:
+            client.fields, client.precision, client.lost = fields, precision, lost
+            client.show(moment)
+        first, *others = (asyncio.run(client.next_said()) for client in clients)
+        assert all(other is first for other in others)
+        assert first == packed(Block(5, {name: values[name] for name in fields}, lost), precision)
+        assert [client.lost for client in clients] == [0, 0, 0]

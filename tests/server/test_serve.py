@@ -22,6 +22,8 @@ from pkxyz_ctrl.client.protocol import SUBPROTOCOL, TOKEN_PREFIX
 from pkxyz_ctrl.client.reply import RefusedError
 from pkxyz_ctrl.safety.modes import Mode
 
+pytestmark = pytest.mark.at_rate
+
 
 @pytest.fixture(scope="module")
 def server(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Server]:

@@ -2,6 +2,7 @@
 
 import dataclasses
 import json
+import math
 import sys
 from pathlib import Path
 from typing import Annotated, Any
@@ -18,6 +19,15 @@ _OTHERS = (
     "move", "path", "status", "settings", "frame", "tilt", "name", "forget", "go", "restore", "law", "quiet", "settle",
     "limits",
 )  # fmt: skip
+
+
+_NEEDED = {
+    "frame": (),
+    "settle": ("window_m", "dwell_s"),
+    "limits": ("velocity_m_per_s", "acceleration_m_per_s2", "jerk_m_per_s3"),
+}
+_MAY = {"frame": ("rotation_deg", "slope_x", "slope_y", "origin_m", "scale"), "settle": ("sigmas",), "limits": ()}
+_POINTS = ("origin_m", "scale")
 
 
 def ask(
@@ -42,7 +52,7 @@ def ask(
 
     if what not in (*_PLAIN, *_OTHERS):
         raise ConfigError(f"{what!r} can't be asked; what can: {', '.join((*_PLAIN, *_OTHERS))}")
-    given = arguments or []
+    words = arguments or []
     try:
         with pkxyz_ctrl.connect(url, name=name, control=what not in _FREE) as stage:
             if what == "status":
@@ -53,11 +63,11 @@ def ask(
                 return
             if what == "move":
                 move = stage.move_by if by else stage.move_to
-                command = move(**_coordinates(given))
+                command = move(**_coordinates(words))
             elif what == "path":
-                command = stage.follow(**_path(given))
+                command = stage.follow(**_path(words))
             elif what in _OTHERS:
-                command = _set(stage, what, given)
+                command = _set(stage, what, words)
             else:
                 command = getattr(stage, what.replace("-", "_"))()
     except StageError as error:
@@ -70,14 +80,11 @@ def ask(
     )
 
 
-def _coordinates(given: list[str]) -> dict[str, Any]:
+def _coordinates(words: list[str]) -> dict[str, Any]:
     found: dict[str, Any] = {}
-    for each in given:
+    for each in words:
         axis, _, value = each.partition("=")
-        try:
-            found[axis] = float(value)
-        except ValueError:
-            raise ConfigError(f"{each!r}: a coordinate is x=1e-6, in m") from None
+        found[axis] = _numbers(value, 1)[0]
         if axis not in ("x", "y", "z"):
             raise ConfigError(f"{each!r}: the axes are x, y and z")
     if not found:
@@ -85,12 +92,12 @@ def _coordinates(given: list[str]) -> dict[str, Any]:
     return found
 
 
-def _path(given: list[str]) -> dict[str, Any]:
-    if len(given) != 1:
+def _path(words: list[str]) -> dict[str, Any]:
+    if len(words) != 1:
         raise ConfigError("path: give one, a shipped scenario, a .csv table or a .json of segments")
-    file = Path(given[0])
+    file = Path(words[0])
     if file.suffix not in (".csv", ".json"):
-        return {"scenario": given[0]}
+        return {"scenario": words[0]}
     try:
         text = file.read_text(encoding="utf-8")
         return {"table_csv": text} if file.suffix == ".csv" else {"segments": json.loads(text)}
@@ -98,24 +105,25 @@ def _path(given: list[str]) -> dict[str, Any]:
         raise ConfigError(f"{file}: {error}") from None
 
 
-def _set(stage: Any, what: str, given: list[str]) -> Any:
+def _set(stage: Any, what: str, words: list[str]) -> Any:
     """What is not a motion, and goes to a named position."""
     if what in ("frame", "settle", "limits"):
-        return {"frame": stage.set_frame, "settle": stage.settle_window, "limits": stage.limits}[what](**_named(given))
+        verb = {"frame": stage.set_frame, "settle": stage.settle_window, "limits": stage.limits}[what]
+        return verb(**_named(what, words))
     if what == "tilt":
-        if len(given) != 3:
+        if len(words) != 3:
             raise ConfigError("tilt: give three points, each x,y,z in m")
-        return stage.tilt_plane(*(_numbers(point) for point in given))
-    if len(given) != 1:
+        return stage.tilt_plane(*(_numbers(point, 3) for point in words))
+    if len(words) != 1:
         raise ConfigError(f"{what}: give one argument; see -h")
     if what == "law":
-        return stage.change_law(**_law(given[0]))
+        return stage.change_law(**_law(words[0]))
     if what == "quiet":
-        if given[0] not in ("on", "off"):
-            raise ConfigError(f"quiet: {given[0]!r} is neither on nor off")
-        return stage.quiet_holds(given[0] == "on")
+        if words[0] not in ("on", "off"):
+            raise ConfigError(f"quiet: {words[0]!r} is neither on nor off")
+        return stage.quiet_holds(words[0] == "on")
     verbs = {"name": stage.name_position, "forget": stage.forget_position, "go": stage.move_to_position}
-    return (verbs | {"restore": stage.restore_settings})[what](given[0])
+    return (verbs | {"restore": stage.restore_settings})[what](words[0])
 
 
 def _law(name: str) -> dict[str, str]:
@@ -127,26 +135,31 @@ def _law(name: str) -> dict[str, str]:
         raise ConfigError(f"{name}: {error}") from None
 
 
-def _named(given: list[str]) -> dict[str, Any]:
+def _named(what: str, words: list[str]) -> dict[str, Any]:
     found: dict[str, Any] = {}
-    for each in given:
+    for each in words:
         key, _, value = each.partition("=")
-        numbers = _numbers(value)
-        found[key] = numbers if key in ("origin_m", "scale") else numbers[0]
-    known = {
-        "rotation_deg", "slope_x", "slope_y", "origin_m", "scale", "window_m", "dwell_s", "sigmas", "velocity_m_per_s",
-        "acceleration_m_per_s2", "jerk_m_per_s3",
-    }  # fmt: skip
-    if not found or not found.keys() <= known:
-        raise ConfigError(f"{' '.join(given)!r}: give key=value, several with a space between; see -h")
+        numbers = _numbers(value, 3 if key in _POINTS else 1)
+        found[key] = numbers if key in _POINTS else numbers[0]
+    needed, known = _NEEDED[what], (*_NEEDED[what], *_MAY[what])
+    if not found or not found.keys() <= set(known):
+        raise ConfigError(f"{what}: {' '.join(words)!r}: give key=value of {', '.join(known)}")
+    if missing := [key for key in needed if key not in found]:
+        raise ConfigError(f"{what}: give {' and '.join(missing)}, too")
     return found
 
 
-def _numbers(text: str) -> tuple[float, ...]:
+def _numbers(text: str, count: int) -> tuple[float, ...]:
     try:
-        return tuple(float(part) for part in text.split(","))
+        found = tuple(float(part) for part in text.split(","))
     except ValueError:
-        raise ConfigError(f"{text!r}: numbers are wanted, such as 1e-6, or 1e-6,0,18e-6") from None
+        found = ()
+    if len(found) != count or not all(math.isfinite(number) for number in found):
+        raise ConfigError(
+            f"{text!r}: {'a number is' if count == 1 else 'three numbers are'} wanted, such as "
+            f"{'1e-6' if count == 1 else '1e-6,0,18e-6'}"
+        )
+    return found
 
 
 def _show_settings(settings: Any, as_json: bool) -> None:

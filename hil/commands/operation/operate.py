@@ -6,6 +6,7 @@ from typing import Annotated, Literal
 import typer
 
 from hil.commands.run import Report
+from hil.screen.terminal import note
 from pkxyz_ctrl.config.files import ConfigError
 
 Name = Annotated[str, typer.Option(help="What the stage is called, where there are several.")]
@@ -46,7 +47,7 @@ def operate(
     law = load("controllers", controller, ControllerConfig)
     setup = bare_setup(stage, "nominal", law, config, 1, autostart=False)
     try:
-        run_loop(setup, settings, name, {"stage": stage, "controller": controller, "bus": bus}, _say)
+        run_loop(setup, settings, name, {"stage": stage, "controller": controller, "bus": bus}, note)
     except StartUpError as error:
         print(f"pkxyz: {error}", file=sys.stderr)
         raise typer.Exit(1) from None
@@ -58,7 +59,3 @@ def _silence(value: str) -> Literal["hold", "park"]:
     if value == "hold":
         return "hold"
     raise ConfigError(f"--on-silence: {value!r} is neither hold nor park")
-
-
-def _say(words: str) -> None:
-    print(words, file=sys.stderr, flush=True)

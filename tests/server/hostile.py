@@ -1,0 +1,152 @@
+"""Hostile clients against `pkxyz serve` itself: ``python tests/server/hostile.py [MESSAGES]``; writes hostile.json.
+
+Eight connections send random messages as fast as they are taken, others subscribe and never read, others come without
+a token or from another page. Meanwhile one looks on. Reported are what moved, the server's memory, and ticks
+missed beside as long without them. On a busy machine ticks are missed in either.
+"""
+
+import asyncio
+import contextlib
+import json
+import os
+import signal
+import subprocess
+import sys
+import tempfile
+import time
+from pathlib import Path
+
+import numpy as np
+from websockets.asyncio.client import connect
+from websockets.exceptions import ConnectionClosed, InvalidStatus
+
+from hil.operate.commands import Verb
+from pkxyz_ctrl.client.protocol import SUBPROTOCOL, TOKEN_PREFIX
+from pkxyz_ctrl.client.stage import AsyncStage, connect_async
+
+SENDERS, NOT_READING, STRANGERS = 8, 12, 200
+FREE = ("stop", "release")  # need no control, and do what they say
+REPORT = Path(__file__).with_suffix(".json")
+NAME = f"hostile-{os.getpid()}"
+
+
+def random_text(rng: np.random.Generator) -> str:
+    """Text, JSON, or something that looks like a wish."""
+    words = [v.name.lower() for v in Verb] + ["subscribe", "preview", "take", "", "jog_again", "jog_end", "__class__"]
+    values = [0, -1, 1e300, float("nan"), "x", None, True, [], {}, [[[]]], "raster", "../../etc/passwd", 10**400]
+    keys = ["x_m", "axis", "direction", "window_m", "scenario", "segments", "fields", "relative", "tag", "precision"]
+    kind = rng.integers(4)
+    if kind == 0:
+        return bytes(rng.integers(32, 127, rng.integers(0, 60)).tolist()).decode()
+    message = {keys[rng.integers(len(keys))]: values[rng.integers(len(values))] for _ in range(3)}
+    return json.dumps(message | ({"do": words[rng.integers(len(words))]} if kind > 1 else {}))
+
+
+def resident_mb(pid: int) -> float:
+    return int(Path(f"/proc/{pid}/statm").read_text().split()[1]) * os.sysconf("SC_PAGE_SIZE") / 1e6
+
+
+async def sending(address: str, token: str, count: int, seed: int) -> dict[str, int]:
+    """So many messages; comes back where it is thrown out."""
+    rng, sent, thrown_out = np.random.default_rng(seed), 0, 0
+    while sent < count:
+        with contextlib.suppress(ConnectionClosed, OSError, InvalidStatus):
+            async with connect(address, subprotocols=[SUBPROTOCOL, TOKEN_PREFIX + token], max_size=None) as socket:  # type: ignore[list-item]
+                reading = asyncio.create_task(_read(socket))
+                try:
+                    while sent < count:
+                        text = random_text(rng)
+                        if not any(f'"{word}"' in text for word in FREE):
+                            await socket.send(text)
+                        sent += 1
+                        await asyncio.sleep(0)
+                finally:
+                    reading.cancel()
+        thrown_out += sent < count
+    return {"sent": sent, "thrown_out": thrown_out}
+
+
+async def _read(socket: object) -> None:
+    with contextlib.suppress(ConnectionClosed):
+        async for _ in socket:  # type: ignore[attr-defined]
+            pass
+
+
+async def strangers(address: str) -> int:
+    """Without a token, with a wrong one, from another page: how many got in."""
+    inside = 0
+    for n in range(STRANGERS):
+        offered = [SUBPROTOCOL, TOKEN_PREFIX + "x" * (n % 3)]
+        origin = "http://example.org" if n % 2 else None
+        try:
+            async with connect(address, subprotocols=offered, origin=origin) as socket:  # type: ignore[arg-type]
+                await asyncio.wait_for(socket.recv(), 1.0)
+                inside += 1
+        except (InvalidStatus, ConnectionClosed, OSError, TimeoutError):
+            pass
+    return inside
+
+
+async def measured(url: str, token: str, server: int, messages: int) -> dict[str, object]:
+    """One looks on, the others come."""
+    address = url.replace("http", "ws", 1).rstrip("/") + "/stage"
+    async with connect_async(url, token, control=True) as stage:
+        while stage.status.activity == "starting":
+            await stage.next_status()
+        at_rest_mb = resident_mb(server)
+        begin, before = time.monotonic(), await _missed(stage)
+        deaf = []
+        for _ in range(NOT_READING):
+            socket = await connect(address, subprotocols=[SUBPROTOCOL, TOKEN_PREFIX + token], max_queue=1)  # type: ignore[list-item]
+            await socket.send('{"do": "subscribe", "fields": ["estimate_m", "voltage_v", "reference_m"]}')
+            socket.transport.pause_reading()
+            deaf.append(socket)
+        target = np.array((await stage.next_status()).target_m)
+        most_mb = at_rest_mb
+        each = messages // SENDERS
+        work = asyncio.gather(*(sending(address, token, each, seed) for seed in range(SENDERS)), strangers(address))
+        while not work.done():
+            await asyncio.sleep(0.2)
+            most_mb = max(most_mb, resident_mb(server))
+        *senders, inside = await work
+        lasted_s, missed = time.monotonic() - begin, await _missed(stage) - before
+        status = await stage.next_status()
+        moved_m = float(np.abs(np.array(status.target_m) - target).max())
+        for socket in deaf:
+            socket.transport.abort()
+        quiet_from = await _missed(stage)
+        await asyncio.sleep(lasted_s)
+        return {
+            "messages": sum(s["sent"] for s in senders), "thrown_out": sum(s["thrown_out"] for s in senders),
+            "strangers": STRANGERS, "strangers_inside": inside, "not_reading": NOT_READING,
+            "seconds": round(lasted_s, 1), "target_moved_m": moved_m, "activity": status.activity,
+            "memory_before_mb": round(at_rest_mb, 1), "memory_most_mb": round(most_mb, 1),
+            "ticks_missed": missed, "ticks_missed_as_long_without": await _missed(stage) - quiet_from,
+            "load_average": round(os.getloadavg()[0], 1), "cores": os.cpu_count(),
+        }  # fmt: skip
+
+
+async def _missed(stage: AsyncStage) -> int:
+    return (await stage.next_status()).missed_ticks
+
+
+def main() -> None:
+    messages = int(sys.argv[1]) if len(sys.argv) > 1 else 100_000
+    with tempfile.TemporaryDirectory() as folder:
+        words = ["serve", "--name", NAME, "--port", "0", "--json", "--saves", folder, "--settings", folder]
+        process = subprocess.Popen([sys.executable, "-m", "hil", *words], stdout=subprocess.PIPE, text=True)
+        try:
+            assert process.stdout is not None
+            url, _, token = json.loads(process.stdout.readline())["url"].partition("#")
+            found = asyncio.run(measured(url, token, process.pid, messages))
+        finally:
+            process.send_signal(signal.SIGTERM)
+            process.wait(30)
+    REPORT.write_text(json.dumps(found, indent=1) + "\n", encoding="utf-8")
+    print(json.dumps(found, indent=1))
+    assert found["target_moved_m"] == 0.0
+    assert found["strangers_inside"] == 0
+
+
+if __name__ == "__main__":
+    main()
