@@ -3,12 +3,14 @@
 A block that can't run here says why, and its commands and options are still checked.
 """
 
+import re
 import subprocess
 import sys
 import tomllib
 from pathlib import Path
 
 import pytest
+from _pytest.mark import ParameterSet
 from fenced_blocks import Block, blocks, commands_of, inline_commands
 from generated_pages import commands
 from installed_wheel import install
@@ -17,10 +19,18 @@ ROOT = Path(__file__).parents[2]
 PAGES = [ROOT / "README.md", ROOT / "benchmarks" / "README.md", *sorted((ROOT / "docs").rglob("*.md"))]
 IDS = [page.relative_to(ROOT).as_posix() for page in PAGES]
 COMMANDS = dict(commands())
+AT_RATE = ("pkxyz plant", "pkxyz serve", "pkxyz operate", "pkxyz demo", "pkxyz latency", "--bus unix", "connect[(]")
 
 
 def runs(page: Path) -> list[Block]:
     return [b for b in blocks(page) if b.language in ("sh", "python") and b.reason is None]
+
+
+def marked(page: Path) -> ParameterSet:
+    """A page for a test, at rate where one of its commands is."""
+    at_rate = re.search("|".join(AT_RATE), "".join(b.text for b in runs(page)))
+    name = page.relative_to(ROOT).as_posix()
+    return pytest.param(page, id=name, marks=[pytest.mark.at_rate] if at_rate else [])
 
 
 @pytest.fixture(scope="module")
@@ -43,7 +53,8 @@ def test_what_runs_is_the_wheel(env: dict[str, str], tmp_path: Path) -> None:
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("page", [p for p in PAGES if runs(p)], ids=lambda p: p.relative_to(ROOT).as_posix())
+@pytest.mark.timeout(3600)
+@pytest.mark.parametrize("page", [marked(p) for p in PAGES if runs(p)])
 def test_the_blocks_of_a_page_run_in_order(page: Path, env: dict[str, str], tmp_path: Path) -> None:
     for block in runs(page):
         interpreter = [sys.executable, "-"] if block.language == "python" else ["bash", "-euo", "pipefail"]
@@ -55,7 +66,7 @@ def test_the_blocks_of_a_page_run_in_order(page: Path, env: dict[str, str], tmp_
             capture_output=True,
             text=True,
             check=False,
-            timeout=300,
+            timeout=1200,  # of kernels that are compiled on a busy machine
         )
         where = f"{page.relative_to(ROOT)}:{block.line}"
         assert done.returncode == 0, f"{where}\n{block.text}\n{done.stdout[-2000:]}{done.stderr[-2000:]}"

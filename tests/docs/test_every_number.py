@@ -113,10 +113,14 @@ MEASURED = [(n, told) for n, page in ANSWERS.items() for told in page.get("bench
 def test_what_was_measured_is_in_the_results(name: str, told: str) -> None:
     """As a figure's value, or in the words beside it, rounded as it is told."""
     results = json.loads((ROOT / "benchmarks" / "results.json").read_text(encoding="utf-8"))["figures"]
-    known = [float(f["value"]) for f in results] + [float(n) for f in results for n in re.findall(_NUMBER, f["detail"])]
+    known = [float(f["value"]) for f in results] + [
+        float(n.replace(" ", "")) for f in results for n in re.findall(_NUMBER, f["detail"])
+    ]
     for number in re.findall(_NUMBER, told):
         digits = len(number.partition(".")[2])
-        assert any(abs(abs(k) - abs(float(number))) <= 0.51 * 10**-digits for k in known), f"{name}: {told}"
+        assert any(abs(abs(k) - abs(float(number.replace(" ", "")))) <= 0.51 * 10**-digits for k in known), (
+            f"{name}: {told}"
+        )
 
 
 def test_numbers_are_found_with_their_units() -> None:

@@ -14,6 +14,9 @@ COMMANDS_MIN = 4.0
 the others; and as much again for looking.
 """
 
+PAGES_WORDS = 22_667
+"""Of README and docs at most: two thirds of the 34 000 that they once were."""
+
 
 def way() -> list[str]:
     """What is read: README to where it leads on, then the tutorial to the end of the first own law."""
@@ -37,3 +40,8 @@ def test_on_that_way_a_law_of_ones_own_runs() -> None:
     shown = [c for b in blocks(tutorial) if b.line < read and b.reason is None for c in commands_of(b.text)]
     assert any("--controller integral.toml" in c and c.startswith("pkxyz sil") for c in shown)
     assert shown[0] == "pkxyz sil"
+
+
+def test_pages_stay_two_thirds_as_long_as_they_were() -> None:
+    pages = [ROOT / "README.md", *(ROOT / "docs").rglob("*.md")]
+    assert sum(len(page.read_text(encoding="utf-8").split()) for page in pages) <= PAGES_WORDS

@@ -69,8 +69,8 @@ HOUSE: Mapping[str, Room] = MappingProxyType({
         "pkxyz_ctrl.design.margins", "pkxyz_ctrl.design.laws",
     )),
     # the harness: what the controller meets
-    "hil.bus": Room(("pkxyz_ctrl.can", "pkxyz_ctrl.compiled", "pkxyz_ctrl.io")),
-    "hil.node": Room(("pkxyz_ctrl.can", "pkxyz_ctrl.config")),
+    "hil.bus": Room(("pkxyz_ctrl.can", "pkxyz_ctrl.compiled", "pkxyz_ctrl.io", "pkxyz_ctrl")),
+    "hil.node": Room(("pkxyz_ctrl.can", "pkxyz_ctrl.config", "pkxyz_ctrl")),
     "hil.plant": Room(("sim.motion", "sim.structure", "sim", "pkxyz_ctrl.compiled", "pkxyz_ctrl.loop", "pkxyz_ctrl")),
     "hil.recording": Room(("pkxyz_ctrl.can", "pkxyz_ctrl.loop", "hil.bus")),
     "hil.faults": Room((
@@ -87,26 +87,29 @@ HOUSE: Mapping[str, Room] = MappingProxyType({
     "hil.server": Room(("pkxyz_ctrl.*", "hil.bus", "hil.recording", "hil.operate", "hil.runs")),
     # many times, for one question
     "hil.studies.spread": Room(("pkxyz_ctrl.*",)),
-    "hil.studies.wafer": Room(("sim.config", "pkxyz_ctrl.*", "hil.lanes", "hil.runs", "hil.studies.spread")),
     "hil.studies.margins": Room(("pkxyz_ctrl.*", "hil.lanes")),
     "hil.studies.identify": Room(("pkxyz_ctrl.*", "hil.lanes", "hil.studies.margins")),
+    "hil.studies.wafer": Room((
+        "sim.config", "pkxyz_ctrl.*", "hil.lanes", "hil.runs", "hil.studies.spread", "hil.studies.identify",
+    )),
     "hil.studies.tune": Room(("pkxyz_ctrl.*", "hil.lanes", "hil.runs", "hil.studies.spread")),
-    "hil.studies.faults": Room(("pkxyz_ctrl.*", "hil.faults", "hil.lanes", "hil.runs")),
+    "hil.studies.faults": Room(("pkxyz_ctrl.*", "hil.faults", "hil.lanes", "hil.runs", "hil.studies.spread")),
     "hil.studies": Room((
         "sim.config", "pkxyz_ctrl.*", "hil.recording", "hil.faults", "hil.lanes", "hil.runs", "hil.studies.spread",
         "hil.studies.margins", "hil.studies.faults",
     )),
     # what a person meets
     "hil.pictures": Room((
-        "pkxyz_ctrl.*", "hil.bus", "hil.recording", "hil.lanes", "hil.runs", "hil.studies.margins",
-        "hil.studies.identify", "hil.studies.tune", "hil.studies.faults", "hil.studies",
+        "pkxyz_ctrl.*", "hil.bus", "hil.recording", "hil.lanes", "hil.runs", "hil.studies.spread",
+        "hil.studies.margins", "hil.studies.identify", "hil.studies.tune", "hil.studies.faults", "hil.studies",
     )),
     "hil.pictures.wafer": Room(("pkxyz_ctrl.*", "hil.pictures", "hil.studies.wafer")),
     "hil.screen": Room(("pkxyz_ctrl.*", "hil.lanes", "hil.runs", "hil.studies.margins")),
     "hil.bench.rigs": Room(("sim.motion", "sim", "pkxyz_ctrl.*", "hil.lanes", "hil.runs")),
     "hil.bench": Room((
         "pkxyz_ctrl.*", "hil.bus", "hil.plant", "hil.recording", "hil.lanes", "hil.runs", "hil.studies.spread",
-        "hil.studies.margins", "hil.studies.identify", "hil.studies.tune", "hil.studies", "hil.bench.rigs",
+        "hil.studies.margins", "hil.studies.identify", "hil.studies.tune", "hil.studies.wafer", "hil.studies",
+        "hil.bench.rigs",
     )),
     "hil.api": Room((
         "pkxyz_ctrl.*", "hil.recording", "hil.lanes", "hil.runs", "hil.studies.spread", "hil.studies.margins",
@@ -119,7 +122,7 @@ HOUSE: Mapping[str, Room] = MappingProxyType({
     )),
     "hil.commands": Room((
         "pkxyz_ctrl.*", "hil.recording", "hil.faults", "hil.lanes", "hil.conformance", "hil.runs", "hil.studies",
-        "hil.pictures", "hil.screen", "hil.bench.rigs", "hil.bench",
+        "hil.pictures", "hil.screen", "hil.bench.rigs", "hil.bench", "hil.commands.studies",
     )),
     "hil.commands.operation": Room((
         "pkxyz_ctrl.*", "hil.lanes", "hil.conformance", "hil.operate", "hil.server", "hil.screen", "hil.commands",
@@ -134,7 +137,6 @@ HOUSE: Mapping[str, Room] = MappingProxyType({
 LIBRARIES: Mapping[str, tuple[str, ...]] = MappingProxyType(
     {
         "pkxyz_ctrl.can.dbc": ("canopen", "cantools", "pathlib", "re", "sys", "pydantic", *VALUES),
-        "pkxyz_ctrl.can.wire_doc": ("canopen", "sys", *VALUES),
         "pkxyz_ctrl.loop.cycle": (*NUMBERS, "typing"),
         "pkxyz_ctrl.loop.row": ("numpy",),
         "pkxyz_ctrl.loop.runtime": ("numpy", *VALUES),

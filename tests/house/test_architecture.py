@@ -214,3 +214,9 @@ def test_no_folder_has_more_modules_than_one_can_overlook():
     assert len(folders) > 40
     counted = {str(folder.relative_to(ROOT)): len(list(folder.glob("*.py"))) for folder in folders}
     assert {folder: count for folder, count in counted.items() if count > 16} == {}
+
+
+def test_every_room_has_its_folder_of_tests():
+    rooms = {room.split(".")[1] for room in AS_IT_IS.rooms if room.startswith(("hil.", "pkxyz_ctrl."))}
+    folders = {path.parent.relative_to(ROOT / "tests").parts[0] for path in (ROOT / "tests").rglob("test_*.py")}
+    assert rooms - folders == set()

@@ -26,7 +26,7 @@ def pkxyz(*words, file_limit_bytes=None):
     )
     script = f"import resource, sys; {limit}from hil.cli import main; sys.argv[0] = 'pkxyz'; main()"
     return subprocess.run(
-        [sys.executable, "-c", script, *map(str, words)], text=True, check=False, capture_output=True, timeout=300,
+        [sys.executable, "-c", script, *map(str, words)], text=True, check=False, capture_output=True, timeout=1200,
         env={**os.environ, "PYTHONPATH": str(ROOT)},
     )  # fmt: skip
 

@@ -9,6 +9,8 @@ import time
 import pytest
 from command_line import ROOT
 
+pytestmark = pytest.mark.at_rate
+
 _BEGIN = """
 import signal
 import hil.__main__ as way_in

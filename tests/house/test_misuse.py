@@ -19,6 +19,8 @@ from hil.screen.outputs import what_to_do
 from hil.studies.spread.processes import ctrl_c_kept_back
 from pkxyz_ctrl.config.files import CONFIG_DIR
 
+pytestmark = pytest.mark.at_rate
+
 ROOT = Path(__file__).parents[2]
 
 

@@ -106,6 +106,7 @@ def test_nothing():
 """
 
 
+@pytest.mark.at_rate
 @pytest.mark.parametrize("unmeasured", [False, True])
 def test_mutants_of_functions_imports_and_caches(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, unmeasured: bool

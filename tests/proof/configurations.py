@@ -1,12 +1,11 @@
 """What is explored: sizes, identifiers, how much may go wrong, and the start-up as short as it may be."""
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from typing import Final
 
 from pkxyz_ctrl.can import startup
 from pkxyz_ctrl.can.codec import Counts
 from pkxyz_ctrl.can.driver_config import DriverConfig
-from pkxyz_ctrl.can.sdo import SdoStep
 from pkxyz_ctrl.config.bus import BusConfig
 from pkxyz_ctrl.config.files import load
 from pkxyz_ctrl.safety.trips import Trip
@@ -77,22 +76,16 @@ loss: what is held back may never be let go."""
 OF_EACH_SORT = {0x2010: (0,), 0x2011: (0,), 0x2012: (0,), 0x1016: (1,), 0x1017: (0,), 0x1019: (0,)}
 
 
-def _of_each_sort(steps: tuple[SdoStep, ...]) -> tuple[SdoStep, ...]:
-    """Of the shipped steps, in their order, those that change what the node does from then on; what the others ask for
-    is the default of the EDS, so nothing of it is written. The dialogue treats all alike, and remembers nothing of one
-    but its answer.
+def few_settings(config: DriverConfig, count_step_max: int) -> tuple[startup.Setting, ...]:
+    """Of the shipped settings, in their order, the identity and those that change what the node does from then on; what
+    the others ask for is the default of the EDS, so nothing of it is written. The dialogue treats all alike, and
+    remembers nothing of one but its answer.
     """
-    return tuple(step for step in steps if step.index == 0x1018 or step.subindex in OF_EACH_SORT.get(step.index, ()))
-
-
-def few_questions(config: DriverConfig) -> tuple[SdoStep, ...]:
-    return _of_each_sort(startup.survey(config))
-
-
-def few_writes(config: DriverConfig, count_step_max: int, found: startup.Found) -> startup.Plan:
-    answered = {setting.key: setting.value for setting in startup.settings(config, count_step_max)}
-    planned = startup.plan(config, count_step_max, answered | dict(found))
-    return replace(planned, steps=_of_each_sort(planned.steps))
+    return tuple(
+        setting
+        for setting in startup.table(config, count_step_max)
+        if setting.index in (0x1000, 0x1018) or setting.subindex in OF_EACH_SORT.get(setting.index, ())
+    )
 
 
 def bus_of(configuration: Configuration) -> BusConfig:

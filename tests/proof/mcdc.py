@@ -33,8 +33,13 @@ MODULES = (
     "pkxyz_ctrl.can.driver",
     "pkxyz_ctrl.can.driver_rules",
     "pkxyz_ctrl.can.sense_input",
+    "pkxyz_ctrl.can.sdo",
+    "pkxyz_ctrl.can.start_plan",
+    "pkxyz_ctrl.can.start_sequence",
+    "pkxyz_ctrl.can.startup",
     "hil.node.drive",
     "hil.node.amplifier",
+    "hil.node.rules",
 )
 TESTS = (
     "tests/safety/test_safety_gate.py",
@@ -54,6 +59,7 @@ TESTS = (
     "tests/node/test_node_sdo.py",
     "tests/node/test_node_sync.py",
     "tests/node/test_node_conditions.py",
+    "tests/node/test_node_rules.py",
     "tests/proof/test_mode_machine.py",
 )
 REASONS = Path(__file__).with_name("uncovered.json")

@@ -29,8 +29,7 @@ import numpy as np
 from hil.node.amplifier import AmplifierNode
 from hil.node.object_dictionary import ObjectDictionary
 from pkxyz_ctrl.can.driver_rules import DriverState
-from pkxyz_ctrl.can.sdo import SdoDialogue
-from pkxyz_ctrl.can.start_sequence import StartSequence
+from pkxyz_ctrl.can.start_plan import VALUE
 from pkxyz_ctrl.loop.controller import Controller
 
 DRIVE_ID = 0x30A
@@ -49,18 +48,13 @@ UNREAD = {
     ("Controller", "_reference"),
     ("TransmitGate", "memory.blocked_frames"),
     ("AmplifierDriver", "emergencies"),
-    ("AmplifierDriver", "lost"),
     *(("AmplifierDriver", f"memory.{name}") for name in _DRIVER_WORDS),
-    ("StartSequence", "lost"),
-    ("StartSequence", "_never_booted"),  # words
     ("DriveReceiver", "crc"),
     ("SenseTransmitter", "crc"),
     ("SenseTransmitter", "counts"),
     ("SenseTransmitter", "_sent"),
     ("Alarm", "_armed_us"),  # not after due_us, where it only goes back to sleep
     ("SdoServer", "_multiplexer"),  # of a segmented transfer, which nobody begins
-    ("StartSequence", "_dialogue"),  # read in two states; `key` adds it there
-    ("StartSequence", "_found"),
     ("Lockstep", "_order"),
     ("Lockstep", "now_us"),
     ("Lockstep", "running"),
@@ -72,13 +66,11 @@ TEXTS = {
     ("TransmitGate", "latched"),
     ("TransmitGate", "memory.latched"),
     ("AmplifierDriver", "memory.failure"),
-    ("StartSequence", "failure"),
-    ("SdoDialogue", "failure"),
 }
 INSTANTS = {("TransmitGate", "memory.time_us"), ("Alarm", "due_us")}
-AGES = {("TransmitGate", "memory.time_us"), ("SenseTransmitter", "_sync_us")}
+AGES = {("TransmitGate", "memory.time_us"), ("SenseTransmitter", "sync_us")}
 AGES.add(("AmplifierDriver", "memory.node_heartbeat_us"))
-DURATIONS = {"_cycle_us", "_period_us", "_time_us", "_event_us", "_drive_timeout_us"}
+DURATIONS = {"cycle_us", "beat_period_us", "time_us", "_event_us", "_drive_timeout_us"}
 DRIVE_COUNTERS = {("TransmitGate", "memory.counter"), ("TransmitGate", "memory.counter_next")}
 SENSE_COUNTERS = {("SenseInput", "memory.counter")}
 SENT_COUNTERS = {("AmplifierDriver", f"memory.{name}") for name in ("drive_counter", "sync_count")}
@@ -95,14 +87,15 @@ CONSTANT_KINDS = {"PdoParameters", "ProcessCodec", "NodeObjects", "ObjectDiction
 CONSTANT = {
     "_w0", "_w1", "_w2", "_heartbeat_frame", "_sense_id", "_drive_id", "_sdo_request_id", "_sdo_response_id",
     "_emergency_id", "_node_heartbeat_id", "_flags_sent", "period_us", "_heartbeat_period_us", "_node_timeout_us",
-    "_node_period_us", "_drive_timeout_syncs", "node_id", "_protection", "_boot_us", "_turnaround_us", "_length",
+    "_node_period_us", "_drive_timeout_syncs", "node_id", "_protection", "_boot_us", "turnaround_us", "_length",
     "_protected", "_limit", "config", "_config", "_heartbeat", "can", "law", "row", "_consumers", "_plant",
+    "_settings",
 }  # fmt: skip
 
 RECORDS = {"AmplifierDriver", "TransmitGate", "SenseInput"}
 """Whose ``memory`` is a record of integers: each field is an attribute, ``memory.counter``."""
 
-_NOT_CONSTANT = {("StartSequence", "_dialogue"), ("DriveReceiver", "receive"), ("AmplifierNode", "_receivers")}
+_NOT_CONSTANT = {("DriveReceiver", "receive"), ("AmplifierNode", "_receivers")}
 _MUTABLE = {list, dict, set, deque, bytearray}
 
 
@@ -158,7 +151,7 @@ RULES = {
     ("DriveReceiver", "counter"): f"None if {{x}} is None or {DRIVE_ID} not in node._receivers"
     " else {x} - drive & 255",
     # measured anew at the next SYNC, read in the turn-around behind it
-    ("SenseTransmitter", "_cycle_us"): "{x} if node._sense._due_us is not None else 0",
+    ("SenseTransmitter", "cycle_us"): "{x} if node._sense.due_us is not None else 0",
     ("", "_sync_expected"): "{x} and ({x}[0] - sync) % 240",
     ("EmergencyProducer", "_active"): "tuple(sorted(map(int, {x})))",
     ("EmergencyProducer", "_waiting"): "tuple([frame[:2] for frame in {x}])",
@@ -171,13 +164,26 @@ RULES = {
 _PLAIN = {int, bool, bytes, str, type(None)}
 
 
+_ASKED = ("blocked", "event", "clearing", "restart_due", "is_restarting")
 _IN_DIALOGUE = (DriverState.IDENTIFYING, DriverState.CONFIGURING)
 
 
-def _dialogue(s: StartSequence, now_us: int) -> Any:
-    v = s._dialogue
-    told = plain(s._found), plain(v.values)
-    return len(v._steps), v._position, v._tries, bool(v.failure), max(v._deadline_us - now_us, -1), told
+# Of the start-up's record, what decides in every state; the others are read in the dialogue, or before the trial ends.
+_START_ALWAYS = ("tried_identity", "has_tried", "repeats_left", "is_tried", "times_left")
+_START_IN_DIALOGUE = ("known", "steps", "position", "tries", "is_planned")
+_BEFORE_TRIAL = (DriverState.RESETTING, DriverState.STARTING, DriverState.TRYING)
+
+
+def _start_up(record: np.void, state: DriverState, now_us: int) -> Any:
+    told = [record[name].tobytes() for name in _START_ALWAYS]
+    if state in _IN_DIALOGUE:
+        told += [record[name].tobytes() for name in _START_IN_DIALOGUE]
+        told += [record[name][: record["steps"]].tobytes() for name in ("row", "act")]
+        told.append((record["found"] * (record["known"] == VALUE)).tobytes())
+        told.append(max(int(record["answer_due_us"]) - now_us, -1))
+    if state in _BEFORE_TRIAL:
+        told.append(max(int(record["deadline_us"]) - now_us, -1))
+    return told
 
 
 def plain(v: Any) -> Any:
@@ -239,7 +245,6 @@ class Snapshot:
     def __init__(self, attributes: list[tuple[Any, str, str]], controller: Controller, node: AmplifierNode) -> None:
         self.attributes = attributes
         self._driver, self._node = controller.driver, node
-        self._start_up = controller.driver._start_up
         self._memory = controller.memory
         self._safe_cycles = int(controller.law["limits"]["safe_cycles"][0])
         self._exchange, self._bytes = controller.exchange, controller.exchange.view(np.uint8)
@@ -281,32 +286,27 @@ class Snapshot:
         return space["read"], space["write"], space["name"]
 
     def take(self) -> tuple[Any, ...]:
-        dialogue = self._start_up._dialogue
-        told = dialogue.values.copy()
-        state = dialogue._position, dialogue._tries, dialogue._deadline_us, dialogue.failure, told
         values = tuple(map(self._value_of, self._entries))
         if values != self._dictionary[0]:
             self._dictionary = values, marshal.dumps([values[i] for i in self._named], 2)
-        return self._read(), (dialogue, state), self._dictionary, self._bytes.tobytes()
+        return self._read(), self._dictionary, self._bytes.tobytes()
 
     def put(self, taken: tuple[Any, ...]) -> None:
-        held, (dialogue, state), dictionary, memory = taken
+        held, dictionary, memory = taken
         self._write(held)
-        dialogue._position, dialogue._tries, dialogue._deadline_us, dialogue.failure, told = state
-        dialogue.values = told.copy()
         for entry, value in zip(self._entries, dictionary[0], strict=True):
             entry.value = value
         self._bytes[:] = np.frombuffer(memory, np.uint8)
 
     def key(self, taken: tuple[Any, ...], bases: Bases, more: tuple[Any, ...]) -> bytes:
-        held, _, dictionary, _ = taken
+        held, dictionary, _ = taken
         record = self._memory[0]
         homing = int(record["homing_count"]) if record["mode"] == 3 else 0
         named = self._name(held, bases.now_us, bases.drive, bases.sense, bases.sync)
         memory = (self._cycle & self._mask).tobytes()
-        asked = tuple(int(self._exchange[name][0]) for name in ("blocked", "event", "clearing", "restart_due"))
-        dialogue = _dialogue(self._start_up, bases.now_us) if self._driver.state in _IN_DIALOGUE else None
-        parts = (more, named, homing, asked, dialogue, min(int(record["safe_cycles"]), self._safe_cycles), memory)
+        asked = tuple(int(self._exchange[name][0]) for name in _ASKED)
+        start_up = _start_up(self._driver.memory["start"][0, 0], self._driver.state, bases.now_us)
+        parts = (more, named, homing, asked, start_up, min(int(record["safe_cycles"]), self._safe_cycles), memory)
         digest = hashlib.blake2b(marshal.dumps(parts, 2), digest_size=12)
         digest.update(dictionary[1])
         return digest.digest()
@@ -323,8 +323,8 @@ class Snapshot:
         found: dict[str, Any] = {f"{n} {kind}.{name}": v for (n, kind, name), v in zip(kept, named, strict=True)}
         for i in self._named:
             entry = self._entries[i]
-            found[f"{entry.index:04X}:{entry.subindex}"] = taken[2][0][i]
-        record = np.frombuffer(taken[3], self._exchange.dtype)[0]["cycle"][0]
+            found[f"{entry.index:04X}:{entry.subindex}"] = taken[1][0][i]
+        record = np.frombuffer(taken[2], self._exchange.dtype)[0]["cycle"][0]
         for name in ("input", "monitors", "mode", "homed", "homing_count", "safe_cycles"):
             found[f"memory.{name}"] = str(record[name])
         found["memory.count"] = str(record["tick"]["count"][0])
@@ -336,7 +336,7 @@ def _walk(roots: Iterable[object]) -> list[Any]:
     waiting = list(roots)
     while waiting:
         value = waiting.pop(0)
-        if id(value) in found or isinstance(value, ObjectDictionary | SdoDialogue) or not _is_ours(value):
+        if id(value) in found or isinstance(value, ObjectDictionary) or not _is_ours(value):
             continue
         found[id(value)] = value
         for name in names_of(value):

@@ -9,18 +9,23 @@ import re
 from collections.abc import Callable
 from typing import Any
 
+import numpy as np
 import pytest
 from configurations import CONFIGURATIONS, LEVELS, Configuration
 from defective.kernels import drives_always, without_gate
 from explore import Explored, explore, settle
+from numpy.typing import NDArray
 from story import as_text, from_text, tell
 from world import World, learnt
 
 from hil.node.amplifier import AmplifierNode
 from hil.node.drive import DriveReceiver
 from hil.node.heartbeat import HeartbeatConsumer
+from pkxyz_ctrl.can import driver as driver_module
+from pkxyz_ctrl.can import start_plan
+from pkxyz_ctrl.can.driver_config import DriverConfig
 from pkxyz_ctrl.can.driver_rules import DriverState
-from pkxyz_ctrl.can.start_sequence import StartSequence
+from pkxyz_ctrl.can.startup import Setting
 from pkxyz_ctrl.loop.controller import Controller
 from pkxyz_ctrl.safety.gate import TransmitGate
 from pkxyz_ctrl.safety.modes import Event, Mode
@@ -75,10 +80,10 @@ def test_states_with_one_key_have_one_future() -> None:
                 world.take(option)
                 settle(world)
                 future.add((repr(option), world.key(world.take_state())))
-            if key in met and met[key][0] != (state[0][6], state[1][3]):
+            if key in met and met[key][0] != (state[0][6], state[1][2]):
                 assert met[key][1] == future
                 compared += 1
-            met[key] = (state[0][6], state[1][3]), future
+            met[key] = (state[0][6], state[1][2]), future
             world.put_state(state)
             world.take(generator.choices(options, [30, *[1 + 8 * (o[0] == "tick") for o in options[1:]]])[0])
             options, _ = settle(world)
@@ -96,7 +101,7 @@ def test_a_state_is_taken_and_put_back_whole() -> None:
     assert world.key(world.take_state()) != key
     world.put_state(state)
     assert world.key(world.take_state()) == key
-    assert world._snapshot.take()[3] == state[1][3]
+    assert world._snapshot.take()[2] == state[1][2]
 
 
 # -- planted defects -----------------------------------------------------------------------------------------
@@ -117,14 +122,14 @@ def _no_step_limit(patch: pytest.MonkeyPatch) -> None:
 
 def _old_start_up(patch: pytest.MonkeyPatch) -> None:
     """A controller that has to see CONFIGURING at the beginning of a tick, or waits for ever."""
-    shipped = Controller._go_on_starting
+    shipped = Controller.begin
 
-    def go_on(controller: Controller, t_us: int) -> None:
+    def begin(controller: Controller, t_us: int) -> None:
         shipped(controller, t_us)
         if controller.mode == Mode.BOOT and controller.driver.state is DriverState.OPERATIONAL:
             controller.exchange["event"] = Event.NODE_READY
 
-    patch.setattr(Controller, "_go_on_starting", go_on)
+    patch.setattr(Controller, "begin", begin)
 
 
 def _no_crc(patch: pytest.MonkeyPatch) -> None:
@@ -144,9 +149,16 @@ def _no_crc(patch: pytest.MonkeyPatch) -> None:
 
 def _believes_what_is_written(patch: pytest.MonkeyPatch) -> None:
     """A start-up that tries nothing: whoever stores 0x1016 is taken to act on it."""
-    patch.setattr(
-        StartSequence, "_is_tried", property(lambda start_up: True, lambda start_up, value: None), raising=False
-    )
+    shipped = driver_module.start_record
+
+    def proven(config: DriverConfig, rows: tuple[Setting, ...]) -> NDArray[np.void]:
+        record = shipped(config, rows)
+        node = {setting.key: setting.value or 0 for setting in rows}
+        record["proven"] = [node[0x1018, 1], node[0x1018, 2], 0x10000, 1]  # revision and serial number of the EDS
+        record["shown"] = start_plan.SHOWN_DRIVE_TIMEOUT
+        return record
+
+    patch.setattr(driver_module, "start_record", proven)
 
 
 def _started_untried(patch: pytest.MonkeyPatch) -> None:

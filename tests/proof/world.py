@@ -37,8 +37,7 @@ from configurations import (
     TURNAROUND_US,
     Configuration,
     bus_of,
-    few_questions,
-    few_writes,
+    few_settings,
 )
 from fates import Held, Option, Plant, ViolationError, damaged, fates_of, wishes_of
 from node_rig import EDS
@@ -49,7 +48,6 @@ from hil.node.amplifier import AmplifierNode
 from pkxyz_ctrl.can.codec import Counts, ProcessCodec
 from pkxyz_ctrl.can.driver_rules import DriverState
 from pkxyz_ctrl.can.frame import Frame
-from pkxyz_ctrl.can.start_sequence import StartSequence
 from pkxyz_ctrl.loop.controller import Controller, StartUpError
 from pkxyz_ctrl.safety.gate import GateConfig
 from pkxyz_ctrl.safety.modes import MAY_ENERGISE, Event, Mode
@@ -74,9 +72,8 @@ class World:
         self.received: deque[Frame] = deque()  # by the controller's port, not read yet
         self.held: tuple[Held, ...] = ()
         self.plant = Plant(lambda: self.node.state)
-        few = {} if configuration.whole_dialogue else {"survey": few_questions, "plan": few_writes}
-        start_up = StartSequence(driver, STEP, **few)
-        self.controller = Controller(self.law, bus, gate, self._from_controller, start_up=start_up)
+        settings = () if configuration.whole_dialogue else few_settings(driver, STEP)
+        self.controller = Controller(self.law, bus, gate, self._from_controller, settings=settings)
         self.controller.driver.sense.record["syncs_uncountable"] = 4
         self.node = AmplifierNode(
             NODE_ID, self.clock, self.wire.append, self.plant, EDS,
@@ -160,7 +157,7 @@ class World:
     def is_landmark(self) -> bool:
         """Where ways meet again although nothing is to be decided: before a tick, and now and then in the dialogue."""
         if self.wire:
-            return self.wire[0].can_id == REQUEST and self.controller.driver._start_up._dialogue._position % 6 == 0
+            return self.wire[0].can_id == REQUEST and self.controller.driver.memory["start"]["position"][0, 0] % 6 == 0
         return self.phase == "before"
 
     # -- what may happen -----------------------------------------------------------------------------------------
