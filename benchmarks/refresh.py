@@ -1,4 +1,5 @@
-"""Takes every measurement anew, or those named, keeps it in benchmarks/results.json and redraws performance.md.
+"""Takes every measurement anew, or the measurements and figures named, keeps it in benchmarks/results.json and redraws
+performance.md.
 
     python benchmarks/refresh.py [NAME ...]
 
@@ -21,7 +22,8 @@ if __name__ == "__main__":
     measured = results(machine, measure_all(sys.argv[1:], quiet=False))
     if sys.argv[1:]:  # the others stay, with the machine as it was for them
         kept = json.loads(RESULTS.read_text(encoding="utf-8"))
-        rest = [f for f in kept["figures"] if f["name"].partition(".")[0] not in sys.argv[1:]]
+        new = {f["name"] for f in measured["figures"]} | set(sys.argv[1:])
+        rest = [f for f in kept["figures"] if not {f["name"], f["name"].partition(".")[0]} & new]
         order = list(MEASUREMENTS)
         figures = sorted(rest + measured["figures"], key=lambda f: order.index(f["name"].partition(".")[0]))
         measured = kept | {"figures": figures}

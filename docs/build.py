@@ -11,6 +11,6 @@ from pathlib import Path
 if __name__ == "__main__":
     here = Path(__file__).parent
     sys.path.insert(0, str(here / "drawings"))  # canvas, which they share
-    for script in sorted([*here.glob("figures/*.py"), *here.glob("tables/*.py"), *here.glob("drawings/*.py")]):
+    for script in sorted([*here.glob("figures/**/*.py"), *here.glob("tables/*.py"), *here.glob("drawings/*.py")]):
         print(script.name, flush=True)
         runpy.run_path(str(script), run_name="__main__")

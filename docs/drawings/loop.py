@@ -72,7 +72,7 @@ def draw_one(plot: Any, theme: Theme, stage: Stage, bus: BusConfig) -> None:
         plot.text(x + 0.34 * side, level, words, color=bus_colour, fontsize=9.5, ha="left" if side > 0 else "right",
                   va="center", bbox={"facecolor": theme.wash, "edgecolor": "none", "pad": 1.5})  # fmt: skip
     plot.plot([0.2, 10.5], [level, level], color=bus_colour, linewidth=0.8, linestyle=(0, (4, 4)), zorder=0)
-    words = f"CAN bus: {bus.delay_periods} period, {bus.period_us} us, from a sample to the force that answers it"
+    words = f"CAN bus: {bus.delay_periods} period, {bus.period_us} µs, from a sample to the force that answers it"
     plot.text(5.53, level + 0.17, words, color=bus_colour, fontsize=9.5, ha="center")
     plot.text(10.62, TOP, "controller", color=law, fontsize=10, rotation=-90, ha="center", va="center")
     plot.text(10.62, BOTTOM, "device", color=device, fontsize=10, rotation=-90, ha="center", va="center")

@@ -75,7 +75,7 @@ def draw_one(plot: Any, theme: Theme, bus: BusConfig) -> None:
     ends = {"arrowstyle": "<|-|>", "mutation_scale": 10, "shrinkA": 0, "shrinkB": 0}
     span = (t["sampled"], -0.3), (period + t["sampled"], -0.3)
     plot.add_patch(FancyArrowPatch(*span, color=theme.ink, linewidth=1.0, **ends))
-    words = f"from sample to action: {bus.period_us} us, exactly one period"
+    words = f"from sample to action: {bus.period_us} µs, exactly one period"
     plot.text(t["sampled"] + period / 2, -0.42, words, color=theme.ink, fontsize=10, ha="center", va="top")
     plot.text(t["sampled"] - 4, -0.2, "sampled", color=first, fontsize=9.5, ha="right", va="center")
     plot.text(period + t["sampled"] + 6, -0.3, "the answer acts", color=first, fontsize=9.5, va="center")

@@ -145,7 +145,7 @@ def draw(passages: list[Passage], load: float) -> None:
     axes.axvline(PERIOD_US, color=FAINT, ls=":", lw=1)
     axes.set(xlim=(-4, 243), ylim=(-2.1, 1.5), yticks=[])
     title = f"One cycle of fd_5k: light 1 Mbit/s, dark 5 Mbit/s; bus load {100 * load:.0f} %"
-    dress(axes, "time after the start of SYNC (us)", title=title, grid="")
+    dress(axes, "time after the start of SYNC (µs)", title=title, grid="")
     axes.spines["left"].set_visible(False)
     save(figure, PICTURE)
 

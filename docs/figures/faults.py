@@ -13,11 +13,13 @@ import sys
 from pathlib import Path
 from typing import Any
 
-from hil.commands.studies.faults import run_matrix
 from hil.pictures.faults import draw
+from hil.screen.progress import progress_bar
+from hil.studies.faults.every_law import break_all
 from hil.studies.faults.matrix import CASES
 from hil.studies.faults.outcome import Outcome
 from pkxyz_ctrl.config.files import names
+from pkxyz_ctrl.io.realtime import cores
 
 HERE = Path(__file__).parent
 PAGE = HERE.parent / "lookup" / "faults.md"
@@ -77,8 +79,10 @@ def filled_in(page: str, part: str, text: str) -> str:
 
 def main() -> None:
     laws = names("controllers")
-    found, refused = run_matrix(laws, list(CASES), 0, quiet=False)
-    print("not run:", refused)
+    with progress_bar("faults", quiet=False) as tell:
+        broken = break_all(laws, CASES, cores(), on_progress=tell)
+    found = broken.outcomes
+    print("not run:", broken.refused)
     draw(found, CASES, HERE / "faults.png")
     kept = plain([o for o in found if o.law == LAW])
     FOUND.write_text(json.dumps(kept, indent=1) + "\n", encoding="utf-8")

@@ -78,7 +78,7 @@ def draw_quantisation(figure: Figure) -> None:
     axes.axvspan(20, 772, color=WASH, zorder=0)
     axes.annotate("the stage follows", (24, 6), color=MUTED, fontsize=SMALL_PT)
     axes.set_xlim(*f)
-    dress(axes, "frequency (Hz)", "voltage error (uV/rtHz)", "Rounding to 6.1 mV counts, while holding")
+    dress(axes, "frequency (Hz)", "voltage error (µV/√Hz)", "Rounding to 6.1 mV counts, while holding")
     legend(axes, "lower right")
 
 

@@ -96,8 +96,8 @@ def draw(found: dict[str, tuple[Array, Array]]) -> None:
     panels = figure.subplots(1, 2, sharey=True)
     shown = list(SHOWS.values())
     for panel, names, words in (
-        (panels[0], [w for w in MOVES.values() if w != "warming package"], "position in x (nm/rtHz)"),
-        (panels[1], shown, "shown in stroke 1 (nm/rtHz)"),
+        (panels[0], [w for w in MOVES.values() if w != "warming package"], "position in x (nm/√Hz)"),
+        (panels[1], shown, "shown in stroke 1 (nm/√Hz)"),
     ):
         for name, colour in zip(names, SERIES, strict=False):
             f, density = signal.welch(found[name][1][:, 0], 5000.0, nperseg=10_000)

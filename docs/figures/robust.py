@@ -33,7 +33,7 @@ def draw() -> Figure:
         axes.axvline(200.0, color=MUTED, lw=0.8, ls="--")
         axes.set(xlim=(10, 2500), ylim=(0.03, 5))
         dress(axes, "frequency (Hz)", title=name)
-    figure.axes[0].set_ylabel("|S|, MIMO: nominal (blue), 134 changed plants (grey)")
+    figure.axes[0].set_ylabel("|S|, MIMO: nominal (blue), changed plants (grey)")
     return figure
 
 

@@ -44,8 +44,8 @@ def draw(path: Path) -> None:
                 )
     for column, title in enumerate(("up", "down")):
         height, distance, voltage = axes[:, column]
-        labels = ("height (um)", "distance from the target (nm)", "voltage of a comb (V)") if column == 0 else ("",) * 3
-        dress(height, "", labels[0], f"a jump of {WAY_M * 1e6:.0f} um {title}")
+        labels = ("height (µm)", "distance from the target (nm)", "voltage of a comb (V)") if column == 0 else ("",) * 3
+        dress(height, "", labels[0], f"a jump of {WAY_M * 1e6:.0f} µm {title}")
         dress(distance, "", labels[1])
         dress(voltage, "time after the jump of the reference (ms)", labels[2])
         bound(distance, BAND_M * 1e9)

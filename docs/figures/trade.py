@@ -5,7 +5,7 @@ from pathlib import Path
 import numpy as np
 from matplotlib.figure import Figure
 
-from hil.pictures.style import BLUE, GREEN, MUTED, VERMILION, bound, dress, save, sheet
+from hil.pictures.style import BLUE, GREEN, MUTED, VERMILION, bound, dress, legend, save, sheet
 from hil.studies.tune.taps import without_filter
 from pkxyz_ctrl.config.bus import BusConfig
 from pkxyz_ctrl.config.controller import ControllerConfig
@@ -62,11 +62,12 @@ def draw() -> Figure:
     left.axvline(200.0, color=MUTED, lw=0.8, ls="--")
     bound(left, 1.0, "1 nm", 22, style="--")
     dress(left, "rejection up to (Hz)", "deviation at hold (nm)", "sense noise alone")
-    left.legend(frameon=False)
+    left.set_ylim(top=1.55)
+    legend(left, "upper left")
     right.plot(EDGES_HZ, [least_nm(f, moved) / floor_nm for f in EDGES_HZ], color=BLUE)
     right.plot([203, 30], [1.165 / floor_nm, 0.703 / floor_nm], "o", color=GREEN)
     bound(right, 1.25, "1.25", 150, style="--")
-    dress(right, "rejection up to (Hz)", f"over the floor of {floor_nm:.2f} nm", "base shaken by 10 ug/rtHz")
+    dress(right, "rejection up to (Hz)", f"over the floor of {floor_nm:.2f} nm", "base shaken by 10 µg/√Hz")
     return figure
 
 

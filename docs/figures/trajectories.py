@@ -50,7 +50,7 @@ def draw_path(axes: Axes, title: str, trajectory: Trajectory, segment: int) -> N
         x, y, scans = x[first_layer], y[first_layer], scans[first_layer]
     axes.plot(x, y, color=REFERENCE, lw=0.8, zorder=1)
     axes.plot(np.where(scans, x, np.nan), y, color=BLUE, lw=0.7)
-    dress(axes, "x (um)", "y (um)", title, grid="")
+    dress(axes, "x (µm)", "y (µm)", title, grid="")
     axes.set_aspect("equal", "datalim")
     if title.startswith("spiral"):
         axes.plot(x[scans][:: 4000 // STEP_US], y[scans][:: 4000 // STEP_US], ".", color=VERMILION, ms=2.5)
@@ -68,7 +68,7 @@ def draw_course(axes: Axes, title: str, trajectory: Trajectory, segment: int, ax
     t_ms, position = t_s[shown] * 1e3, rows[shown, axis] * 1e6
     axes.plot(t_ms, position, color=REFERENCE, lw=0.8)
     axes.plot(t_ms, np.where(scans[shown], position, np.nan), color=VERMILION, lw=0.7)
-    dress(axes, "time (ms)", f"{'xyz'[axis]} (um)", title, grid="")
+    dress(axes, "time (ms)", f"{'xyz'[axis]} (µm)", title, grid="")
 
 
 def main() -> None:

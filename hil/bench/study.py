@@ -1,18 +1,23 @@
 """The fast lane in a study: how many closed-loop seconds two worker processes get through in a second, as `pkxyz
-montecarlo` and `pkxyz tune` use them.
+montecarlo` and `pkxyz tune` use them; what a device of `pkxyz yield` costs; and what it costs to spread the work.
 """
 
 import gc
 import statistics
 import time
+from importlib.util import find_spec
 
 from hil.bench.figure import Figure
-from hil.runs.scenario import load_scenario
-from hil.studies.montecarlo import Study, run_one
-from hil.studies.spread.workers import as_done, with_constant, worker_pool
+from hil.runs.scenario import Scenario, build_scenario, load_scenario
+from hil.studies.montecarlo import PLANTS_AT_ONCE, Study, run_one
+from hil.studies.spread.cluster import Cluster
+from hil.studies.spread.workers import Pool, as_done, with_constant, worker_pool
 from hil.studies.tune.search import evaluate, load_problem
-from pkxyz_ctrl.config.files import load
+from hil.studies.wafer.closed_loop import PART_DEVICES, ClosedLoops
+from hil.studies.wafer.study import WaferStudy
+from pkxyz_ctrl.config.files import load, plain
 from pkxyz_ctrl.design.margins.tolerances import Tolerances
+from pkxyz_ctrl.fabrication.process import Process
 
 WORKERS = 2
 ROUNDS = 5
@@ -20,6 +25,12 @@ PLANTS = 60
 """Of a round."""
 TRIALS = 12
 """The first ones read files and load kernels."""
+SCAN_LINES, SCAN_LAYERS, SCAN_HOLD_S, SCAN_RUN_S = 9, 2, 0.05, 0.5
+"""A scan of 0.3 s at 60 lines/s; the holds before and after it; the run, start-up and the way there included."""
+PARTS = 8
+"""Of ``PART_DEVICES`` each."""
+PIECES = 2000
+"""That do nothing."""
 
 
 def study() -> list[Figure]:
@@ -41,6 +52,7 @@ def study() -> list[Figure]:
             walls.append(time.perf_counter() - begin)
         list(as_done(pool, width, _trial, range(2 * WORKERS)))
         trial_s = [cpu_s for _, cpu_s in as_done(pool, width, _trial, range(2 * WORKERS, TRIALS))]
+        device_ms = _device_ms(pool, width)
     by_clock = [PLANTS * stage_s / wall for wall in walls]
     by_processor = [WORKERS * PLANTS * stage_s / cpu for cpu in busy]
     each_ms = min(busy) / PLANTS * 1e3
@@ -54,7 +66,93 @@ def study() -> list[Figure]:
                "processor time of a plant: sampled, run, its figures, Ms of its linear loop"),
         Figure("study.trial", min(trial_s) * 1e3, "ms", None, None, statistics.median(trial_s) * 1e3,
                "processor time of a trial of `pkxyz tune lqg`: designed, margins, Ms of 135 changed plants, two runs"),
+        Figure("study.device", min(device_ms), "ms", 12.0, "at most", statistics.median(device_ms),
+               f"processor time of a device of `pkxyz yield`, {PART_DEVICES} at once: made, its figures, Ms under the "
+               "shipped law, a run of 0.5 s with a scan of 0.3 s; 12 ms are 10^5 devices in 10 min on 2 cores"),
     ]  # fmt: skip
+
+
+def spread() -> list[Figure]:
+    """What it takes to work in several processes: plants on two against one, a worker's memory, and the time of the
+    process in which a Dask scheduler and its client are, for pieces that do nothing (where distributed is installed).
+    """
+    plants = Study(load_scenario("raster", controller="lqg"), load("tolerances", "wide", Tolerances))
+    alone: list[float] = []
+    both: list[float] = []
+    with worker_pool(1) as (one, _), worker_pool(WORKERS) as (two, _):
+        for pool, width in ((one, 1), (two, WORKERS)):
+            list(as_done(pool, width, with_constant(_timed, plants), range(4 * width)))
+        for n in range(ROUNDS):
+            seeds = range(1000 * (n + 1), 1000 * (n + 1) + PLANTS)
+            for pool, width, walls in ((one, 1, alone), (two, WORKERS, both)):
+                begin = time.perf_counter()
+                list(as_done(pool, width, with_constant(_timed, plants), seeds, ahead=width))
+                walls.append(time.perf_counter() - begin)
+        memory = [mb for _, mb in as_done(one, 1, _memory_mb, range(1))]
+    ratios = [a / b for a, b in zip(alone, both, strict=True)]
+    found = [
+        Figure("spread.two_workers", min(alone) / min(both), "times", 1.8, "at least", statistics.median(ratios),
+               f"{PLANTS} plants on two local workers against one, by the clock on the wall, in turn"),
+        Figure("spread.worker_memory", max(memory), "MB", None, None, None,
+               f"most that a worker held, libraries and kernels included, after {ROUNDS * PLANTS} plants"),
+    ]  # fmt: skip
+    if find_spec("distributed") is None:
+        return found
+    piece_ms = _piece_ms()
+    return [
+        *found,
+        Figure("spread.piece", min(piece_ms), "ms", None, None, statistics.median(piece_ms),
+               "processor time of a Dask scheduler and its client for one piece of work; a piece has up to "
+               f"{PLANTS_AT_ONCE} plants"),
+    ]  # fmt: skip
+
+
+def _piece_ms() -> list[float]:
+    from distributed import LocalCluster
+
+    found = []
+    with (
+        LocalCluster(
+            n_workers=WORKERS, threads_per_worker=1, processes=True, dashboard_address=None, host="127.0.0.1"
+        ) as cluster,
+        worker_pool(1, Cluster(cluster.scheduler_address)) as (pool, width),
+    ):
+        list(as_done(pool, width, abs, range(100), ahead=width))
+        for _ in range(ROUNDS):
+            begin = time.process_time()
+            list(as_done(pool, width, abs, range(PIECES), ahead=width))
+            found.append((time.process_time() - begin) / PIECES * 1e3)
+    return found
+
+
+def _memory_mb(_: int) -> float:
+    import resource  # which not every system has
+
+    return resource.getrusage(resource.RUSAGE_SELF).ru_maxrss * 1024e-6
+
+
+def short_scan() -> Scenario:
+    """The default scenario with a scan of 0.3 s."""
+    data = plain(load_scenario("raster").config)
+    data["reference"][3] |= {"lines": SCAN_LINES, "layers": SCAN_LAYERS}
+    for hold in (2, 4):
+        data["reference"][hold] |= {"duration_s": SCAN_HOLD_S}
+    return build_scenario(data | {"duration_s": SCAN_RUN_S})
+
+
+def _device_ms(pool: Pool, width: int) -> list[float]:
+    scenario = short_scan()
+    loops = ClosedLoops(WaferStudy(load("processes", "oreo_drie", Process), scenario.stage, 1), scenario, known=False)
+    timed = with_constant(_timed_part, loops)
+    list(as_done(pool, width, timed, range(2 * WORKERS)))
+    return [cpu_s / PART_DEVICES * 1e3 for _, cpu_s in as_done(pool, width, timed, range(4, 4 + PARTS))]
+
+
+def _timed_part(loops: ClosedLoops, number: int) -> float:
+    """Processor time of a part in s."""
+    begin = time.process_time()
+    loops.part(number)
+    return time.process_time() - begin
 
 
 def _timed(plants: Study, seed: int) -> float:

@@ -34,6 +34,7 @@ MEASUREMENTS: dict[str, Measurement] = {
     "lockstep": lanes.lockstep,
     "fast": lanes.fast,
     "study": study.study,
+    "spread": study.spread,
     "sil": startup.sil,
     "nominal": quality.nominal,
     "mild": quality.mild,

@@ -10,9 +10,8 @@ from numpy.typing import NDArray
 from hil.bench.figure import Figure, repeated
 from hil.bench.rigs.closed_loop import ClosedLoop, scan
 from hil.bench.rigs.kernels import replay_cycle
-from pkxyz_ctrl.design.law import amplifier_time_constant_s
 from pkxyz_ctrl.design.laws.estimator_gain import measurement_matrix, measurement_noise, process_noise
-from pkxyz_ctrl.design.model.plant_model import linearise, sample
+from pkxyz_ctrl.design.model.plant_model import amplifier_time_constant_s, linearise, sample
 from pkxyz_ctrl.loop.cycle import MEMORY, cycle
 from pkxyz_ctrl.stage import Stage
 

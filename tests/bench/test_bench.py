@@ -30,7 +30,7 @@ drawing = runpy.run_path(str(ROOT / "docs" / "figures" / "performance.py"))
 
 def run_bench(*arguments: str) -> subprocess.CompletedProcess[str]:
     command = [sys.executable, "-c", "from hil.cli import main; main()", "bench", *arguments]
-    return subprocess.run(command, capture_output=True, text=True, check=False, timeout=300, cwd=ROOT)
+    return subprocess.run(command, capture_output=True, text=True, check=False, timeout=1200, cwd=ROOT)
 
 
 def test_json_of_the_command() -> None:
