@@ -1,6 +1,6 @@
 # make sil    close the loop over the simulated bus: runs/raster-lockstep-1/ holds recording, summary and picture
 # make live   operate the simulated stage: a page and clients, until Ctrl-C
-# make test   run every test, the linter and the type checker
+# make test   run every test, the linter and the type checker; what runs against the machine's clock after all else, alone
 # make test-socketcan  controller and plant in two processes over the kernel's CAN sockets, in a guest that has them
 # make test-peers  other makers' CANopen stacks and tools over the kernel's CAN sockets, in such a guest
 # make test-firmware  a million ticks of the exported controller, here and on an emulated Cortex-M7: the bits of Python?
@@ -8,7 +8,7 @@
 # make bench  measure what the docs promise and print it
 # make mutate change one thing at a time in gate, modes, monitors, comb law and codec: does a test notice? SECONDS=1200
 # make prove  every state that shipped controller and node can reach under any law with faults: EXPLORED="two one"
-# make coverage  branches and conditions (MC/DC) of safety, codec, driver and the node's drive path that the tests meet
+# make coverage  branches and conditions (MC/DC) of safety, codec, driver, start-up and the node's drive path, met by tests
 # make fuzz   hostile frames and broken documents: FRAMES=1000000 DOCUMENTS=10000
 # make kills  SIGKILL, SIGSTOP and SIGTERM at random moments, KILLS=300 at rate, KILLS_LOCKSTEP=10000 in lockstep's clock: 0 V in time?
 # make docs   draw every figure of docs/ and fill in the generated tables
@@ -28,7 +28,8 @@ test: .venv/.ready
 	$(BIN)/ruff check .
 	$(BIN)/ruff format --check .
 	$(BIN)/mypy
-	$(BIN)/python -m pytest -n auto --dist loadfile --no-loadscope-reorder
+	$(BIN)/python -m pytest -n auto --dist loadfile --no-loadscope-reorder -m "not at_rate"
+	$(BIN)/python -m pytest -m at_rate --reruns 4 --reruns-delay 5
 
 test-socketcan: .venv/.ready
 	$(BIN)/python tests/socketcan/run.py

@@ -6,12 +6,16 @@ from collections.abc import Iterator
 os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")  # small matrices: on a busy machine threads only wait for each other
 
 import pytest
-from hypothesis import settings
+from hypothesis import HealthCheck, settings
 
 import pkxyz_ctrl  # noqa: F401
 from hil.pictures import aside
+from hil.screen import terminal
 
-settings.register_profile("same every time", derandomize=True)
+# Whether an example is slow is the machine's affair, and no test's.
+settings.register_profile(
+    "same every time", derandomize=True, deadline=None, suppress_health_check=[HealthCheck.too_slow]
+)
 settings.load_profile("same every time")
 
 
@@ -21,6 +25,14 @@ def pictures_in_place() -> Iterator[None]:
     with pytest.MonkeyPatch.context() as patched:
         patched.setattr(aside, "cores", lambda: 1)
         yield
+
+
+@pytest.fixture(autouse=True)
+def a_screen_of_its_own() -> Iterator[None]:
+    """Each test has a terminal of its own: its width is read once, by whoever prints first."""
+    terminal.screen.cache_clear()
+    yield
+    terminal.screen.cache_clear()
 
 
 def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:

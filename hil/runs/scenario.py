@@ -144,15 +144,15 @@ def load_scenario(
     """
     source = config.find("scenarios", name_or_path)
     wanted = {"seed": seed, "stage": stage, "plant": plant, "controller": controller, "bus": bus}
-    given = {key: value for key, value in wanted.items() if value is not None}
+    replaced = {key: value for key, value in wanted.items() if value is not None}
     written, held = _taken_apart(config.read_toml(source))
-    data = {**written, **given}
+    data = {**written, **replaced}
     if learning is not None:
         own = data.get("learning", {})
         data["learning"] = {key: value for key, value in own.items() if key != "file"} | learning
     scenario = config.parse(data, ScenarioConfig, str(source))
     scenario = scenario.model_copy(update={"faults": (*scenario.faults, *faults)})
-    loaded = _resolved(scenario, source, held, from_here=tuple(given), learning_from_here=learning is not None)
+    loaded = _resolved(scenario, source, held, from_here=tuple(replaced), learning_from_here=learning is not None)
     if adapted is None:
         return loaded
     from hil.runs.adapted import begun_with  # which few runs need

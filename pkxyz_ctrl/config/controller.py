@@ -139,9 +139,9 @@ class ControllerConfig(FrozenModel):
     @model_validator(mode="after")
     def _section_of_this_law_alone(self) -> Self:
         for name in SECTIONS:
-            given = getattr(self, name) is not None
-            if given and name != self.law:
+            is_there = getattr(self, name) is not None
+            if is_there and name != self.law:
                 raise ValueError(f'section [{name}] belongs to law = "{name}", not to "{self.law}"; remove it')
-            if not given and name == self.law:
+            if not is_there and name == self.law:
                 raise ValueError(f'law = "{name}" needs a section [{name}]; add it')
         return self

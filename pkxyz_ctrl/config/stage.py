@@ -32,11 +32,11 @@ class GeometryConfig(FrozenModel):
     def _one_description_of_the_link(self) -> Self:
         by_legs = self.link_projection_rest_m is not None and self.link_height_rest_m is not None
         by_polar = self.link_length_m is not None and self.elevation_rest_rad is not None
-        given = sum(
+        numbers = sum(
             v is not None
             for v in (self.link_projection_rest_m, self.link_height_rest_m, self.link_length_m, self.elevation_rest_rad)
         )
-        if given != 2 or by_legs == by_polar:
+        if numbers != 2 or by_legs == by_polar:
             raise ValueError(
                 "give the link either by link_projection_rest_m and link_height_rest_m "
                 "or by link_length_m and elevation_rest_rad"

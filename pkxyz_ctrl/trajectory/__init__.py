@@ -119,7 +119,6 @@ class Trajectory:
         self.end_m = position
         self._motions = (*motions, still(position, 1.0))
         self._start_us = np.array([*starts_us, float(start_us)])
-        self._segment_start_us = np.array([s.t_start_us for s in timed])
 
     def sample(self, first_tick: int, count: int, period_us: int) -> Array:
         """(count, 9): position (m), velocity (m/s), acceleration (m/s2) at ticks first_tick, first_tick + 1, ...
@@ -137,12 +136,6 @@ class Trajectory:
             if end > begin:
                 out[begin:end] = self._motions[n].sample((t_us[begin:end] - self._start_us[n]) * 1e-6)
         return out
-
-    def segment_index(self, first_tick: int, count: int, period_us: int) -> NDArray[np.int16]:
-        """(count,) index into ``segments`` at each tick, -1 before the start and after the end."""
-        t_us = _instants_us(first_tick, count, period_us)
-        index = np.searchsorted(self._segment_start_us, t_us, side="right") - 1
-        return np.where(t_us < self.duration_us, index, -1).astype(np.int16)
 
 
 def _require_bounded(where: str, plan: Plan, start_s: float, before: int) -> int:

@@ -7,7 +7,7 @@ import numpy as np
 from sim.config.plant_file import PlantConfig
 from sim.config.surroundings import Flicker, FloorVibration, Mains
 from sim.motion import layout
-from sim.motion.layout import FLICKERS, TONES
+from sim.motion.layout import FLICKERS
 from sim.motion.noise import next_u64, normal, stream
 from sim.surroundings.tones import sum_tones
 
@@ -109,9 +109,9 @@ def start_surroundings(p: np.void, s: np.void, config: PlantConfig, seed: int) -
     }
     for source, offset in offsets.items():
         s["random"][source] = stream(seed, source, offset)
-    lines = len(_mains(config.mains))
-    for k in range(TONES):
-        source = layout.MAINS_STREAM if k >= int(p["tone_count"]) - lines else layout.FLOOR_STREAM
+    lines, tones = len(_mains(config.mains)), int(p["tone_count"])
+    for k in range(tones):
+        source = layout.MAINS_STREAM if k >= tones - lines else layout.FLOOR_STREAM
         for j in range(3):
             turn = 2 * math.pi * float(next_u64(s["random"][source])) / 2.0**64
             s["tone_phase"][k, j] = math.cos(turn), math.sin(turn)

@@ -236,7 +236,7 @@ JSON = st.recursive(
 )
 
 
-@settings(max_examples=100, deadline=None)
+@settings(max_examples=100)
 @given(st.dictionaries(st.text(max_size=5), JSON, max_size=4))
 def test_the_digest_is_of_the_content_not_of_its_order(data):
     turned = dict(reversed(list(data.items())))

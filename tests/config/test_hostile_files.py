@@ -175,7 +175,7 @@ def extreme_segment(draw):
     return {"kind": kind, **values}
 
 
-@settings(max_examples=400, deadline=None)
+@settings(max_examples=400)
 @given(extreme_segment())
 def test_no_number_of_a_segment_ends_in_anything_but_a_plan_or_words(values):
     """Zero divided, overflows, no numbers at all: what is planned is finite, what is not is told."""

@@ -16,6 +16,8 @@ import pytest
 from hil.conformance.run import CHECKS
 from pkxyz_ctrl.config.files import CONFIG_DIR
 
+pytestmark = pytest.mark.at_rate
+
 ROOT = Path(__file__).parents[2]
 
 

@@ -23,7 +23,7 @@ from pkxyz_ctrl.can.driver_config import DriverConfig
 from pkxyz_ctrl.can.driver_rules import DriverState
 from pkxyz_ctrl.can.emergency import decode_emergency
 from pkxyz_ctrl.can.frame import ERROR, EXTENDED, FD_FAST, REMOTE, UNUSUAL, Frame
-from pkxyz_ctrl.can.sdo import parse_reply
+from pkxyz_ctrl.can.sdo import ReplyKind, kind_of, value_of
 from pkxyz_ctrl.can.startup import configuration_steps, identity_steps
 from pkxyz_ctrl.safety.gate import GateConfig, TransmitGate
 from pkxyz_ctrl.safety.modes import Mode
@@ -251,9 +251,12 @@ def fuzz_codec(rng: random.Random, frames: int) -> int:
     traffic, right_ones = Traffic(rng), 0
     for _ in range(frames):
         data = traffic.frame().data
-        parse_reply(data)
         decode_emergency(data, 0)
         if len(data) == 8:
+            word = int.from_bytes(data, "little", signed=True)
+            ReplyKind(kind_of(word))
+            if not 0 <= value_of(word) <= 0xFFFF_FFFF:
+                raise ViolationError(f"{data.hex(' ')}: no value of an object")
             for codec in (DRIVE, SENSE):
                 a, b, c, counter, right = codec.decode(data)
                 if right != (codec.encode((a, b, c), counter) == data):

@@ -23,6 +23,8 @@ from pkxyz_ctrl.config.files import ConfigError, load
 from pkxyz_ctrl.io.can_port import CanPort, open_bus, to_frame, to_message
 from pkxyz_ctrl.io.clocks import WallClock
 
+pytestmark = pytest.mark.at_rate
+
 FD_LENGTHS = [*range(9), 12, 16, 20, 24, 32, 48, 64]
 
 
@@ -45,7 +47,7 @@ def test_a_frame_survives_python_can(frame):
     assert to_frame(to_message(frame)) == frame
 
 
-@settings(max_examples=150, deadline=None)
+@settings(max_examples=150)
 @given(st.lists(frames(), min_size=1, max_size=5))
 def test_frames_cross_between_sockets_in_order_and_whole(tmp_path_factory, sent):
     folder = tmp_path_factory.getbasetemp() / "crossing"
@@ -152,7 +154,7 @@ def test_what_a_killed_process_leaves_behind_is_cleared_away(tmp_path):
     assert list((tmp_path / "bus").iterdir()) == []
 
 
-@settings(max_examples=200, deadline=None)
+@settings(max_examples=200)
 @given(st.lists(st.binary(max_size=100), max_size=5))
 def test_what_is_not_a_frame_is_passed_over(tmp_path_factory, rubbish):
     folder = tmp_path_factory.getbasetemp() / "rubbish"

@@ -9,6 +9,8 @@ from hypothesis import strategies as st
 from pkxyz_ctrl.io.clocks import TickClock, WallClock, percentile_us
 from pkxyz_ctrl.io.realtime import go_real_time, leave_real_time, settle_memory
 
+pytestmark = pytest.mark.at_rate
+
 PERIOD_US, LATEST_US, GUARD_US = 1000, 300, 125
 
 
@@ -67,7 +69,7 @@ def test_sleeping_leaves_most_of_the_time_to_others():
     assert time.process_time() - cpu_s < 0.5 * (clock.now_us - wall_us) * 1e-6
 
 
-@settings(max_examples=200, deadline=None)
+@settings(max_examples=200)
 @given(
     late_us=st.lists(st.integers(0, 2500), max_size=60),
     work_us=st.lists(st.integers(1, 3300), min_size=1, max_size=25),

@@ -20,7 +20,7 @@ from pkxyz_ctrl.learning.update import beginning, learn
 from pkxyz_ctrl.trajectory import Circle, Hold, Lissajous, Raster, Sine, Trajectory
 
 N, TICK_S = 400, 200e-6
-QUICK = settings(deadline=None, max_examples=30)
+QUICK = settings(max_examples=30)
 
 
 def some_harmonics(seed: int, count: int = 40, size_m: float = 20e-9):

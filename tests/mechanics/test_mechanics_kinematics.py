@@ -20,7 +20,7 @@ from pkxyz_ctrl.mechanics.sextic import (
 )
 from pkxyz_ctrl.stage import Stage
 
-MODEST = settings(max_examples=60, deadline=None)
+MODEST = settings(max_examples=60)
 STROKES = st.tuples(*[st.floats(-5e-6, 25e-6)] * 3).map(np.array)
 
 
@@ -116,7 +116,7 @@ def test_no_root_is_a_named_error_with_the_inequality() -> None:
         require_positive(gap_m=-1.0)
 
 
-@settings(max_examples=25, deadline=None)
+@settings(max_examples=25)
 @given(any_stage(), positions())
 def test_crank_and_link_jacobians_are_derivatives_of_the_angles(stage: Stage, position_m: np.ndarray) -> None:
     def crank(x: np.ndarray) -> np.ndarray:
@@ -129,7 +129,7 @@ def test_crank_and_link_jacobians_are_derivatives_of_the_angles(stage: Stage, po
     assert_derivative(link, lambda x: exact_jacobians(stage, x).link_rad_per_m, position_m, step=2e-6, rtol=1e-8)
 
 
-@settings(max_examples=25, deadline=None)
+@settings(max_examples=25)
 @given(any_stage(), positions())
 def test_curvature_is_the_derivative_of_the_jacobian(stage: Stage, position_m: np.ndarray) -> None:
     assert_derivative(stage.jacobian, lambda x: stroke_curvature_per_m(stage, x), position_m, step=1e-6, rtol=1e-7)

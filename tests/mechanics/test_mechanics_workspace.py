@@ -115,7 +115,7 @@ def test_pushes_are_not_held_where_strokes_below_rest_are_allowed() -> None:
     assert volume.error_m3 < 1e-3 * volume.value_m3
 
 
-@settings(max_examples=10, deadline=None)
+@settings(max_examples=10)
 @given(any_stage())
 def test_extents_hold_every_point_and_are_touched(stage: Stage) -> None:
     found = workspace(stage)
@@ -130,7 +130,7 @@ def test_extents_hold_every_point_and_are_touched(stage: Stage) -> None:
     assert found.linear_volume_m3 == pytest.approx(found.exact_volume.value_m3, rel=0.05)
 
 
-@settings(max_examples=8, deadline=None)
+@settings(max_examples=8)
 @given(any_stage())
 def test_inscribed_cubes_fit_and_touch(stage: Stage) -> None:
     for aligned in (False, True):
@@ -152,7 +152,7 @@ def test_the_cube_of_20_um_that_the_text_asks_for_fits_standing_on_its_corner() 
     assert aligned.side_m * 1e6 == pytest.approx(12.25, abs=0.01)
 
 
-@settings(max_examples=8, deadline=None)
+@settings(max_examples=8)
 @given(any_stage())
 def test_symmetric_cube_is_nearly_the_inscribed_one(stage: Stage) -> None:
     standing, best = standing_cube_m(stage), inscribed_cube(stage).side_m

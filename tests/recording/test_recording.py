@@ -35,7 +35,7 @@ def assert_holds(path, rows):
         assert recording.vector(field).tobytes() == np.ascontiguousarray(rows[field]).tobytes(), field
 
 
-@settings(max_examples=15, deadline=None, suppress_health_check=[HealthCheck.function_scoped_fixture])
+@settings(max_examples=15, suppress_health_check=[HealthCheck.function_scoped_fixture])
 @given(st.lists(st.integers(0, 5000), max_size=6), st.integers(0, 2**32 - 1))
 def test_every_bit_comes_back_whatever_the_blocks(tmp_path, sizes, seed):
     rows = random_rows(sum(sizes), seed)
@@ -153,7 +153,7 @@ def test_a_journal_of_other_rows_is_refused_in_words(tmp_path, whole_journal):
     assert journal_of(path).is_file()
 
 
-@settings(max_examples=60, deadline=None, suppress_health_check=[HealthCheck.function_scoped_fixture])
+@settings(max_examples=60, suppress_health_check=[HealthCheck.function_scoped_fixture])
 @given(st.floats(0, 1) | st.floats(0, 1e-3))
 def test_a_journal_cut_anywhere_gives_the_rows_before_the_cut_or_one_clear_error(tmp_path, whole_journal, share):
     path = tmp_path / "r.parquet"

@@ -29,6 +29,8 @@ from pkxyz_ctrl.config.files import ConfigError
 from pkxyz_ctrl.loop.row import ROW
 from pkxyz_ctrl.safety.modes import Mode
 
+pytestmark = pytest.mark.at_rate
+
 ROOT = Path(__file__).parents[2]
 
 

@@ -29,7 +29,7 @@ def pkxyz(*words, cwd):
         capture_output=True,
         text=True,
         check=False,
-        timeout=600,
+        timeout=1200,
     )
 
 

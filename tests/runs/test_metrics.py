@@ -29,7 +29,7 @@ def rows_in(rows, key):
     return [np.flatnonzero((t_us >= w[0]) & (t_us < w[1])) for w in windows if w]
 
 
-@settings(max_examples=25, deadline=None)
+@settings(max_examples=25)
 @given(st.integers(0, 99), st.lists(st.integers(0, 5500), max_size=20))
 def test_figures_equal_those_of_whole_arrays_in_any_blocks(seed, cuts):
     rows = tracking_rows(seed, error_m=2e-9)

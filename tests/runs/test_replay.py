@@ -102,7 +102,7 @@ TROUBLE = st.fixed_dictionaries(
 )
 
 
-@settings(max_examples=20, deadline=None, suppress_health_check=[HealthCheck.function_scoped_fixture])
+@settings(max_examples=20, suppress_health_check=[HealthCheck.function_scoped_fixture])
 @given(st.lists(TROUBLE, max_size=8), st.integers(0, 2**32 - 1))
 def test_whatever_happened_to_the_controller_is_in_the_recording(tmp_path, troubles, seed):
     """Requests in any mode, trips from outside, lost ticks, bad frames: the rows of a cycle fed by hand replay."""
@@ -122,7 +122,7 @@ def test_whatever_happened_to_the_controller_is_in_the_recording(tmp_path, troub
     assert result.ticks == 420
 
 
-@settings(max_examples=15, deadline=None, suppress_health_check=[HealthCheck.function_scoped_fixture])
+@settings(max_examples=15, suppress_health_check=[HealthCheck.function_scoped_fixture])
 @given(st.data())
 def test_one_altered_bit_of_an_output_is_named_by_tick_and_signal(run, tmp_path, data):
     _, rows, metadata = run

@@ -19,6 +19,8 @@ from hil.runs.scenario import load_scenario, resolve
 from pkxyz_ctrl.config.files import CONFIG_DIR, ConfigError, read_toml, write_toml
 from pkxyz_ctrl.loop.controller import StartUpError
 
+pytestmark = pytest.mark.at_rate
+
 EARLIER = ".earlier"
 
 

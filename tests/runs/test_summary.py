@@ -2,6 +2,7 @@
 
 import pytest
 
+from hil.commands.run import _show
 from hil.lanes.lane import Lane
 from hil.runs.metrics import RowFigures
 from hil.runs.scenario import load_scenario
@@ -50,6 +51,19 @@ def test_checks_that_fail(tmp_path, loop, more, failing):
     found = summary(tmp_path, loop, more)
     assert [check.name for check in found.checks if check.ok is False] == failing
     assert found.ok == (not failing)
+
+
+def test_what_was_lost_is_said_on_the_screen(tmp_path, capsys):
+    _show(summary(tmp_path, LoopFigures(lost_rows=5, dropped_frames=4, refused_frames=3, blocked_frames=2)), tmp_path)
+    lines = [line for line in capsys.readouterr().out.splitlines() if line.startswith("lost: ")]
+    assert lines == [
+        "lost: 3 frames that the interface did not take",
+        "lost: 4 frames that a bus among processes lost",
+        "lost: 2 frames that our own gate held back",
+        "lost: 5 rows that the recording's writer was too slow for",
+    ]
+    _show(summary(tmp_path, LoopFigures(lost_rows=0, dropped_frames=0, refused_frames=0, blocked_frames=0)), tmp_path)
+    assert "lost: " not in capsys.readouterr().out
 
 
 def test_what_was_lost_is_in_the_json(tmp_path):

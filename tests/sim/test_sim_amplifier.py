@@ -9,7 +9,7 @@ from hypothesis import strategies as st
 from sim_rig import VOLT_PER_COUNT, config, counts, plant, settle
 
 
-@settings(deadline=None, max_examples=40)
+@settings(max_examples=40)
 @given(st.tuples(*[st.integers(-32768, 32767)] * 3))
 def test_counts_are_linear_volts(c):
     p = plant(config())
@@ -34,7 +34,7 @@ def test_gain_offset_and_coarse_converter():
     assert p.voltage_v == pytest.approx(expected, rel=1e-14)
 
 
-@settings(deadline=None, max_examples=30)
+@settings(max_examples=30)
 @given(st.floats(1e3, 100e3), st.integers(1, 300))
 def test_bandwidth_is_one_pole(corner_hz, t_us):
     p = plant(config(amplifier_bandwidth={"corner_hz": corner_hz}))

@@ -111,7 +111,7 @@ def test_a_blow_breaks_it_once_and_for_all():
     assert [e.kind for e in p.events].count("broken") == 1
 
 
-@settings(deadline=None, max_examples=60)
+@settings(max_examples=60)
 @given(
     st.sampled_from(["nominal", "mild", "harsh", "lab"]),
     st.lists(

@@ -35,7 +35,7 @@ def strokes_of(p, x):
     return out
 
 
-@settings(deadline=None, max_examples=40)
+@settings(max_examples=40)
 @given(poses)
 def test_crank_and_link_keep_their_lengths(x):
     """Points of each chain, rebuilt from the stroke: slider, pin and table stand L1 and L2 apart, the link over e_i."""
@@ -59,7 +59,7 @@ def test_strokes_are_zero_at_rest():
     assert np.abs(strokes_of(PLAIN, np.zeros(3))).max() < 1e-18
 
 
-@settings(deadline=None, max_examples=40)
+@settings(max_examples=40)
 @given(poses)
 def test_jacobian_is_the_slope_of_the_strokes(x):
     h = 1e-8
@@ -69,13 +69,13 @@ def test_jacobian_is_the_slope_of_the_strokes(x):
     np.testing.assert_allclose(jacobian(PLAIN.params[0], x), slopes, atol=1e-9)
 
 
-@settings(deadline=None, max_examples=40)
+@settings(max_examples=40)
 @given(st.floats(-0.999, 0.999))
 def test_arcsine_series_meets_the_library(y):
     assert arcsine(y) == pytest.approx(math.asin(y), rel=4e-16, abs=0)
 
 
-@settings(deadline=None, max_examples=40)
+@settings(max_examples=40)
 @given(plants, poses)
 def test_force_is_minus_the_slope_of_the_energy(p, x):
     par, s = p.params[0], p.state[0]
@@ -92,7 +92,7 @@ def test_force_is_minus_the_slope_of_the_energy(p, x):
     )  # of up to 4e-3 N; 1e-10 is the difference quotient's rounding
 
 
-@settings(deadline=None, max_examples=40)
+@settings(max_examples=40)
 @given(plants, poses)
 def test_stiffness_is_the_slope_of_the_force(p, x):
     par, s = p.params[0], p.state[0]
@@ -106,7 +106,7 @@ def test_stiffness_is_the_slope_of_the_force(p, x):
     np.testing.assert_allclose(rest_stiffness(par, x), slope, rtol=1e-6, atol=1e-5)
 
 
-@settings(deadline=None, max_examples=40)
+@settings(max_examples=40)
 @given(poses, st.tuples(*[st.floats(0, 4e4)] * 3).map(np.array))
 def test_combs_act_through_the_transposed_jacobian(x, volt2):
     par, s = UNEVEN.params[0], UNEVEN.state[0]
@@ -128,7 +128,7 @@ def test_published_stiffness_and_frequencies():
     assert hz == pytest.approx([630.92, 630.92, 771.75], rel=2e-4)
 
 
-@settings(deadline=None, max_examples=8)
+@settings(max_examples=8)
 @given(plants, st.tuples(*[st.floats(60, 150)] * 3))
 def test_the_stage_settles_where_the_energy_is_least(p, volts):
     """Static truth against a minimiser of V(x) - sum k_i V_i^2 q_i(x), in micrometres and nanojoules."""

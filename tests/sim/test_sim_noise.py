@@ -10,7 +10,7 @@ from sim_rig import GRADIENT_F_PER_M, config, plant, settle
 from sim.motion.noise import next_u64, normal, stream
 
 
-@settings(deadline=None, max_examples=30)
+@settings(max_examples=30)
 @given(st.integers(0, 2**63), st.integers(0, 7), st.integers(0, 9))
 def test_the_bits_are_numpys_own(seed, source, offset):
     words = stream(seed, source, offset)

@@ -15,7 +15,7 @@ def shown_m(p):
     return (np.array(p.sample()) * scale_f + (zero_f - REST_F)) / GRADIENT_F_PER_M
 
 
-@settings(deadline=None, max_examples=40)
+@settings(max_examples=40)
 @given(st.tuples(*[st.floats(-10e-6, 10e-6)] * 2, st.floats(-2e-6, 30e-6)))
 def test_counts_show_the_strokes_to_half_a_count(x):
     p = plant(config())

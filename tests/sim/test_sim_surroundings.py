@@ -112,7 +112,7 @@ def test_the_stage_rings_as_white_noise_lets_it(source):
 
 
 @given(st.floats(1e-6, 1e-4), st.one_of(st.none(), st.floats(1.0, 5.0)), st.floats(0.5, 10.0))
-@settings(deadline=None, max_examples=20)
+@settings(max_examples=20)
 def test_each_band_of_the_floor_has_its_velocity(velocity, isolator_hz, quality):
     """Sum of the tones of a one-third octave band, back through the table's legs: the rms of the file, 1 to 80 Hz."""
     floor = FloorVibration(on=True, velocity_m_per_s=velocity, isolator_hz=isolator_hz, isolator_quality=quality)

@@ -11,7 +11,7 @@ from stage_strategies import SHIPPED, any_stage, positions
 
 from pkxyz_ctrl.stage import Stage, StageDomainError
 
-MODEST = settings(max_examples=60, deadline=None)
+MODEST = settings(max_examples=60)
 WORKSPACE = seeded_points(40, [-20e-6, -20e-6, 0.0], [20e-6, 20e-6, 35e-6])
 
 
@@ -65,7 +65,7 @@ def test_hessian_of_the_energy(name: str) -> None:
     assert_derivative(stage.energy_gradient, stage.stiffness, WORKSPACE, step=2e-6, rtol=1e-10)
 
 
-@settings(max_examples=25, deadline=None)
+@settings(max_examples=25)
 @given(any_stage(), positions())
 def test_derivatives_for_any_geometry(stage: Stage, position_m: np.ndarray) -> None:
     micron_n = 1e-6 * float(np.abs(stage.stiffness(position_m)).max())  # the gradient vanishes at rest

@@ -12,7 +12,7 @@ from stage_strategies import SHIPPED, any_stage, positions, stage_with
 
 from pkxyz_ctrl.stage import Stage, StageDomainError
 
-MODEST = settings(max_examples=60, deadline=None)
+MODEST = settings(max_examples=60)
 
 
 def printed_equation_8(stage: Stage, position_m: np.ndarray) -> list[Decimal]:
@@ -75,7 +75,7 @@ def test_rest_is_exact(name: str) -> None:
     assert np.array_equal(stage.forward_kinematics(np.zeros(3)), np.zeros(3))
 
 
-@settings(max_examples=25, deadline=None)
+@settings(max_examples=25)
 @given(any_stage(), positions())
 def test_jacobian_is_the_derivative_of_the_strokes(stage: Stage, position_m: np.ndarray) -> None:
     # step 2 um: the shortest length over which q bends is the link's reach, 60 um from the steepest pose

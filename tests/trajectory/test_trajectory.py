@@ -54,7 +54,7 @@ def pieces_of(trajectory):
     return every.duration_s[:-1], every.state, every.jerk_m_per_s3
 
 
-@settings(max_examples=60, deadline=None)
+@settings(max_examples=60)
 @given(st.lists(holds | moves | rasters, min_size=1, max_size=3))
 def test_position_velocity_and_acceleration_are_continuous_from_rest_to_rest(segments):
     trajectory = planned(segments)
@@ -69,7 +69,7 @@ def test_position_velocity_and_acceleration_are_continuous_from_rest_to_rest(seg
     assert np.array_equal(end, np.concatenate([trajectory.end_m, np.zeros(6)]))
 
 
-@settings(max_examples=60, deadline=None)
+@settings(max_examples=60)
 @given(moves | rasters)
 def test_no_axis_ever_passes_its_limits(segment):
     trajectory = planned([segment])
@@ -92,7 +92,7 @@ def test_no_axis_ever_passes_its_limits(segment):
     assert reached > 0.999, "some limit has to bind, or the move is slower than it may be"
 
 
-@settings(max_examples=40, deadline=None)
+@settings(max_examples=40)
 @given(rasters, st.integers(0, 3000), st.integers(1, 400), st.integers(1, 50), st.sampled_from([50, 200, 500]))
 def test_a_tick_has_the_same_bits_however_it_is_asked_for(segment, first, count, chunk, period_us):
     trajectory = planned([segment, Hold(kind="hold", duration_s=0.01)])
@@ -100,11 +100,9 @@ def test_a_tick_has_the_same_bits_however_it_is_asked_for(segment, first, count,
     starts = range(first, first + count, chunk)
     parts = [trajectory.sample(n, min(chunk, first + count - n), period_us) for n in starts]
     assert np.concatenate(parts).tobytes() == whole.tobytes()
-    index = [trajectory.segment_index(n, min(chunk, first + count - n), period_us) for n in starts]
-    assert np.array_equal(np.concatenate(index), trajectory.segment_index(first, count, period_us))
 
 
-@settings(max_examples=40, deadline=None)
+@settings(max_examples=40)
 @given(rasters)
 def test_raster_passes_every_line_at_one_speed_in_serpentine_order(segment):
     trajectory = planned([segment])
@@ -132,7 +130,7 @@ def test_raster_passes_every_line_at_one_speed_in_serpentine_order(segment):
         assert np.diff(starts) == pytest.approx(1e6 / segment.line_rate_hz, abs=1.001)
 
 
-@settings(max_examples=200, deadline=None)
+@settings(max_examples=200)
 @given(
     st.floats(1e-6, 1e-2), st.floats(1e-9, 1e-5), st.floats(0.01, 10), st.floats(1.0, 1e4), st.floats(1.0, 3.0)
 )  # fmt: skip
@@ -188,8 +186,6 @@ def test_move_and_hold_by_hand():
     assert trajectory.duration_us == first.t_end_us + 50_000
     half = trajectory.sample(0, 2, round(2 * (1e-6 / 2000) ** (1 / 3) * 1e6))[1]
     assert half[0] == pytest.approx(0.5e-6, rel=1e-3)
-    assert trajectory.segment_index(0, 3, first.t_end_us).tolist() == [0, 1, 1 if first.t_end_us < 50_000 else -1]
-    assert trajectory.segment_index(-1, 1, 200).tolist() == [-1]
     with pytest.raises(TrajectoryError, match=r"reference\.1 \(move\): .*nowhere"):
         Trajectory([move, move])
     with pytest.raises(TrajectoryError, match="no segments"):

@@ -90,7 +90,7 @@ def motions_of(segment):
     return trajectory._motions, trajectory
 
 
-@settings(max_examples=100, deadline=None)
+@settings(max_examples=100)
 @given(smooth)
 def test_position_velocity_and_acceleration_go_on_over_every_joint_and_end_at_rest(segment):
     motions, trajectory = motions_of(segment)
@@ -107,7 +107,7 @@ def test_position_velocity_and_acceleration_go_on_over_every_joint_and_end_at_re
     assert np.abs(rows[:, 6:9]).max() < 1e-5
 
 
-@settings(max_examples=80, deadline=None)
+@settings(max_examples=80)
 @given(smooth, st.data())
 def test_velocity_and_acceleration_are_the_derivatives_of_the_position(segment, data):
     motions, _ = motions_of(segment)
@@ -133,7 +133,7 @@ def jerk_of(segment):
     return 3 * getattr(segment, "jerk_max_m_per_s3", 0.0)
 
 
-@settings(max_examples=60, deadline=None)
+@settings(max_examples=60)
 @given(smooth, st.integers(0, 500), st.integers(1, 300), st.integers(1, 40), st.sampled_from([50, 200, 500]))
 def test_a_tick_has_the_same_bits_however_it_is_asked_for(segment, offset, count, chunk, period_us):
     _, trajectory = motions_of(segment)
@@ -156,7 +156,7 @@ def full(segment, step_us=50):
     return t_s, rows, trajectory
 
 
-@settings(max_examples=40, deadline=None)
+@settings(max_examples=40)
 @given(circles)
 def test_a_circle_has_its_radius_and_its_frequency_and_begins_at_positive_x(segment):
     t_s, rows, trajectory = full(segment)
@@ -171,7 +171,7 @@ def test_a_circle_has_its_radius_and_its_frequency_and_begins_at_positive_x(segm
     assert end - begin == pytest.approx(segment.turns / segment.frequency_hz * 1e6, abs=2)
 
 
-@settings(max_examples=40, deadline=None)
+@settings(max_examples=40)
 @given(lissajous, rosettes, sines)
 def test_lissajous_rosette_and_sine_are_what_their_equations_say(figure, flower, sine):
     t_s, rows, _ = full(figure)
@@ -191,7 +191,7 @@ def test_lissajous_rosette_and_sine_are_what_their_equations_say(figure, flower,
     assert np.abs(np.delete(rows[:, :3], i, axis=1)).max() < 1e-20
 
 
-@settings(max_examples=60, deadline=None)
+@settings(max_examples=60)
 @given(sweeps, st.booleans(), st.floats(0.0, 1.0))
 def test_a_sweep_runs_from_one_frequency_to_the_other_by_its_law(segment, down, where):
     if down:
@@ -217,7 +217,7 @@ def test_a_sweep_runs_from_one_frequency_to_the_other_by_its_law(segment, down, 
     assert np.abs(envelope / segment.amplitude_m - 1).max() < 1e-6
 
 
-@settings(max_examples=60, deadline=None)
+@settings(max_examples=60)
 @given(linear_spirals | angular_spirals)
 def test_spirals_keep_their_pitch_and_their_velocity(segment):
     period_us = 50
@@ -257,7 +257,7 @@ def check_spiral(segment, rows, period_s):
         assert np.abs(np.diff(angle) / (2 * math.pi * segment.frequency_hz * period_s) - 1).max() < 1e-6
 
 
-@settings(max_examples=50, deadline=None)
+@settings(max_examples=50)
 @given(waypoints)
 def test_waypoints_pass_every_point_as_near_as_promised_inside_the_limits(segment):
     _, trajectory = motions_of(segment)

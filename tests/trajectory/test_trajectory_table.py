@@ -25,7 +25,7 @@ def table(folder, text, **changes):
     return Table(kind="csv", file=str(path), **{**limits, **changes})
 
 
-@settings(max_examples=25, deadline=None)
+@settings(max_examples=25)
 @given(
     st.lists(st.tuples(st.floats(0.004, 0.02), *[st.floats(-0.1, 0.1)] * 3), min_size=4, max_size=20),
     st.floats(-5.0, 5.0),
