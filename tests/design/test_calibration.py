@@ -1,6 +1,7 @@
 """[calibration] of a stage file: found from a plant's response, written, read, and used wherever the model is."""
 
 import dataclasses
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -142,6 +143,14 @@ def test_another_device_is_refused():
     response = measured(*(20.0 * gains(Stage(DRAWN), MIDDLE, COUNT_F)))
     with pytest.raises(FitError, match="not this drawing: comb_gain"):
         calibrate(DRAWN, MIDDLE, response, COUNT_F, AS_DRAWN)
+
+
+def test_a_response_that_tells_nothing_of_the_springs_is_refused():
+    """As where a fit ran away from them: its normal matrix was singular or not by the machine that inverted it."""
+    told = measured(*gains(Stage(DRAWN), MIDDLE, COUNT_F))
+    blind = np.where(np.arange(18) < 9, 1e18, 1.0)  # static gains alone tell springs
+    with pytest.raises(FitError, match="no springs and gains of it answer so"):
+        calibrate(DRAWN, MIDDLE, replace(told, gains_covariance=blind * told.gains_covariance), COUNT_F, AS_DRAWN)
 
 
 # -- what uses them -------------------------------------------------------------------------------------------------

@@ -120,7 +120,7 @@ def applied_as_shipped(self, counts, t_us):
 def test_a_soak_sees_what_a_node_does_that_it_must_not(tmp_path, monkeypatch, part, defect, words):
     """Its verdicts are no wider than the limits: each of these passed while an amplifier's offset was allowed for."""
     monkeypatch.setattr(AmplifierNode, part, defect)
-    monkeypatch.setattr(LockstepRig, "_stretches", lambda *_: None)  # which call the node's compiled rules
+    monkeypatch.setattr(LockstepRig, "_stretches_of", lambda _: None)  # which call the node's compiled rules
     monkeypatch.setattr("hil.studies.soak.random_faults", lambda *_: (parse("bus.sync:drop@0.3"),))
     monkeypatch.setattr("hil.studies.soak.CLEAR_S", 10.0)
     found = soak(0.5, 1, soaked_scenario("lqg"), tmp_path)
