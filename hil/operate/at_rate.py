@@ -25,6 +25,8 @@ from pkxyz_ctrl.can.frame import Frame
 from pkxyz_ctrl.client import place
 from pkxyz_ctrl.config.bus import CanConfig
 from pkxyz_ctrl.io.realtime import go_real_time, leave_real_time, settle_memory
+from pkxyz_ctrl.loop import in_position
+from pkxyz_ctrl.loop.in_position import IN_POSITION
 from pkxyz_ctrl.loop.row import ROW
 from pkxyz_ctrl.stage import Stage
 from pkxyz_ctrl.trajectory.check import DriveLimits
@@ -149,7 +151,11 @@ def _session_of(setup: Setup, settings: Settings, rig: WallRig, memory: StageMem
 
 
 def rehearse(reach: Reach, settings: Settings) -> None:
-    """Move, pause, follow and refuse once without a stage: what is loaded at its first use costs a tick some ms."""
+    """Look, move, pause, follow, refuse once without a stage: what is loaded at its first use costs a tick some ms."""
+    zero = np.zeros(3)
+    in_position.look(
+        np.zeros(1, IN_POSITION)[0], np.zeros((9, 3)), zero, zero, zero, settings.window_m, settings.sigmas
+    )
     setpoints = Setpoints(500, 1, 20)
     start, near_m = np.zeros(3), np.array([0.0, 0.0, 1e-6])
     for position in (near_m, np.full(3, 1.0), np.full(3, 1e-3)):

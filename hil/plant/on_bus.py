@@ -61,6 +61,7 @@ class PlantOnBus:
         self._exchange = direct(at_sync, plant.params, plant.state, self.record, 0, False, 0, 0, 0)
         # Loaded now, not in the first tick:
         self._exchange(plant.params, plant.state.copy(), self.record.copy(), 0, False, 0, 0, 0)
+        kernels.drive(plant.params, plant.state.copy(), np.zeros(3, np.int32))
 
     def exchange(self, t_us: int, counts: tuple[int, int, int] | None, *, sample: bool) -> tuple[int, int, int]:
         """As ``hil.node.sense.Plant`` says; with a sample one compiled call."""

@@ -87,6 +87,8 @@ class Controller:
         self._begin = direct(exchange.begin, config, memory, 0)
         self._on_frame = direct(exchange.on_frame, config, memory, *[0] * 5)
         self._finish = direct(exchange.finish, config, memory, 0, 0)
+        self._start, self._wait = direct(exchange.start, config, memory, 0), direct(exchange.wait, config, memory, 0)
+        self._come_up, self._stop = direct(exchange.come_up, memory), direct(exchange.stop, config, memory, 0)
         self._period = self._period_of()
         self._period(config, memory.copy(), self._reference, 0)  # loaded now, not in the first tick
 
@@ -126,7 +128,7 @@ class Controller:
     def start(self, t_us: int) -> None:
         """Begin the start-up dialogue with the amplifier."""
         self.driver.emergencies.clear()
-        self._pass_on(exchange.start(self.record, self.exchange, t_us), t_us)
+        self._pass_on(self._start(self.record, self.exchange, t_us), t_us)
 
     def dialogue(self, frame: Frame | None, t_us: int) -> bool:
         """One step of the start-up: a frame that came, or None if none came for a
@@ -137,8 +139,8 @@ class Controller:
         if frame is not None:
             self.receive(frame, t_us)
         else:
-            self._pass_on(exchange.wait(self.record, self.exchange, t_us), t_us)
-        come_up = exchange.come_up(self.exchange)
+            self._pass_on(self._wait(self.record, self.exchange, t_us), t_us)
+        come_up = self._come_up(self.exchange)
         if self.exchange["blocked"][0]:
             raise StartUpError(self.faults[-1])
         if come_up < 0:
@@ -147,7 +149,7 @@ class Controller:
 
     def stop(self, t_us: int) -> None:
         """0 V and pre-operational, whatever the mode."""
-        self._pass_on(exchange.stop(self.record, self.exchange, t_us), t_us)
+        self._pass_on(self._stop(self.record, self.exchange, t_us), t_us)
 
     def request(self, event: Event) -> None:
         """Ask for an event at the next tick: HOME, ENABLE, TRACK, HOLD, DISABLE."""

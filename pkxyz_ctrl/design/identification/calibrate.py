@@ -34,7 +34,7 @@ UNKNOWNS = 10
 SIGNIFICANT = 13.8
 """Chi-square of two ratios that noise alone passes once in a thousand."""
 TOLD_APART = 1e-6
-"""Least of a fit's singular values over the greatest: 0.06 on the shipped drawing, 1e-14 where springs have run away."""
+"""Least of a fit's singular values over the greatest: 0.06 on the shipped drawing, 1e-14 where springs ran away."""
 
 _DIFFERENCES = np.array([[2.0, -1.0, -1.0], [0.0, 1.0, -1.0]]) / np.array([[6.0], [2.0]]) ** 0.5
 """Orthonormal, sum 0: how three springs, or three sense gains, may differ."""
@@ -86,7 +86,7 @@ def calibrate(
         fit = scipy.optimize.least_squares(misses, start, x_scale=0.01)
         singular = np.linalg.svd(fit.jac, compute_uv=False)
         if singular[-1] < TOLD_APART * singular[0]:
-            raise FitError("the stage is not this drawing: no springs and gains of it answer so; give the right --stage")
+            raise FitError("the stage is not this drawing: no springs, no gains answer so; give the right --stage")
         chi_square = float(fit.fun @ fit.fun) / (len(seen) - len(start))
         return fit.x, np.linalg.inv(fit.jac.T @ fit.jac) * max(1.0, chi_square), chi_square
 
