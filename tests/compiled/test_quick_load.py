@@ -31,6 +31,37 @@ def test_a_warm_run_brings_in_no_library_to_compile_with(lane, tmp_path):
     assert run(lane, tmp_path / "again") == "[]"
 
 
+_LOADED_IN_RUN = """
+import sys
+from pathlib import Path
+from numba.core.dispatcher import Dispatcher
+from hil.lanes.lane import Lane
+from hil.lanes.lockstep import LockstepRig
+from hil.runs.run import run_into
+from hil.runs.run_folder import RunFolder
+from hil.runs.scenario import load_scenario
+loads, loaded = Dispatcher.compile, []
+def compile(self, types):
+    loaded.append(self.py_func.__qualname__)
+    return loads(self, types)
+Dispatcher.compile = compile
+runs = LockstepRig.run
+def run(rig, blocks):
+    loaded.clear()
+    ran = runs(rig, blocks)
+    print(*loaded)
+    return ran
+LockstepRig.run = run
+run_into(RunFolder(Path(sys.argv[1])), load_scenario("steps"), Lane.LOCKSTEP)
+"""
+
+
+def test_a_run_finds_its_kernels_loaded(tmp_path):
+    """Four were loaded by its first ticks: 80 ms, three times the run itself, and several periods of one at rate."""
+    script = [sys.executable, "-c", _LOADED_IN_RUN, tmp_path / "run"]
+    assert subprocess.run(script, capture_output=True, text=True, check=True).stdout == "\n"
+
+
 def kernels() -> list[tuple[Path, ast.FunctionDef]]:
     found = []
     for package in ("pkxyz_ctrl", "sim", "hil"):
