@@ -3,6 +3,8 @@
 import asyncio
 import contextlib
 import hmac
+import inspect
+import logging
 from collections.abc import AsyncIterator, Awaitable, Callable
 from pathlib import Path
 from typing import Any
@@ -25,6 +27,7 @@ CLIENTS_MOST = 32
 _ASKED_MOST = 1000
 """Messages of a client that wait for those before them."""
 _LOOK_S, _SHOW_S, _STATUS_S = 0.02, 1 / 30, 0.1
+_LOG = logging.getLogger(__name__)
 _HEADERS = [
     (b"content-security-policy", b"default-src 'self'; style-src 'self' 'unsafe-inline'; img-src 'self' data: blob:"),
     (b"x-content-type-options", b"nosniff"),
@@ -106,8 +109,7 @@ def app_of(desk: Desk, token: str, hosts: frozenset[str]) -> Starlette:
 
     @contextlib.asynccontextmanager
     async def lifespan(app: Starlette) -> AsyncIterator[None]:
-        tasks = [asyncio.create_task(_every(period, each)) for period, each in _rounds(desk)]
-        tasks.append(asyncio.create_task(_keep_faults(desk)))
+        tasks = [asyncio.create_task(repeat(period, each)) for period, each in _rounds(desk)]
         try:
             yield
         finally:
@@ -143,19 +145,26 @@ async def _speak(socket: WebSocket, client: Client) -> None:
 
 
 def _rounds(desk: Desk) -> list[tuple[float, Callable[[], object]]]:
-    return [(_LOOK_S, desk.look), (_SHOW_S, lambda: desk.show_telemetry(2000)), (_STATUS_S, desk.tell_status)]
+    return [
+        (_LOOK_S, desk.look), (_SHOW_S, lambda: desk.show_telemetry(2000)), (_STATUS_S, desk.tell_status),
+        (_STATUS_S, desk.keep_fault),
+    ]  # fmt: skip
 
 
-async def _every(period_s: float, each: Callable[[], object]) -> None:
+async def repeat(period_s: float, each: Callable[[], object]) -> None:
+    """Again and again. One that fails is told with its trace, once until one succeeds, and does not end the others."""
+    failed = False
     while True:
-        each()
+        try:
+            done = each()
+            if inspect.isawaitable(done):
+                await done
+            failed = False
+        except Exception:
+            if not failed:
+                _LOG.exception("a round of the server failed, and is tried again every %g s", period_s)
+            failed = True
         await asyncio.sleep(period_s)
-
-
-async def _keep_faults(desk: Desk) -> None:
-    while True:
-        await desk.keep_fault()
-        await asyncio.sleep(_STATUS_S)
 
 
 Plan = Callable[..., Awaitable[Any]]

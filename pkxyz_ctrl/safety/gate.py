@@ -137,6 +137,8 @@ class TransmitGate:
         word = int.from_bytes(frame.data[:_HEAD], "little", signed=True)
         known_mode = Mode(mode).name if mode in list(Mode) else f"unknown mode {mode}"
         words = _words(reason, self.record[0], held, len(frame.data), word, t_us)
+        if reason == Reason.LATCHED and self.latched:
+            words += f" since this {self.latched}"
         told = f"frame 0x{frame.can_id:03X} [{bytes(frame.data).hex(' ')}] blocked in {known_mode}: {words}"
         self.latched = self.latched or told
         return told

@@ -144,7 +144,7 @@ def test_the_first_refusal_is_kept_until_it_is_cleared() -> None:
     assert gate.latched == first
     told = reason(drive(6, 5, 5, 0), gate=gate)
     assert told is not None
-    assert "latched" in told
+    assert told.endswith(f"blocked in TRACKING: the gate is latched since this {first}")
     gate_rules.clear(gate.memory)  # as the compiled loop does it
     gate.clear()
     assert not gate.latched
