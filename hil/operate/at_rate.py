@@ -70,7 +70,7 @@ class OperatedLoop:
         self._path = memory.reader("path", from_start=True)
         self._laws = memory.reader("laws")
         self._head = memory.head
-        self._stops = 0
+        self._stop_id = 0
         self._tick = np.zeros(1, TICK)
         self._tick_bytes = self._tick.view(np.uint8).data
 
@@ -93,9 +93,9 @@ class OperatedLoop:
     def _come(self) -> list[np.void]:
         """Commands that have come; a stop that anyone asked for is the first of them."""
         commands: list[np.void] = []
-        if (stops := int(self._head["stop"][0])) != self._stops:
-            self._stops = stops
-            commands.append(new_command(Verb.STOP, 0)[0])
+        if (stop_id := int(self._head["stop"][0])) != self._stop_id:
+            self._stop_id = stop_id
+            commands.append(new_command(Verb.STOP, stop_id)[0])
         while len(commands) < _COMMANDS_A_TICK and (command := self._commands.read()) is not None:
             commands.append(np.frombuffer(command, COMMAND)[0])
             if commands[-1]["verb"] == Verb.LAW:

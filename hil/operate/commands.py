@@ -29,7 +29,7 @@ class Verb(IntEnum):
     SETTLE = 14
     LIMITS = 15
     RELEASE = 16
-    FRAME = 17
+    SAMPLE = 17
     QUIET = 18
     LAW = 19
 
@@ -50,7 +50,7 @@ MEANING: Final[dict[Verb, str]] = {
     Verb.AUTO_ZERO: "park, home, and back to where the stage held",
     Verb.SETTLE: "the window and dwell by which the stage is in position",
     Verb.LIMITS: "velocity, acceleration and jerk of moves that name none",
-    Verb.FRAME: "where the sample lies: targets and positions are in its coordinates from now on",
+    Verb.SAMPLE: "where the sample lies: targets and positions are in its coordinates from now on",
     Verb.QUIET: "quiet holds: less noise and less rejection while the set-point stands; or no longer",
     Verb.LAW: "another law, taken over without a jump; while the stage holds, or is off",
     Verb.RELEASE: "0 V at once, whatever runs; a fault that has to be cleared",
@@ -110,7 +110,7 @@ COMMAND = np.dtype(
         ("window_m", "<f8"),  # SETTLE
         ("dwell_s", "<f8"),
         ("sigmas", "<f8"),
-        ("matrix", "<f8", (3, 4)),  # FRAME, as of ``SampleFrame.matrix``
+        ("matrix", "<f8", (3, 4)),  # SAMPLE, as of ``SampleAxes.matrix``
         ("on", "<i4"),  # QUIET
         ("law", "<u8"),  # LAW: number of the one that was offered
         ("path", "<u8"),  # PATH: number of the path whose rows are streamed ...
@@ -138,7 +138,7 @@ SESSION = np.dtype(
         ("homed", "<i4"),
         ("running_id", "<u8"),  # of the command that moves the stage, 0 for none
         ("target_m", "<f8", (3,)),  # where the motion ends, in the stage's coordinates
-        ("matrix", "<f8", (3, 4)),  # of the sample's coordinates, as of ``SampleFrame.matrix``
+        ("matrix", "<f8", (3, 4)),  # of the sample's coordinates, as of ``SampleAxes.matrix``
         ("uncertainty_m", "<f8", (3,)),  # standard deviation of the estimate
         ("law", f"S{NAME_BYTES}"),
         ("progress", "<f8"),  # 0..1 of a path

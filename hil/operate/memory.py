@@ -27,7 +27,7 @@ _IN_MEMORY = Path("/dev/shm")
 
 
 class StageMemory:
-    """``head["server"]`` is counted up by the server while it lives, ``head["stop"]`` by whoever wants a stop."""
+    """``head["server"]`` is counted up by the server while it lives; ``head["stop"]`` is the number of the newest stop."""
 
     def __init__(self, path: Path, kept_ticks: int | None = None) -> None:
         """Map ``path``; with ``kept_ticks`` it is made anew, for so many ticks. Raises ``OSError``."""
@@ -72,9 +72,13 @@ class StageMemory:
         """To read from a ring."""
         return Reader(*self._parts[ring], from_start=from_start)
 
-    def count_up(self, word: str) -> None:
-        """One more."""
-        self.head[word] += 1
+    def sign_of_life(self) -> None:
+        """Of the server."""
+        self.head["server"] += 1
+
+    def stop(self, command_id: int) -> None:
+        """Ask for a stop, which is known by that number; one that the loop has not seen yet is this one, too."""
+        self.head["stop"] = command_id
 
     def remove(self) -> None:
         """Take the file away; whoever has mapped it keeps what is there."""

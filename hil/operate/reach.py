@@ -11,7 +11,7 @@ import numpy as np
 from numba import njit
 from numpy.typing import NDArray
 
-from hil.operate.sample_frame import PLAIN, Turn
+from hil.operate.sample_axes import PLAIN, Turn
 from pkxyz_ctrl.core import kinematics
 from pkxyz_ctrl.stage import Stage
 from pkxyz_ctrl.trajectory.check import DriveLimits

@@ -15,7 +15,7 @@ from hil.operate.commands import ANSWER, SESSION, Activity, State, Verb
 from hil.operate.path_stream import PathStream
 from hil.operate.procedures import AbortedError, Lease, Operated, RefusedError, Steps
 from hil.operate.reach import Reach
-from hil.operate.sample_frame import PLAIN, Turn
+from hil.operate.sample_axes import PLAIN, Turn
 from hil.operate.setpoints import Setpoints
 from hil.operate.settings import Settings
 from pkxyz_ctrl.loop import in_position
@@ -31,7 +31,7 @@ Say = Callable[[bytes], object]
 _WORDS_BYTES = ANSWER["words"].itemsize
 _MODAL = frozenset({Verb.HOME, Verb.ENABLE, Verb.CLEAR, Verb.AUTO_ZERO, Verb.PATH, Verb.LAW})
 """Begun only while nothing else runs."""
-_AT_ONCE = frozenset({Verb.SETTLE, Verb.LIMITS, Verb.FRAME, Verb.QUIET})
+_AT_ONCE = frozenset({Verb.SETTLE, Verb.LIMITS, Verb.SAMPLE, Verb.QUIET})
 """Done within a tick."""
 _LEAST, _MOST = 1e-12, 1e6
 _SIGMAS_MOST = 10.0
@@ -201,8 +201,8 @@ class Session:
             self.settings.limits = self._limits(command)
             v, a, j = self.settings.limits
             return f"moves that name none: {v:g} m/s, {a:g} m/s2, {j:g} m/s3"
-        if verb is Verb.FRAME:
-            return self._take_frame(command)
+        if verb is Verb.SAMPLE:
+            return self._take_sample(command)
         if verb is Verb.QUIET:
             self.stage.controller.hold_quietly(bool(command["on"]))
             return "holds are quiet: less noise, less rejection" if command["on"] else "holds are as stiff as moves"
@@ -215,7 +215,7 @@ class Session:
         of_it = f", {sigmas:g} standard deviations of the estimate included" if sigmas else ""
         return f"in position within {window_m * 1e9:g} nm for {dwell_s * 1e3:g} ms{of_it}"
 
-    def _take_frame(self, command: np.void) -> str:
+    def _take_sample(self, command: np.void) -> str:
         try:
             turn = Turn(command["matrix"])
         except ValueError as error:

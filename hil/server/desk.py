@@ -21,7 +21,8 @@ from hil.server.opening import listed, opened, values_of
 from hil.server.paths import Feeding, Planner, StagePath
 from hil.server.saving import AFTER_S, BEFORE_S, NotSavedError, save
 from hil.server.setting import ASKED, Setting
-from hil.server.status import status_of
+from hil.server.status import BusLoad, status_of
+from hil.server.stopping import Stopping
 from hil.server.stored_settings import SettingsStore
 from pkxyz_ctrl.config.files import ConfigError
 
@@ -57,11 +58,11 @@ class Desk:
         self._planner, self._plan = planner, plan
         self._feeding: Feeding | None = None
         self._asked_for: Feeding | None = None  # fed once the loop has begun it; another may be running
+        self._stopping = Stopping(link, self._tell)
         self._jog_id = 0
         self._jog_direction = [0.0, 0.0, 0.0]
         self._numbers = 0
-        self._frames = (0, 0, 0)
-        self._load = 0.0
+        self._bus_load = BusLoad()
         self._setting = Setting(link, planner, store or SettingsStore(), self._settings_changed)
         self._ranges: tuple[list[float], list[list[float | None]]] = ([], [])
 
@@ -116,9 +117,10 @@ class Desk:
             self._command(client, what, message, tag)
         elif what == "stop":
             self.stops += 1
-            self.link.stop()
             self._feeding = self._asked_for = None
-            client.tell(answer_of(tag, "stop", "done", "the loop was told to stop"))
+            command_id = self.link.next_id()
+            client.tags[command_id] = tag
+            self._stopping.ask(command_id)
         elif what == "subscribe":
             self._subscribe(client, message)
         elif what == "take_control":
@@ -211,7 +213,7 @@ class Desk:
             verb = Verb[what.upper()]
         except KeyError:
             raise AskedWrongError(f"there is nothing called {what!r} to do") from None
-        if verb in (Verb.FRAME, Verb.LAW):
+        if verb in (Verb.SAMPLE, Verb.LAW):
             raise AskedWrongError(f"{what} is asked otherwise")
         if verb is Verb.QUIET:
             fields["on"] = int(bool(message.get("on", True)))
@@ -304,6 +306,9 @@ class Desk:
             if answer.state not in FINAL:
                 self._feeding = self._asked_for
             self._asked_for = None
+        if answer.verb == "stop":
+            self._stopping.heard(answer)
+            return
         told = self._setting.heard(answer)
         if answer.state in FINAL:
             if self._feeding is not None and self._feeding.number == answer.id:
@@ -347,8 +352,8 @@ class Desk:
         if newest is None:
             status: dict[str, Any] = {"activity": "starting", "words": "the loop is starting", "alive": False}
         else:
-            self._look_at_load(newest)
-            status = status_of(newest, self.link.description, self._load) | {"alive": self.link.is_alive}
+            load = self._bus_load.at(newest)
+            status = status_of(newest, self.link.description, load) | {"alive": self.link.is_alive}
             status["range_m"] = self._ranges_at(newest["session"]["target_m"])
         status |= {
             "last_fault": self.last_fault,
@@ -365,13 +370,6 @@ class Desk:
         if self._ranges[0] != target_m.tolist():
             self._ranges = (target_m.tolist(), self._planner.ranges(target_m.copy()))
         return self._ranges[1]
-
-    def _look_at_load(self, newest: np.void) -> None:
-        now = (int(newest["row"]["t_us"]), int(newest["session"]["wire_ns"]), int(newest["session"]["missed"]))
-        passed_us = now[0] - self._frames[0]
-        if passed_us >= 500_000 or passed_us < 0:
-            self._load = (now[1] - self._frames[1]) * 1e-3 / passed_us if passed_us > 0 else 0.0
-            self._frames = now
 
     # -- telemetry -----------------------------------------------------------------------------------------------------
 

@@ -82,6 +82,7 @@ class Link:
     @property
     def is_alive(self) -> bool:
         """Whether the loop has ticked within the last second."""
+        self.newest()
         return time.monotonic() - self._seen_s < _GONE_S
 
     # -- out -----------------------------------------------------------------------------------------------------------
@@ -89,7 +90,7 @@ class Link:
     def sign_of_life(self) -> None:
         """Tell the loop that the server is there."""
         if self._memory is not None:
-            self._memory.count_up("server")
+            self._memory.sign_of_life()
 
     def next_id(self) -> int:
         """The number of the next command."""
@@ -109,10 +110,10 @@ class Link:
             command[name] = value
         self._commands.write(command.view(np.uint8).data[: COMMAND.itemsize])
 
-    def stop(self) -> None:
+    def stop(self, command_id: int) -> None:
         """Stop, past all that waits."""
         if self._memory is not None:
-            self._memory.count_up("stop")
+            self._memory.stop(command_id)
 
     def offer(self, offered: bytes) -> None:
         """A law, as bytes of ``OFFER``. Raises ``BusyError``."""

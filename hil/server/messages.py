@@ -6,7 +6,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from hil.operate.sample_frame import Turn
+from hil.operate.sample_axes import Turn
 from hil.server.paths import StagePath
 from pkxyz_ctrl.loop.row import ROW
 

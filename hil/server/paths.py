@@ -13,7 +13,7 @@ from pydantic import Field, TypeAdapter
 
 from hil.operate.commands import PATH_ROWS
 from hil.operate.reach import Reach
-from hil.operate.sample_frame import Turn
+from hil.operate.sample_axes import Turn
 from hil.runs.scenario import load_scenario
 from hil.server.link import Link
 from pkxyz_ctrl.config.bus import BusConfig

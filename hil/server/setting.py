@@ -6,14 +6,14 @@ from typing import Any, Final
 import numpy as np
 
 from hil.operate.commands import FINAL, State, Verb
-from hil.operate.sample_frame import SampleFrame, Turn
+from hil.operate.sample_axes import SampleAxes, Turn
 from hil.server.link import Answer, Link
 from hil.server.messages import AskedWrongError, number
 from hil.server.paths import Planner
 from hil.server.stored_settings import MoveLimits, SettingsStore, SettleWindow, StageSettings
 from pkxyz_ctrl.config.files import parse
 
-ASKED: Final = frozenset({"frame", "tilt_plane", "limits", "settle", "name_position", "forget_position", "restore"})
+ASKED: Final = frozenset({"sample", "tilt_plane", "limits", "settle", "name_position", "forget_position", "restore"})
 """What is asked for here."""
 _WHO_MOST = 60
 
@@ -68,7 +68,7 @@ class Setting:
             wanted = now.model_copy(update={"settle": parse(now.settle.model_dump() | changed, SettleWindow, what)})
             words = "settle window"
         else:
-            wanted, words = now.model_copy(update={"frame": self._frame(what, message)}), "frame of the sample"
+            wanted, words = now.model_copy(update={"sample": self._sample(what, message)}), "axes of the sample"
             self._require_rest()
         last = self._tell_loop(wanted)
         self._waiting[last] = (what, who, words, wanted)
@@ -97,7 +97,7 @@ class Setting:
 
     def _describe(self) -> None:
         now = self._store.now
-        self._planner.turn = Turn(now.frame.matrix())
+        self._planner.turn = Turn(now.sample.matrix())
         if self._store.changes:
             self._link.description |= {
                 "limits": list(now.limits.model_dump().values()), "window_m": now.settle.window_m,
@@ -105,20 +105,20 @@ class Setting:
             }  # fmt: skip
 
     def _tell_loop(self, settings: StageSettings) -> int:
-        """All of it, the frame last; returns the id of that command."""
+        """All of it, the sample's axes last; returns the id of that command."""
         link = self._link
         limits, settle, last = (link.next_id() for _ in range(3))
         self._own |= {limits, settle, last}
         link.command(Verb.LIMITS, limits, **settings.limits.model_dump())
         link.command(Verb.SETTLE, settle, **settings.settle.model_dump())
-        link.command(Verb.FRAME, last, matrix=settings.frame.matrix())
+        link.command(Verb.SAMPLE, last, matrix=settings.sample.matrix())
         return last
 
-    def _frame(self, what: str, message: dict[str, Any]) -> SampleFrame:
-        now = self._store.now.frame
-        if what == "frame":
-            changed = {name: message[name] for name in SampleFrame.model_fields if name in message}
-            return parse(now.model_dump() | changed, SampleFrame, "frame")
+    def _sample(self, what: str, message: dict[str, Any]) -> SampleAxes:
+        now = self._store.now.sample
+        if what == "sample":
+            changed = {name: message[name] for name in SampleAxes.model_fields if name in message}
+            return parse(now.model_dump() | changed, SampleAxes, "sample")
         try:
             points = np.array(message.get("points_m"), np.float64)
         except (ValueError, TypeError):
@@ -130,7 +130,7 @@ class Setting:
     def _require_rest(self) -> None:
         newest = self._link.newest()
         if newest is not None and newest["session"]["running_id"]:
-            raise AskedWrongError("the frame of the sample is changed while nothing runs: wait, or abort first")
+            raise AskedWrongError("the axes of the sample are changed while nothing runs: wait, or abort first")
 
     def _positions(self, what: str, message: dict[str, Any]) -> tuple[str, StageSettings]:
         now, name = self._store.now, message.get("name")

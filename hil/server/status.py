@@ -6,8 +6,27 @@ from typing import Any
 import numpy as np
 
 from hil.operate.commands import ACTIVITY_WORDS, Activity
-from hil.operate.sample_frame import Turn
+from hil.operate.sample_axes import Turn
 from pkxyz_ctrl.safety.modes import LOOP_CLOSED, MODE_FACTS, Mode
+
+_LOAD_OVER_US = 500_000
+
+
+class BusLoad:
+    """Share of the time in which frames are on the wire, over half a second or more."""
+
+    def __init__(self) -> None:
+        self._from_us = self._from_wire_ns = 0
+        self._share = 0.0
+
+    def at(self, tick: np.void) -> float:
+        """0 to 1, at a record of ``TICK``."""
+        t_us, wire_ns = int(tick["row"]["t_us"]), int(tick["session"]["wire_ns"])
+        passed_us = t_us - self._from_us
+        if passed_us >= _LOAD_OVER_US or passed_us < 0:
+            self._share = (wire_ns - self._from_wire_ns) * 1e-3 / passed_us if passed_us > 0 else 0.0
+            self._from_us, self._from_wire_ns = t_us, wire_ns
+        return self._share
 
 
 def status_of(tick: np.void, description: dict[str, Any], bus_load: float) -> dict[str, Any]:
@@ -28,7 +47,7 @@ def status_of(tick: np.void, description: dict[str, Any], bus_load: float) -> di
         "in_position": bool(session["in_position"]), "running_id": int(session["running_id"]),
         "setpoint_m": _finite(setpoint), "position_m": _finite(position), "error_m": _finite(position - setpoint),
         "target_m": _finite(target), "uncertainty_m": _finite(session["uncertainty_m"]),
-        "law": session["law"].decode(errors="replace"), "quiet": bool(row["quiet"]), "framed": not turn.is_plain,
+        "law": session["law"].decode(errors="replace"), "quiet": bool(row["quiet"]), "in_sample_axes": not turn.is_plain,
         "voltage_v": voltage, "headroom_v": most_v - max(voltage), "saturated": bool(row["saturated"]),
         "progress": float(session["progress"]), "missed_ticks": int(session["missed"]),
         "frames": int(session["frames"]), "bus_load": round(bus_load, 4),

@@ -13,7 +13,7 @@ from typing import Annotated, Any
 
 from pydantic import Field, ValidationError
 
-from hil.operate.sample_frame import SampleFrame
+from hil.operate.sample_axes import SampleAxes
 from hil.operate.settings import Settings
 from pkxyz_ctrl.config.files import ConfigError, FrozenModel
 
@@ -45,7 +45,7 @@ class SettleWindow(FrozenModel):
 class StageSettings(FrozenModel):
     """All that is kept."""
 
-    frame: SampleFrame = SampleFrame()
+    sample: SampleAxes = SampleAxes()
     positions: Annotated[Positions, Field(max_length=_POSITIONS_MOST)] = Field(default_factory=dict)
     """m, in the sample's coordinates"""
     limits: MoveLimits = MoveLimits()

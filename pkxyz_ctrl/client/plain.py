@@ -80,7 +80,7 @@ class Stage:
     auto_zero = _waited(AsyncStage.auto_zero)
     settle_window = _waited(AsyncStage.settle_window)
     limits = _waited(AsyncStage.limits)
-    set_frame = _waited(AsyncStage.set_frame)
+    set_sample = _waited(AsyncStage.set_sample)
     tilt_plane = _waited(AsyncStage.tilt_plane)
     name_position = _waited(AsyncStage.name_position)
     forget_position = _waited(AsyncStage.forget_position)
@@ -102,7 +102,7 @@ class Stage:
 
     @property
     def settings(self) -> StageSettings:
-        """Frame of the sample, named positions, limits of moves, settle window, and their history."""
+        """Axes of the sample, named positions, limits of moves, settle window, and their history."""
         return self._stage.settings
 
     @property

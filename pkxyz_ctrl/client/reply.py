@@ -58,8 +58,8 @@ class Status:
     law: str
     quiet: bool
     """whether quiet holds are asked for"""
-    framed: bool
-    """whether the sample's coordinates are other ones than the stage's"""
+    in_sample_axes: bool
+    """whether lengths are along the sample's axes, and those are not the stage's"""
     missed_ticks: int
     bus_load: float
     """0 to 1"""
@@ -77,7 +77,7 @@ class Status:
         low_high = [[np.nan if v is None else v for v in pair] for pair in values["range_m"] or [[None] * 2] * 3]
         values["range_m"] = np.array(low_high, np.float64)
         plain: dict[str, Any] = {"homed": False, "driven": False, "in_position": False, "missed_ticks": 0}
-        plain |= {"quiet": False, "framed": False}
+        plain |= {"quiet": False, "in_sample_axes": False}
         plain |= dict.fromkeys(("t_s", "headroom_v", "progress", "bus_load"), 0.0)
         return cls(**{name: plain.get(name, "") if value is None else value for name, value in values.items()})
 

@@ -44,7 +44,7 @@ class Change:
 class StageSettings:
     """They outlive the loop and the server."""
 
-    frame: SampleCoordinates
+    sample: SampleCoordinates
     positions: Mapping[str, Point]
     """m, in the sample's coordinates"""
     velocity_m_per_s: float
@@ -64,9 +64,9 @@ class StageSettings:
     @classmethod
     def of(cls, data: Mapping[str, Any]) -> Self:
         """From the server's words."""
-        frame = data["frame"]
+        sample = data["sample"]
         return cls(
-            frame=SampleCoordinates(**frame | {name: tuple(frame[name]) for name in ("origin_m", "scale")}),
+            sample=SampleCoordinates(**sample | {name: tuple(sample[name]) for name in ("origin_m", "scale")}),
             positions={name: (place[0], place[1], place[2]) for name, place in data["positions"].items()},
             **data["limits"], **data["settle"], digest=data["digest"],
             history=tuple(Change(**change) for change in data["history"]),

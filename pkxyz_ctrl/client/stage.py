@@ -180,7 +180,7 @@ class AsyncStage:
         """Of moves that name none, for each axis."""
         return await self._set("limits", **_limits(velocity_m_per_s, acceleration_m_per_s2, jerk_m_per_s3))
 
-    async def set_frame(
+    async def set_sample(
         self,
         origin_m: Point | None = None,
         rotation_deg: float | None = None,
@@ -192,10 +192,10 @@ class AsyncStage:
         the sample's coordinates from now on.
         """
         turn = {"rotation_deg": rotation_deg, "slope_x": slope_x, "slope_y": slope_y}
-        return await self._set("frame", origin_m=origin_m, scale=scale, **turn)
+        return await self._set("sample", origin_m=origin_m, scale=scale, **turn)
 
     async def tilt_plane(self, a_m: Point, b_m: Point, c_m: Point) -> Command:
-        """Tilt the frame so that these three points, in present coordinates, are at z = 0."""
+        """Tilt the sample's axes so that these three points, in present coordinates, are at z = 0."""
         return await self._set("tilt_plane", points_m=[list(a_m), list(b_m), list(c_m)])
 
     async def name_position(
@@ -251,7 +251,7 @@ class AsyncStage:
 
     @property
     def settings(self) -> StageSettings:
-        """Frame of the sample, named positions, limits of moves, settle window, and their history."""
+        """Axes of the sample, named positions, limits of moves, settle window, and their history."""
         return StageSettings.of(self._connection.settings)
 
     @property

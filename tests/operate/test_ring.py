@@ -159,8 +159,8 @@ def test_memory_is_nobody_elses_and_not_made_over_a_link(tmp_path):
     path = tmp_path / "memory"
     memory = StageMemory(path, kept_ticks=8)
     assert path.stat().st_mode & 0o777 == 0o600
-    memory.count_up("stop")
-    assert int(StageMemory(path).head["stop"][0]) == 1
+    memory.stop(17)
+    assert int(StageMemory(path).head["stop"][0]) == 17
     (tmp_path / "link").symlink_to(path)
     with pytest.raises(OSError, match="link"):
         StageMemory(tmp_path / "link")

@@ -112,7 +112,7 @@ def operate(browser: Browser, url: str, pictures: Path) -> None:
 
 
 def set_up(browser: Browser, pictures: Path) -> None:
-    """Window, law, frame of the sample, a position with a name, and the way back."""
+    """Window, law, axes of the sample, a position with a name, and the way back."""
     fill(browser, "#settle [name=window]", "25")
     browser.click("#settle button")
     logged(browser, "settle done: settle window: settings ")
@@ -120,10 +120,10 @@ def set_up(browser: Browser, pictures: Path) -> None:
     logged(browser, "quiet done: holds are quiet")
     assert "stage.quiet_holds(True)" in browser.text("#as-python")
     browser.click("#quiet")
-    fill(browser, "#frame [name=origin_z]", "19")
-    fill(browser, "#frame [name=rotation]", "30")
-    browser.click("#frame button:not([type])")
-    logged(browser, "frame done: ")
+    fill(browser, "#sample [name=origin_z]", "19")
+    fill(browser, "#sample [name=rotation]", "30")
+    browser.click("#sample button:not([type])")
+    logged(browser, "sample done: ")
     browser.until("document.querySelector('#facts').innerText.includes('sample')")
     assert "rotation_deg=30" in browser.text("#as-command")
     fill(browser, "#name-position [name=name]", "corner")

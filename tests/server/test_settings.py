@@ -5,14 +5,14 @@ import pytest
 from operated_rig import MIDDLE_M, Script
 from test_desk import DeskRig, switched_on
 
-from hil.operate.sample_frame import SampleFrame, Turn
+from hil.operate.sample_axes import SampleAxes, Turn
 from hil.server.setting import Setting
 from hil.server.stored_settings import SettingsStore, StageSettings
 from pkxyz_ctrl.client.protocol import unpacked
 from pkxyz_ctrl.client.settings import StageSettings as Told
 from pkxyz_ctrl.config.files import ConfigError
 
-FRAME = {"origin_m": [0.5e-6, -0.3e-6, 18e-6], "rotation_deg": 90.0, "slope_x": 0.02, "slope_y": -0.01}
+SAMPLE = {"origin_m": [0.5e-6, -0.3e-6, 18e-6], "rotation_deg": 90.0, "slope_x": 0.02, "slope_y": -0.01}
 
 
 @pytest.fixture
@@ -24,22 +24,22 @@ def rig(tmp_path, monkeypatch):
     return rig
 
 
-def test_a_frame_changes_what_everybody_sees_and_moves_nothing(rig):
+def test_the_samples_axes_change_what_everybody_sees_and_moves_nothing(rig):
     client, looker = rig.desk.enter(), rig.desk.enter()
-    turn = Turn(SampleFrame(**{k: tuple(v) if isinstance(v, list) else v for k, v in FRAME.items()}).matrix())
+    turn = Turn(SampleAxes(**{k: tuple(v) if isinstance(v, list) else v for k, v in SAMPLE.items()}).matrix())
 
     def script() -> Script:
         yield from switched_on(rig, client)
-        answer = yield from rig.finish(looker, do="frame", rotation_deg=5.0)
+        answer = yield from rig.finish(looker, do="sample", rotation_deg=5.0)
         assert answer["state"] == "refused", "read-only without control"
-        answer = yield from rig.finish(client, do="frame", who="Ann", **FRAME)
-        assert (answer["state"], answer["verb"]) == ("done", "frame")
+        answer = yield from rig.finish(client, do="sample", who="Ann", **SAMPLE)
+        assert (answer["state"], answer["verb"]) == ("done", "sample")
         assert np.allclose(rig.session.stage.setpoints.target_m, MIDDLE_M, atol=1e-18)
         yield from rig.wait_s(0.002)
         rig.desk.tell_status()
         heard = rig.heard(looker)
         assert np.allclose(heard["status"][-1]["target_m"], turn.to_sample(np.array(MIDDLE_M)), atol=1e-15)
-        assert heard["status"][-1]["framed"]
+        assert heard["status"][-1]["in_sample_axes"]
         assert heard["settings"][-1]["history"][0]["who"] == "Ann"
         answer = yield from rig.finish(client, do="move", x_m=1e-6, y_m=0.0, z_m=0.0)
         assert answer["words"].startswith("in position at (1, 0, 0) um"), answer
@@ -89,8 +89,8 @@ def test_positions_planes_and_windows_are_kept_with_a_way_back(rig, tmp_path):
         answer = yield from rig.finish(client, do="tilt_plane", points_m=points, who="Bob")
         assert answer["state"] == "done"
         now = Told.of(rig.desk._setting.told())
-        assert (now.frame.slope_x, now.frame.slope_y) == (pytest.approx(0.05), pytest.approx(-0.05))
-        assert now.frame.origin_m[2] == pytest.approx(18e-6)
+        assert (now.sample.slope_x, now.sample.slope_y) == (pytest.approx(0.05), pytest.approx(-0.05))
+        assert now.sample.origin_m[2] == pytest.approx(18e-6)
         assert [change.who for change in now.history] == ["Bob", "somebody", "Ann", ""]
         assert len({change.digest for change in now.history}) == 4
         again = SettingsStore(file)
@@ -98,7 +98,7 @@ def test_positions_planes_and_windows_are_kept_with_a_way_back(rig, tmp_path):
         assert again.now.positions == {"corner": (2e-6, 1e-6, 18e-6)}
         rig.desk._setting.joined()  # a new loop is told what is kept
         yield from rig.wait_s(0.005)
-        assert np.allclose(rig.session.state["matrix"][0], again.now.frame.matrix())
+        assert np.allclose(rig.session.state["matrix"][0], again.now.sample.matrix())
         answer = yield from rig.finish(client, do="restore", digest=fresh.digest[:6])
         assert answer["state"] == "done"
         assert SettingsStore(file).now == StageSettings()

@@ -16,17 +16,17 @@ _PLAIN = (
 )  # fmt: skip
 _FREE = ("stop", "release", "status", "save", "settings")
 _OTHERS = (
-    "move", "path", "status", "settings", "frame", "tilt", "name", "forget", "go", "restore", "law", "quiet", "settle",
+    "move", "path", "status", "settings", "sample", "tilt", "name", "forget", "go", "restore", "law", "quiet", "settle",
     "limits",
 )  # fmt: skip
 
 
 _NEEDED = {
-    "frame": (),
+    "sample": (),
     "settle": ("window_m", "dwell_s"),
     "limits": ("velocity_m_per_s", "acceleration_m_per_s2", "jerk_m_per_s3"),
 }
-_MAY = {"frame": ("rotation_deg", "slope_x", "slope_y", "origin_m", "scale"), "settle": ("sigmas",), "limits": ()}
+_MAY = {"sample": ("rotation_deg", "slope_x", "slope_y", "origin_m", "scale"), "settle": ("sigmas",), "limits": ()}
 _POINTS = ("origin_m", "scale")
 
 
@@ -35,7 +35,7 @@ def ask(
     arguments: Annotated[
         list[str] | None,
         typer.Argument(
-            help="move: x=1e-6 y=... z=... in m. path: a shipped scenario, a .csv table, a .json of segments. frame: "
+            help="move: x=1e-6 y=... z=... in m. path: a shipped scenario, a .csv table, a .json of segments. sample: "
             "rotation_deg, slope_x, slope_y, origin_m=x,y,z, scale=x,y,z. tilt: three points x,y,z in m. name, forget, "
             "go: a position's name. restore: a digest of settings. law: a shipped controller or a .toml. quiet: on, "
             "off. settle: window_m, dwell_s, sigmas. limits: velocity_m_per_s, acceleration_m_per_s2, jerk_m_per_s3."
@@ -107,8 +107,8 @@ def _path(words: list[str]) -> dict[str, Any]:
 
 def _set(stage: Any, what: str, words: list[str]) -> Any:
     """What is not a motion, and goes to a named position."""
-    if what in ("frame", "settle", "limits"):
-        verb = {"frame": stage.set_frame, "settle": stage.settle_window, "limits": stage.limits}[what]
+    if what in ("sample", "settle", "limits"):
+        verb = {"sample": stage.set_sample, "settle": stage.settle_window, "limits": stage.limits}[what]
         return verb(**_named(what, words))
     if what == "tilt":
         if len(words) != 3:
@@ -166,12 +166,12 @@ def _show_settings(settings: Any, as_json: bool) -> None:
     if as_json:
         print(json.dumps(dataclasses.asdict(settings)))
         return
-    frame = settings.frame
+    sample = settings.sample
     print(f"settings {settings.digest}")
     print(
-        f"frame: origin {frame.origin_m} m, rotation {frame.rotation_deg:g} deg, slopes {frame.slope_x:g} and", end=" "
+        f"sample: origin {sample.origin_m} m, rotation {sample.rotation_deg:g} deg, slopes {sample.slope_x:g} and", end=" "
     )
-    print(f"{frame.slope_y:g}, scale {frame.scale}")
+    print(f"{sample.slope_y:g}, scale {sample.scale}")
     print(f"in position: {settings.window_m:g} m for {settings.dwell_s:g} s, {settings.sigmas:g} sigma included")
     for name, place in settings.positions.items():
         print(f"position {name}: {place} m")

@@ -1,4 +1,4 @@
-// What is set of the stage: frame of the sample, named positions, law, settle window, and the way back.
+// What is set of the stage: axes of the sample, named positions, law, settle window, and the way back.
 
 const at = (id) => document.getElementById(id);
 const numberOf = (text) => Number(String(text).trim().replace(",", "."));
@@ -7,7 +7,7 @@ export class Setting {
   /** `ask(message, command, python)` asks the server and shows what does the same. */
   constructor(ask) {
     this.ask = ask; this.points = [];
-    at("frame").onsubmit = (event) => { event.preventDefault(); this.setFrame(); };
+    at("sample").onsubmit = (event) => { event.preventDefault(); this.setSample(); };
     at("plane-point").onclick = () => this.addPoint();
     at("name-position").onsubmit = (event) => {
       event.preventDefault();
@@ -30,14 +30,14 @@ export class Setting {
 
   do(message, command, python) { this.ask({ ...message, who: "page" }, command, python); }
 
-  setFrame() {
-    const f = at("frame").elements, origin_m = ["x", "y", "z"].map((a) => numberOf(f[`origin_${a}`].value) * 1e-6);
+  setSample() {
+    const f = at("sample").elements, origin_m = ["x", "y", "z"].map((a) => numberOf(f[`origin_${a}`].value) * 1e-6);
     const turn = { rotation_deg: numberOf(f.rotation.value), slope_x: numberOf(f.slope_x.value) * 1e-3, slope_y: numberOf(f.slope_y.value) * 1e-3 };
     const scale = ["x", "y", "z"].map((a) => numberOf(f[`scale_${a}`].value));
     const plain = Object.entries(turn).map(([key, v]) => `${key}=${+v.toPrecision(9)}`);
     const [o, s] = [origin_m, scale].map((list) => list.map((v) => +v.toPrecision(9)));
-    this.do({ do: "frame", origin_m: o, scale: s, ...turn }, `pkxyz ask frame ${plain.join(" ")} origin_m=${o} scale=${s}`,
-      `stage.set_frame(${plain.join(", ")}, origin_m=(${o.join(", ")}), scale=(${s.join(", ")}))`);
+    this.do({ do: "sample", origin_m: o, scale: s, ...turn }, `pkxyz ask sample ${plain.join(" ")} origin_m=${o} scale=${s}`,
+      `stage.set_sample(${plain.join(", ")}, origin_m=(${o.join(", ")}), scale=(${s.join(", ")}))`);
   }
 
   addPoint() {
@@ -54,10 +54,10 @@ export class Setting {
   /** What is set now; a form that somebody is writing in keeps what is written. */
   show(told) {
     this.told = told;
-    if (!at("frame").contains(document.activeElement)) {
-      const f = at("frame").elements, frame = told.frame;
-      ["x", "y", "z"].forEach((a, n) => { f[`origin_${a}`].value = +(frame.origin_m[n] * 1e6).toPrecision(7); f[`scale_${a}`].value = frame.scale[n]; });
-      f.rotation.value = +frame.rotation_deg.toPrecision(7); f.slope_x.value = +(frame.slope_x * 1e3).toPrecision(6); f.slope_y.value = +(frame.slope_y * 1e3).toPrecision(6);
+    if (!at("sample").contains(document.activeElement)) {
+      const f = at("sample").elements, sample = told.sample;
+      ["x", "y", "z"].forEach((a, n) => { f[`origin_${a}`].value = +(sample.origin_m[n] * 1e6).toPrecision(7); f[`scale_${a}`].value = sample.scale[n]; });
+      f.rotation.value = +sample.rotation_deg.toPrecision(7); f.slope_x.value = +(sample.slope_x * 1e3).toPrecision(6); f.slope_y.value = +(sample.slope_y * 1e3).toPrecision(6);
     }
     if (!at("settle").contains(document.activeElement)) {
       const f = at("settle").elements;

@@ -22,7 +22,7 @@ Scale = Annotated[float, Field(ge=0.5, le=2.0)]
 Metres = Annotated[float, Field(ge=-_ORIGIN_MOST_M, le=_ORIGIN_MOST_M)]
 
 
-class SampleFrame(FrozenModel):
+class SampleAxes(FrozenModel):
     """Where the sample lies on the stage."""
 
     origin_m: tuple[Metres, Metres, Metres] = (0.0, 0.0, 0.0)
@@ -41,7 +41,7 @@ class SampleFrame(FrozenModel):
         turned = _tilted(self.slope_x, self.slope_y) @ _about_z(math.radians(self.rotation_deg)) @ np.diag(self.scale)
         return np.concatenate([turned, np.array(self.origin_m)[:, None]], axis=1)
 
-    def through(self, points_m: Array) -> "SampleFrame":
+    def through(self, points_m: Array) -> "SampleAxes":
         """With the sample's plane z = 0 through three points (3, 3) of the stage, the origin moved along z into it.
         Raises ``ValueError`` for points that tell no plane, or one that is too steep.
         """
@@ -62,14 +62,14 @@ class SampleFrame(FrozenModel):
 
 
 class Turn:
-    """A frame at work, from its ``matrix``."""
+    """Axes at work, from their ``matrix``."""
 
     def __init__(self, matrix: Array) -> None:
         """Raises ``ValueError`` for one that can't be undone."""
         self.matrix = np.array(matrix, np.float64)
         self._forth, self._origin = np.ascontiguousarray(self.matrix[:, 0:3]), self.matrix[:, 3].copy()
         if not np.isfinite(self.matrix).all() or not 0.1 <= abs(np.linalg.det(self._forth)) <= 10.0:
-            raise ValueError("a frame is a turn, a scale near 1 and an origin")
+            raise ValueError("axes are a turn, a scale near 1 and an origin")
         self._back = np.linalg.inv(self._forth)
         self.is_plain = bool((self.matrix == PLAIN).all())
         """whether stage and sample have the same coordinates, to the last bit"""
@@ -103,5 +103,5 @@ def _tilted(slope_x: float, slope_y: float) -> Array:
     return np.eye(3) + cross + cross @ cross / (1.0 + normal[2])
 
 
-PLAIN: Array = SampleFrame().matrix()
+PLAIN: Array = SampleAxes().matrix()
 """The sample's coordinates are the stage's."""
