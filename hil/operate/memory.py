@@ -27,7 +27,9 @@ _IN_MEMORY = Path("/dev/shm")
 
 
 class StageMemory:
-    """``head["server"]`` is counted up by the server while it lives; ``head["stop"]`` is the number of the newest stop."""
+    """``head["server"]`` is counted up by the server while it lives; ``head["stop"]`` is the number of the newest
+    stop.
+    """
 
     def __init__(self, path: Path, kept_ticks: int | None = None) -> None:
         """Map ``path``; with ``kept_ticks`` it is made anew, for so many ticks. Raises ``OSError``."""

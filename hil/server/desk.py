@@ -162,7 +162,8 @@ class Desk:
         elif what == "parameters":
             client.tell({"parameters": self._planner.parameters})
         elif what == "recordings":
-            client.tell({"recordings": await self._plan(listed, self._saves)})
+            names = await self._plan(listed, self._saves)
+            client.tell({"recordings": {"folder": str(self._saves), "names": names}})
         elif what == "open_recording":
             about, block = await self._plan(opened, self._saves, message.get("name"), client.fields)
             if not client.has_room:

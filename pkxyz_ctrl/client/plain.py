@@ -70,6 +70,7 @@ class Stage:
     ended = _waited(AsyncStage.ended)
     jog = _waited(AsyncStage.jog)
     follow = _waited(AsyncStage.follow)
+    preview = _waited(AsyncStage.preview)
     pause = _waited(AsyncStage.pause)
     resume = _waited(AsyncStage.resume)
     abort = _waited(AsyncStage.abort)

@@ -1,16 +1,50 @@
-"""A scan as frames: what came by, tick by tick, put where on its lines the path was."""
+"""Paths: what is asked, what is told before one is followed, and a scan's frames, put together tick by tick."""
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
+from typing import Any, Self
 
 import numpy as np
 from numpy.typing import NDArray
 
 from pkxyz_ctrl.client.protocol import Block
+from pkxyz_ctrl.client.reply import StageError
 
 Array = NDArray[np.float64]
 PATH_ROW = "path_row"
 """Field of telemetry: where on the path the set-point is, in its rows; NaN off it."""
+
+
+def path_of(
+    scenario: str | None, segments: Sequence[Mapping[str, Any]] | None, table_csv: str | None, limits: dict[str, float]
+) -> dict[str, Any]:
+    """A path as the server is told it; ``limits`` are those of a table. Raises ``StageError`` unless it is one of the
+    three.
+    """
+    sources = {"scenario": scenario, "segments": segments, "table": table_csv}
+    path: dict[str, Any] = {key: value for key, value in sources.items() if value is not None}
+    if len(path) != 1:
+        raise StageError("give one of scenario, segments and table_csv")
+    return path if table_csv is None else path | limits
+
+
+@dataclass(frozen=True)
+class PathPreview:
+    """A path that could be followed."""
+
+    name: str
+    duration_s: float
+    points_m: Array
+    """(n, 3), some hundreds along it"""
+    low_m: Array
+    """(3,), least of each axis"""
+    high_m: Array
+
+    @classmethod
+    def of(cls, data: Mapping[str, Any]) -> Self:
+        """From the server's words."""
+        places = {name: np.array(data[name], np.float64) for name in ("points_m", "low_m", "high_m")}
+        return cls(name=data["name"], duration_s=data["duration_s"], **places)
 
 
 @dataclass(frozen=True)

@@ -12,7 +12,7 @@ from pkxyz_ctrl.client import place
 from pkxyz_ctrl.client.connection import FINAL, Connection
 from pkxyz_ctrl.client.protocol import Block
 from pkxyz_ctrl.client.reply import Command, NoStageError, StageError, Status
-from pkxyz_ctrl.client.scan import PATH_ROW, Frames, ScanFrame
+from pkxyz_ctrl.client.scan import PATH_ROW, Frames, PathPreview, ScanFrame, path_of
 from pkxyz_ctrl.client.settings import Metres, Point, StageSettings, who
 from pkxyz_ctrl.client.trigger import Trigger, beginning, column_of
 
@@ -130,13 +130,24 @@ class AsyncStage:
         """Follow the path of a shipped scenario, of segments as in a scenario file, or of a table (the text of a CSV
         file, whose limits are the three below). The stage goes to its first point before.
         """
-        source = {"scenario": scenario, "segments": segments, "table": table_csv}
-        path: dict[str, Any] = {key: value for key, value in source.items() if value is not None}
-        if len(path) != 1:
-            raise StageError("give one of scenario, segments and table_csv")
-        if table_csv is not None:
-            path |= _limits(velocity_m_per_s, acceleration_m_per_s2, jerk_m_per_s3)
-        return await self._done("path", wait=wait, **path)
+        limits = _limits(velocity_m_per_s, acceleration_m_per_s2, jerk_m_per_s3)
+        return await self._done("path", wait=wait, **path_of(scenario, segments, table_csv, limits))
+
+    async def preview(
+        self,
+        scenario: str | None = None,
+        *,
+        segments: Sequence[Mapping[str, Any]] | None = None,
+        table_csv: str | None = None,
+        velocity_m_per_s: float = 0.5e-3,
+        acceleration_m_per_s2: float = 0.5,
+        jerk_m_per_s3: float = 300.0,
+    ) -> PathPreview:
+        """What ``follow`` would do: how long it takes, and where it leads. Nothing moves, and it needs no control.
+        Raises ``RefusedError`` for what the combs can't follow.
+        """
+        limits = _limits(velocity_m_per_s, acceleration_m_per_s2, jerk_m_per_s3)
+        return PathPreview.of(await self._connection.preview(path_of(scenario, segments, table_csv, limits)))
 
     async def pause(self) -> Command:
         """Stop on the path, without leaving it."""
@@ -306,7 +317,7 @@ class AsyncStage:
         """Follow a scan and give each of its frames as soon as its last line is over. Raises ``StageError`` for a path
         without lines, or where rows were lost.
         """
-        path = {"scenario": scenario} if segments is None else {"segments": list(segments)}
+        path = path_of(scenario, segments, None, {})
         shown = await self._connection.preview(path)
         if not shown["lines"]:
             raise StageError(f"{shown['name']} has no lines: frames are those of a raster")

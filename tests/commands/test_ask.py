@@ -1,5 +1,6 @@
 """``pkxyz ask``: every word that can be asked, and what of it the server is sent."""
 
+import asyncio
 import json
 import sys
 from types import SimpleNamespace
@@ -72,6 +73,7 @@ SENT = [
     (["move", "x=1e-6", "z=18e-6"], {"do": "move", "x_m": 1e-6, "z_m": 18e-6, "relative": False}),
     (["move", "--by", "y=2e-9"], {"do": "move", "y_m": 2e-9, "relative": True}),
     (["path", "raster"], {"do": "path", "scenario": "raster"}),
+    (["path", '[{"kind": "hold", "duration_s": 1}]'], {"do": "path", "segments": [{"kind": "hold", "duration_s": 1}]}),
     (["sample", "rotation_deg=30", "origin_m=0,0,19e-6", "scale=1,1,2"],
      {"do": "sample", "rotation_deg": 30.0, "origin_m": (0.0, 0.0, 19e-6), "scale": (1.0, 1.0, 2.0)}),
     (["tilt", "0,0,1e-6", "1e-6,0,0", "0,1e-6,0"],
@@ -98,8 +100,61 @@ def test_a_word_with_arguments_is_sent_with_them(asked, words, sent):
 
 
 def test_no_word_is_left_out_here():
-    looks = {"status", "settings"}
+    looks = {"status", "settings", "preview", "jog"}
     assert {words[0] for words, _ in SENT} | looks == set(_OTHERS)
+
+
+class Line:
+    """Of ``Connection`` what a preview and a jog use; keeps what is said."""
+
+    def __init__(self) -> None:
+        self.said: list[dict[str, Any]] = []
+
+    async def preview(self, path: dict[str, Any]) -> dict[str, Any]:
+        self.said.append(path)
+        corners = {"low_m": [-2e-6, -1e-6, 18e-6], "high_m": [2e-6, 1e-6, 20e-6]}
+        return {"name": "raster", "duration_s": 1.07, "points_m": [[0.0, 0.0, 18e-6]] * 2, **corners}
+
+    def asked(self) -> tuple[int, asyncio.Queue[Command]]:
+        return 3, asyncio.Queue()
+
+    async def say(self, message: dict[str, Any]) -> None:
+        self.said.append(message)
+
+    async def until(self, queue: object, states: object) -> Command:
+        return Command(7, "jog", "done", "stands")
+
+
+@pytest.fixture
+def line(monkeypatch):
+    found = Line()
+    init = Heard.__init__
+
+    def with_line(self: Heard, end: str = "done") -> None:
+        init(self, end)
+        self._connection = found  # type: ignore[assignment]
+
+    monkeypatch.setattr(Heard, "__init__", with_line)
+    return found
+
+
+def test_a_preview_tells_time_and_reach_and_needs_no_control(asked, line):
+    done = asked("preview", "raster")
+    assert done.out == "raster: 1.07 s, from (-2, -1, 18) to (2, 1, 20) um; the combs can follow\n"
+    assert not done.connected[0][2]
+    told = json.loads(asked("preview", "[]", "--json").out)
+    assert (told["duration_s"], told["high_m"]) == (1.07, [2e-6, 1e-6, 20e-6])
+    assert line.said == [{"scenario": "raster"}, {"segments": []}]
+
+
+def test_a_jog_is_said_again_for_as_long_as_it_lasts(asked, line):
+    done = asked("jog", "y=-1e-5", "seconds=0.12")
+    assert done.out == "stands\n"
+    first, *again, last = line.said
+    assert first == {"do": "jog", "tag": 3, "axis": "y", "direction": -1.0, "velocity_m_per_s": 1e-5}
+    assert {m["do"] for m in again} == {"jog_again"}
+    assert len(again) >= 2  # at 10 Hz or more
+    assert last == {"do": "jog_end"}
 
 
 def test_a_file_is_sent_by_what_it_is(asked, tmp_path):
@@ -116,8 +171,11 @@ def test_a_file_is_sent_by_what_it_is(asked, tmp_path):
 WRONG = [
     ("jump", "'jump' can't be asked"), ("move", "where to?"), ("move x", "a number is wanted"),
     ("move q=1", "the axes are x, y and z"), ("move x=nan", "a number is wanted"), ("move x=1,2", "a number is wanted"),
-    ("path", "give one"), ("path a b", "give one"), ("path none.csv", "none.csv"), ("path none.json", "none.json"),
-    ("sample", "give key=value"), ("sample window_m=1", "rotation_deg, slope_x"), ("sample origin_m=1", "three numbers"),
+    ("jog", "give one of x, y, z"), ("jog x=1e-5", "and seconds"), ("jog q=1 seconds=1", "give one of x, y, z"),
+    ("path [1", "are no JSON"), ("path", "give one"), ("path a b", "give one"),
+    ("path none.csv", "none.csv"), ("path none.json", "none.json"),
+    ("sample", "give key=value"), ("sample window_m=1", "rotation_deg, slope_x"),
+    ("sample origin_m=1", "three numbers"),
     ("sample rotation_deg=x", "a number is wanted"), ("tilt 0,0,0", "three points"), ("tilt 0,0 1,0,0 0,1,0", "three"),
     ("settle window_m=1e-9", "give dwell_s, too"), ("settle sigmas=2", "window_m and dwell_s"),
     ("settle rotation_deg=1", "window_m, dwell_s, sigmas"), ("limits velocity_m_per_s=1", "acceleration_m_per_s2 and"),

@@ -88,8 +88,9 @@ def test_a_client_opens_what_was_kept_of_a_fault_and_sees_it_with_its_events(rig
     rows = rig.play(script())
     rig.heard(client)
     rig.ask(client, do="recordings")
-    (names,) = rig.heard(client)["recordings"]
-    assert names == listed(tmp_path / "runs")
+    (kept,) = rig.heard(client)["recordings"]
+    names = kept["names"]
+    assert (kept["folder"], names) == (str(tmp_path / "runs"), listed(tmp_path / "runs"))
     rig.ask(client, do="subscribe", fields=["estimate_m"])
     rig.ask(client, do="open_recording", name=names[0], tag=3)
     heard = rig.heard(client)

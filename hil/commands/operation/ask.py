@@ -14,10 +14,10 @@ from pkxyz_ctrl.config.files import ConfigError
 _PLAIN = (
     "home", "enable", "disable", "pause", "resume", "abort", "stop", "release", "park", "clear", "auto-zero", "save",
 )  # fmt: skip
-_FREE = ("stop", "release", "status", "save", "settings")
+_FREE = ("stop", "release", "status", "save", "settings", "preview")
 _OTHERS = (
-    "move", "path", "status", "settings", "sample", "tilt", "name", "forget", "go", "restore", "law", "quiet", "settle",
-    "limits",
+    "move", "jog", "path", "preview", "status", "settings", "sample", "tilt", "name", "forget", "go", "restore", "law",
+    "quiet", "settle", "limits",
 )  # fmt: skip
 
 
@@ -35,10 +35,11 @@ def ask(
     arguments: Annotated[
         list[str] | None,
         typer.Argument(
-            help="move: x=1e-6 y=... z=... in m. path: a shipped scenario, a .csv table, a .json of segments. sample: "
-            "rotation_deg, slope_x, slope_y, origin_m=x,y,z, scale=x,y,z. tilt: three points x,y,z in m. name, forget, "
-            "go: a position's name. restore: a digest of settings. law: a shipped controller or a .toml. quiet: on, "
-            "off. settle: window_m, dwell_s, sigmas. limits: velocity_m_per_s, acceleration_m_per_s2, jerk_m_per_s3."
+            help="move: x=1e-6 y=... z=... in m. jog: x=1e-5 seconds=1, in m/s. path, preview: a shipped scenario, a "
+            ".csv table, a .json of segments, or its text. sample: rotation_deg, slope_x, slope_y, origin_m=x,y,z, "
+            "scale=x,y,z. tilt: three points x,y,z in m. name, forget, go: a position's name. restore: a digest of "
+            "settings. law: a shipped controller or a .toml. quiet: on, off. settle: window_m, dwell_s, sigmas. "
+            "limits: velocity_m_per_s, acceleration_m_per_s2, jerk_m_per_s3."
         ),
     ] = None,
     by: Annotated[bool, typer.Option("--by", help="move: by a way from the present target, not to a point.")] = False,
@@ -64,8 +65,13 @@ def ask(
             if what == "move":
                 move = stage.move_by if by else stage.move_to
                 command = move(**_coordinates(words))
+            elif what == "jog":
+                command = stage.jog(**_jog(words))
             elif what == "path":
                 command = stage.follow(**_path(words))
+            elif what == "preview":
+                _show_preview(stage.preview(**_path(words)), as_json)
+                return
             elif what in _OTHERS:
                 command = _set(stage, what, words)
             else:
@@ -92,9 +98,24 @@ def _coordinates(words: list[str]) -> dict[str, Any]:
     return found
 
 
+def _jog(words: list[str]) -> dict[str, Any]:
+    found = {key: _numbers(value, 1)[0] for key, _, value in (each.partition("=") for each in words)}
+    seconds = found.pop("seconds", 0.0)
+    axis, velocity = next(iter(found.items()), ("", 0.0))
+    if len(found) != 1 or axis not in ("x", "y", "z") or velocity == 0.0 or not seconds > 0.0:
+        raise ConfigError("jog: give one of x, y, z its velocity in m/s, and seconds, such as x=1e-5 seconds=1")
+    direction = math.copysign(1.0, velocity)
+    return {"axis": axis, "direction": direction, "seconds": seconds, "velocity_m_per_s": abs(velocity)}
+
+
 def _path(words: list[str]) -> dict[str, Any]:
     if len(words) != 1:
-        raise ConfigError("path: give one, a shipped scenario, a .csv table or a .json of segments")
+        raise ConfigError("give one path: a shipped scenario, a .csv table, a .json of segments or its text")
+    if words[0].startswith("["):
+        try:
+            return {"segments": json.loads(words[0])}
+        except ValueError as error:
+            raise ConfigError(f"these segments are no JSON: {error}") from None
     file = Path(words[0])
     if file.suffix not in (".csv", ".json"):
         return {"scenario": words[0]}
@@ -162,16 +183,22 @@ def _numbers(text: str, count: int) -> tuple[float, ...]:
     return found
 
 
+def _show_preview(preview: Any, as_json: bool) -> None:
+    if as_json:
+        print(json.dumps({key: getattr(value, "tolist", lambda v=value: v)() for key, value in vars(preview).items()}))
+        return
+    low, high = (", ".join(f"{v * 1e6:.4g}" for v in corner) for corner in (preview.low_m, preview.high_m))
+    print(f"{preview.name}: {preview.duration_s:.4g} s, from ({low}) to ({high}) um; the combs can follow")
+
+
 def _show_settings(settings: Any, as_json: bool) -> None:
     if as_json:
         print(json.dumps(dataclasses.asdict(settings)))
         return
     sample = settings.sample
     print(f"settings {settings.digest}")
-    print(
-        f"sample: origin {sample.origin_m} m, rotation {sample.rotation_deg:g} deg, slopes {sample.slope_x:g} and", end=" "
-    )
-    print(f"{sample.slope_y:g}, scale {sample.scale}")
+    print(f"sample: origin {sample.origin_m} m, rotation {sample.rotation_deg:g} deg,", end=" ")
+    print(f"slopes {sample.slope_x:g} and {sample.slope_y:g}, scale {sample.scale}")
     print(f"in position: {settings.window_m:g} m for {settings.dwell_s:g} s, {settings.sigmas:g} sigma included")
     for name, place in settings.positions.items():
         print(f"position {name}: {place} m")

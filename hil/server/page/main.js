@@ -115,18 +115,18 @@ function showControl() {
 function ask(message, command, python) {
   at("as-command").textContent = `$ ${command}`;
   at("as-python").textContent = python;
-  return link.say(message);
+  return message && link.say(message);
 }
 
 const setting = new Setting(ask);
 
 // -- recordings: the same page, the same code
 
-function listRecordings(names) {
+function listRecordings({ folder, names }) {
   at("recordings").replaceChildren(...names.map((name) => {
     const row = document.createElement("li"), words = document.createElement("span"), open = document.createElement("button");
     words.textContent = name; open.className = "quiet small"; open.textContent = "Open";
-    open.onclick = () => ask({ do: "open_recording", name }, `pkxyz recording ${name}`, `hil.recording.Recording.open("${name}/recording.parquet")`);
+    open.onclick = () => ask({ do: "open_recording", name }, `pkxyz recording ${folder}/${name} --to csv`, `hil.open_run("${folder}/${name}")`);
     row.append(words, open);
     return row;
   }));
@@ -184,7 +184,7 @@ function jog(axis, direction) {
   if (step) return moveBy(axis, direction * step);
   const speed = Number(at("speed").value);
   endJog();
-  ask({ do: "jog", axis, direction, velocity_m_per_s: speed }, "pkxyz ask jog (held keys only)", `stage.jog("${axis}", ${direction}, 1.0, velocity_m_per_s=${speed})`);
+  ask({ do: "jog", axis, direction, velocity_m_per_s: speed }, `pkxyz ask jog ${axis}=${direction * speed} seconds=1`, `stage.jog("${axis}", ${direction}, 1.0, velocity_m_per_s=${speed})`);
   jogTimer = setInterval(() => link.say({ do: "jog_again" }), JOG_MS);
 }
 function endJog() { if (jogTimer !== null) { clearInterval(jogTimer); jogTimer = null; link?.say({ do: "jog_end" }); } }
@@ -230,13 +230,17 @@ document.addEventListener("visibilitychange", () => { if (document.hidden) endJo
 
 function stop() { ask({ do: "stop" }, "pkxyz ask stop", "stage.stop()"); }
 at("stop").onclick = stop;
-at("control").onclick = () => link.say({ do: mine ? "give_control" : "take_control" });
+at("control").onclick = () => ask({ do: mine ? "give_control" : "take_control" }, "pkxyz ask takes control by itself, and gives it back", `stage.${mine ? "give" : "take"}_control()`);
 for (const button of document.querySelectorAll("[data-do]")) button.onclick = () => verb(button.dataset.do);
 at("move").onsubmit = (event) => { event.preventDefault(); const f = new FormData(at("move")); moveTo(Object.fromEntries(AXES.map((a) => [`${a}_m`, number(f.get(`${a}_m`))]))); };
 at("middle").onclick = () => moveTo(Object.fromEntries(AXES.map((a, n) => [`${a}_m`, hello.middle_m?.[n] ?? null])));
-at("scan").onsubmit = (event) => { event.preventDefault(); preview(); ask({ do: "path", segments: segments() }, "pkxyz ask path segments.json", `stage.follow(segments=${JSON.stringify(segments())})`); };
+at("scan").onsubmit = (event) => { event.preventDefault(); preview(); asPath("path", "follow"); };
 at("scan").elements.preview.onclick = preview;
-function preview() { previewTag = link.say({ do: "preview", segments: segments() }); }
+function preview() { previewTag = asPath("preview", "preview"); }
+function asPath(verb, method) {
+  const asked = segments(), text = JSON.stringify(asked);
+  return ask({ do: verb, segments: asked }, `pkxyz ask ${verb} '${text}'`, `stage.${method}(segments=${text})`);
+}
 
 at("step").onchange = at("speed").onchange = jogLabels;
 at("view").onchange = () => { plane.view = at("view").value; at("view-hint").textContent = plane.view === "3d" ? "body: what the combs hold; drag to turn" : "shaded: what the combs hold"; };
@@ -248,7 +252,8 @@ function toggles(id, set) { at(id).onclick = () => { const on = at(id).getAttrib
 toggles("tree-open", openTree);
 toggles("hold", (on) => { scope.held = on; });
 toggles("spectrum", (on) => { scope.inSpectrum = on; scope.rebuild(); });
-at("csv").onclick = () => save(URL.createObjectURL(new Blob([scope.csv()], { type: "text/csv" })), "scope.csv");
+at("csv").onclick = () => { seen(); save(URL.createObjectURL(new Blob([scope.csv()], { type: "text/csv" })), "scope.csv"); };
+function seen() { ask(null, "pkxyz ask save", `stage.capture("reference_m", "estimate_m", seconds=${scope.spanS})`); }
 at("png").onclick = () => save(scope.png(), "scope.png");
 function save(url, name) { const a = document.createElement("a"); a.href = url; a.download = name; a.click(); }
 
