@@ -34,7 +34,7 @@ from hil.recording.wall_recorder import WallRecorder
 from hil.runs.run_folder import RunFolder, metadata_of
 from hil.runs.scenario import Scenario, load_scenario
 from pkxyz_ctrl.config.files import CONFIG_DIR
-from pkxyz_ctrl.io.realtime import go_real_time, leave_real_time, settle_memory
+from pkxyz_ctrl.io.realtime import leave_real_time, settle_memory
 from pkxyz_ctrl.loop.row import ROW
 from pkxyz_ctrl.safety.modes import LOOP_CLOSED, Mode
 
@@ -94,7 +94,7 @@ class Witness(WallRecorder):
     def watch(self, plant_pid: int, rig: WallRig) -> None:
         """Whose memory to look at, besides that of the two processes that are known here; whose faults to clear."""
         self._rig = rig
-        self._files = [os.open(f"/proc/{pid}/statm", os.O_RDONLY) for pid in (os.getpid(), plant_pid, self._child)]
+        self._files = [os.open(f"/proc/{pid}/statm", os.O_RDONLY) for pid in (os.getpid(), plant_pid, self.writer_pid)]
 
     def row(self, row: memoryview) -> None:
         super().row(row)
@@ -180,7 +180,7 @@ def _controlled(recorder: Witness, setup: Any, plant_pid: int) -> WallRig:
         rig = WallRig(setup, recorder, ending)
         recorder.watch(plant_pid, rig)
         try:
-            print(go_real_time(), file=sys.stderr)
+            print(rig.go_real_time(), file=sys.stderr)
             tracemalloc.start()
             settle_memory()
             rig.start()

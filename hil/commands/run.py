@@ -17,6 +17,7 @@ from pkxyz_ctrl.config.refused import reason
 
 if TYPE_CHECKING:
     from hil.runs.summary import Summary
+    from pkxyz_ctrl.config.bus import CanConfig
 
 Scenario = Annotated[str, typer.Argument(help="A shipped scenario's name or a TOML file.")]
 Bus = Annotated[
@@ -46,6 +47,9 @@ Report = Annotated[
         help="conformance.json of `pkxyz check-amplifier` on this very module: what passed is not tried anew."
     ),
 ]
+Native = Annotated[
+    bool, typer.Option("--native", help="By the loop in C, compiled here the first time, instead of Python's.")
+]
 _MEETING_BUSES = ("unix_2k", "unix_1k")  # on one channel: a plant on one of them serves a controller on the other, too
 
 
@@ -65,6 +69,7 @@ def run(
         float, typer.Option("--wait", min=0, max=3600, help="Seconds until somebody else has to be on the bus.")
     ] = 30.0,
     report: Report = None,
+    native: Native = False,
     as_json: Json = False,
 ) -> None:
     """Control an amplifier at rate; exit code 0 if the checks hold, 1 if not, 2 for bad input or a full disk, 128 +
@@ -93,15 +98,16 @@ def run(
     except Ended as end:
         raise typer.Exit(128 + end.signal_number) from None
     loaded = _lasting(loaded, duration_s)
-    require_real_bus(loaded.bus)
+    can_config = require_real_bus(loaded.bus)
     if report is not None:
         loaded = dataclasses.replace(loaded, bus=with_report(loaded.bus, report))
+    program = native_loop(loaded, can_config) if native else None
     live = LiveStatus(round(loaded.config.duration_s / loaded.bus.period_s), loaded.bus.period_s)
     path = out if out is not None else next_free(Path("runs"), loaded.config.name, Lane.WALL)
     folder = RunFolder(path, replace=replace_earlier)
     try:
         with amplifier_errors(loaded.bus, bus):
-            ran = run_into(folder, loaded, note, _quiet if as_json else live, wait_s)
+            ran = run_into(folder, loaded, note, _quiet if as_json else live, wait_s, program)
         draw(folder, ran.summary, ran.lateness_us)
     except RecordingError as error:
         raise ConfigError(str(error)) from None
@@ -160,6 +166,23 @@ def plant(
         if truth is None:
             raise
         raise ConfigError(f"--truth: {truth}: {reason(error)}") from None
+
+
+def native_loop(loaded: Any, can_config: "CanConfig") -> Path:
+    """The program, compiled if it isn't yet. Raises ``ConfigError`` for what it does not take, and without compiler."""
+    from hil.native.settings import require_native
+    from pkxyz_ctrl.export.kernels import ExportError
+    from pkxyz_ctrl.export.program import compiled, kept
+
+    require_native(loaded.setup(), can_config)
+    try:
+        if kept() is None:
+            note(
+                "the native loop is being compiled, once: some seconds, or some minutes if nothing was exported before"
+            )
+        return compiled()
+    except ExportError as error:
+        raise ConfigError(str(error)) from None
 
 
 def learning_of(learn: bool, apply: str | None, refresh: str | None) -> dict[str, str] | None:

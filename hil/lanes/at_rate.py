@@ -9,7 +9,6 @@ from hil.lanes.ending import Ending
 from hil.lanes.setup import Setup
 from hil.lanes.wall import COMPANY_S, AmplifierGoneError, WallRig
 from pkxyz_ctrl.can.frame import Frame
-from pkxyz_ctrl.io.realtime import go_real_time, leave_real_time, settle_memory
 from pkxyz_ctrl.loop.row import ROW
 
 _SIZE = ROW.itemsize
@@ -53,15 +52,11 @@ def run_at_rate(
         rig = WallRig(setup, kept, ending)
         try:
             rig.wait_for_others(say, company_s)
-            say(go_real_time())
-            settle_memory()
+            say(rig.go_real_time())
             rig.start(say)
             rig.run()
         except AmplifierGoneError:
             say(f"the amplifier has fallen silent after {kept.count * setup.bus.period_s:.1f} s")
         finally:
-            try:
-                rig.close()
-            finally:
-                leave_real_time()
+            rig.close()
     return kept.rows[: kept.count], tuple(rig.controller.faults)

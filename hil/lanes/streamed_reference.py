@@ -56,10 +56,17 @@ class StreamedReference:
         self._take(at)
 
     def _write(self, rows: NDArray[np.void], first: int) -> None:
-        write_rows(rows, self._trajectory.sample(first, len(rows), self._period_us), first)
-        if self._excitation is not None:
-            rows["added_m"] = self._excitation.sample(first, len(rows))
+        write_sampled(rows, self._trajectory, first, self._period_us, self._excitation)
 
     def _take(self, at: int) -> None:
         """The rows in use begin at trajectory tick ``at``; of those after them there is none yet."""
         self._base, self._filled = at, 0
+
+
+def write_sampled(
+    rows: NDArray[np.void], trajectory: Trajectory, first: int, period_us: int, excitation: Excitation | None
+) -> None:
+    """Write rows (n,) of ``REFERENCE`` that are there: the trajectory from tick ``first`` on, with what is added."""
+    write_rows(rows, trajectory.sample(first, len(rows), period_us), first)
+    if excitation is not None:
+        rows["added_m"] = excitation.sample(first, len(rows))

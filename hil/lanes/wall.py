@@ -18,6 +18,8 @@ from pkxyz_ctrl.config.bus import BusConfig, CanConfig
 from pkxyz_ctrl.config.files import ConfigError
 from pkxyz_ctrl.io.can_port import CanPort, open_bus
 from pkxyz_ctrl.io.clocks import TickClock, WallClock
+from pkxyz_ctrl.io.realtime import go_real_time, leave_real_time, settle_memory
+from pkxyz_ctrl.learning import Learner
 from pkxyz_ctrl.loop import cycle as cycling
 from pkxyz_ctrl.loop.controller import Controller, StartUpError
 from pkxyz_ctrl.loop.reference import standing_still
@@ -29,8 +31,8 @@ from pkxyz_ctrl.safety.modes import LOOP_CLOSED, Event, Mode
 COMPANY_S = 30.0
 """For which an empty bus is given time."""
 _LOOK_S = 0.02
-_GUARDS_PER_PERIOD = 8
-_SILENT_US = 500_000  # after a fault, for so long without its heartbeat, the amplifier is gone
+GUARDS_PER_PERIOD = 8
+SILENT_US = 500_000  # after a fault, for so long without its heartbeat, the amplifier is gone
 _NO_END = 1 << 60  # ticks
 _LANDED_TICKS = 2  # that begin and end a way down
 _LAST_FRAMES_S = 0.02  # 0 V and pre-operational leave even a slow adapter before it is closed
@@ -59,7 +61,12 @@ def wall_gate(gate: GateConfig) -> GateConfig:
 
     The SYNC between two voltages, which bounds the steps of the combs, it demands as ever.
     """
-    return dataclasses.replace(gate, spacing_min_us=gate.period_us // _GUARDS_PER_PERIOD)
+    return dataclasses.replace(gate, spacing_min_us=gate.period_us // GUARDS_PER_PERIOD)
+
+
+def alone(company_s: float) -> str:
+    """What is said on an empty bus."""
+    return f"nobody else is on the bus yet: waiting {company_s:g} s for an amplifier, such as `pkxyz plant`"
 
 
 class TakesFrames(Protocol):
@@ -120,7 +127,7 @@ class WallRig:
         )  # fmt: skip
         for name, *_ in TRUTH_FIELDS:
             self.controller.memory["row"][name] = np.nan  # nobody here knows it
-        self._guard_us = setup.bus.period_us // _GUARDS_PER_PERIOD
+        self._guard_us = setup.bus.period_us // GUARDS_PER_PERIOD
         self.ticks = TickClock(
             self.clock,
             setup.bus.period_us,
@@ -130,6 +137,31 @@ class WallRig:
             leave=self._leave,
         )
         self._started = False
+
+    @property
+    def refused_frames(self) -> int:
+        """Frames that the bus did not take."""
+        return self.can_port.refused
+
+    @property
+    def lateness_us(self) -> list[int]:
+        """Wake-ups by whole microseconds of lateness, the last entry all beyond."""
+        return self.ticks.lateness_us
+
+    @property
+    def complaint(self) -> str:
+        """``; ...``: what stands in the way of frames."""
+        return self.can_port.complaint
+
+    @property
+    def learner(self) -> Learner | None:
+        """Of a run that learns while it goes on."""
+        return None if self.live is None else self.live.learner
+
+    @property
+    def is_amplifier_a_process(self) -> bool:
+        """Whether the amplifier is another process of this machine."""
+        return self.others is not None
 
     @property
     def others(self) -> int | None:
@@ -147,10 +179,16 @@ class WallRig:
         """
         end_s = time.monotonic() + company_s
         if self.others == 0:
-            say(f"nobody else is on the bus yet: waiting {company_s:g} s for an amplifier, such as `pkxyz plant`")
+            say(alone(company_s))
         while self.others == 0 and time.monotonic() < end_s:
             self._ending.check()
             time.sleep(_LOOK_S)
+
+    def go_real_time(self) -> str:
+        """Ask the system for what a loop at rate needs; in a line what it gave."""
+        given = go_real_time()
+        settle_memory()
+        return given
 
     def start(self, say: Callable[[str], object] = lambda words: None) -> None:
         """Start the amplifier; ``say`` is told which protections are lacking. Raises ``StartUpError`` and ``Ended``."""
@@ -198,7 +236,7 @@ class WallRig:
         run(self.ticks, self.port, self.controller, reference, _NO_END, after)
 
     def close(self) -> None:
-        """0 V, pre-operational, and off the bus."""
+        """0 V, pre-operational, off the bus, and an ordinary process again."""
         try:
             if self._started:
                 self.clock.wait_until(self.clock.now_us + self._guard_us)  # or the gate calls it a babbling node
@@ -206,6 +244,7 @@ class WallRig:
                 time.sleep(_LAST_FRAMES_S)
         finally:
             self._bus.shutdown()
+            leave_real_time()
 
     def _leave(self) -> None:
         """Between two ticks: raise ``Ended`` if somebody asked for the end, once the stage has been led down."""
@@ -216,7 +255,7 @@ class WallRig:
             self._ending.check()
 
     def _require_amplifier(self) -> None:
-        if self.clock.now_us - self.port.heartbeat_us > _SILENT_US:
+        if self.clock.now_us - self.port.heartbeat_us > SILENT_US:
             raise AmplifierGoneError
 
     def _take_late_frames(self, until_us: int) -> None:

@@ -24,7 +24,6 @@ from hil.operate.tick_frames import TickFrames
 from pkxyz_ctrl.can.frame import Frame
 from pkxyz_ctrl.client import place
 from pkxyz_ctrl.config.bus import CanConfig
-from pkxyz_ctrl.io.realtime import go_real_time, leave_real_time, settle_memory
 from pkxyz_ctrl.loop import in_position
 from pkxyz_ctrl.loop.in_position import IN_POSITION
 from pkxyz_ctrl.loop.row import ROW
@@ -128,8 +127,7 @@ def operate(setup: Setup, settings: Settings, name: str, files: dict[str, str], 
             session = _session_of(setup, settings, rig, memory)
             rig.wait_for_others(say)
             place.write(name, "loop", _description(setup, settings, memory, files))
-            say(go_real_time())
-            settle_memory()
+            say(rig.go_real_time())
             rig.start(say)
             rig.operate(session.stage.setpoints, OperatedLoop(session, memory, counted).after)
         except Ended as end:
@@ -138,7 +136,6 @@ def operate(setup: Setup, settings: Settings, name: str, files: dict[str, str], 
             try:
                 rig.close()
             finally:
-                leave_real_time()
                 place.forget(name, "loop")
                 memory.remove()
     return 0

@@ -4,15 +4,22 @@ import dataclasses
 import time
 from collections.abc import Callable
 from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
 from hil.lanes.ending import Ended, Ending
 from hil.lanes.lane import Lane
+from hil.lanes.setup import Setup
 from hil.lanes.wall import COMPANY_S, AmplifierGoneError, WallRig, require_real_bus
+from hil.native.mapped import Mapped
+from hil.native.native_rig import NativeRig
+from hil.native.ring_recorder import RingRecorder
 from hil.recording.recording import Recording
-from hil.recording.wall_recorder import WallRecorder, Watch
+from hil.recording.wall_recorder import WallRecorder
+from hil.recording.writer_process import Watch
 from hil.runs.metrics import Metrics, RowFigures
 from hil.runs.run import Begun
 from hil.runs.run_folder import RunFolder
@@ -20,9 +27,9 @@ from hil.runs.scenario import Scenario
 from hil.runs.summary import LoopFigures, Summary
 from pkxyz_ctrl.config.bus import CanConfig
 from pkxyz_ctrl.io.clocks import percentile_us
-from pkxyz_ctrl.io.realtime import go_real_time, leave_real_time, settle_memory
 from pkxyz_ctrl.learning import Learner
 
+_Files = tuple[Path, Path, dict[str, Any], str, Watch]
 _COME_BACK = {
     False: "start `pkxyz plant` again, then this",
     True: "check its power and the cable, then start this again",
@@ -64,15 +71,17 @@ def run_into(
     say: Callable[[str], object],
     watch: Watch = lambda row: None,
     company_s: float = COMPANY_S,
+    program: Path | None = None,
 ) -> RanAtRate:
-    """Run ``scenario`` at rate and leave everything in ``folder`` but the picture.
+    """Run ``scenario`` at rate and leave everything in ``folder`` but the picture; by Python's loop, or by the native
+    one that is compiled in ``program``.
 
     ``say`` is called with what a person should know, ``watch`` with each row, in the writer's process; an empty bus is
     given ``company_s`` until somebody else is on it. Raises ``ConfigError``, ``StartUpError``, ``RecordingError``.
     """
     can_config = require_real_bus(scenario.bus)
     with folder.taken():
-        return _run_into(folder, scenario, can_config, say, watch, company_s)
+        return _run_into(folder, scenario, can_config, say, watch, company_s, program)
 
 
 def _run_into(
@@ -82,15 +91,16 @@ def _run_into(
     say: Callable[[str], object],
     watch: Watch,
     company_s: float,
+    program: Path | None,
 ) -> RanAtRate:
     begun = Begun.begin(folder, scenario, Lane.WALL)
     setup = scenario.setup()
     watched = _Watched()
     with Ending() as ending:
-        channel = can_config.channel
-        recorder = WallRecorder(folder.recording, folder.frames, begun.metadata, channel, watch)
+        files = folder.recording, folder.frames, begun.metadata, can_config.channel, watch
+        recorder, rig_of = _loop_of(program, setup, can_config, ending, files)
         try:
-            _run(WallRig(setup, recorder, ending), watched, say, company_s)
+            _run(rig_of(), watched, say, company_s)
         except Ended as end:
             watched.ended_by = end.signal_number
         finally:
@@ -116,33 +126,43 @@ def _run_into(
     return RanAtRate(summary, watched.ended_by, late)
 
 
-def _run(rig: WallRig, watched: _Watched, say: Callable[[str], object], company_s: float) -> None:
+def _loop_of(
+    program: Path | None, setup: Setup, can_config: CanConfig, ending: Ending, files: _Files
+) -> tuple[WallRecorder | RingRecorder, Callable[[], WallRig | NativeRig]]:
+    """A recorder, which has to be there first, and how its loop is made."""
+    if program is None:
+        recorder = WallRecorder(*files)
+        return recorder, lambda: WallRig(setup, recorder, ending)
+    mapped = Mapped()
+    ring = RingRecorder(mapped, *files)
+    return ring, lambda: NativeRig(program, setup, can_config, mapped, ring, ending)
+
+
+def _run(rig: WallRig | NativeRig, watched: _Watched, say: Callable[[str], object], company_s: float) -> None:
     begin_s = time.monotonic()
     try:
         rig.wait_for_others(say, company_s)
-        say(go_real_time())
-        settle_memory()
+        say(rig.go_real_time())
         begin_s = time.monotonic()
         rig.start(say)
         rig.run()
     except AmplifierGoneError:
-        hint = rig.can_port.complaint or f": {_COME_BACK[rig.others is None]}"
+        hint = rig.complaint or f": {_COME_BACK[not rig.is_amplifier_a_process]}"
         say(f"the amplifier has fallen silent, so the run ends{hint}")
     finally:
         try:
             rig.close()
         finally:
-            leave_real_time()
             watched.elapsed_s = time.monotonic() - begin_s
             watched.faults = tuple(rig.controller.faults)
             watched.protections_lacking = rig.controller.driver.lost
-            watched.lateness_us = rig.ticks.lateness_us
+            watched.lateness_us = rig.lateness_us
             watched.missed_ticks = rig.controller.missed_ticks
-            watched.refused_frames = rig.can_port.refused
+            watched.refused_frames = rig.refused_frames
             watched.dropped_frames = rig.dropped_frames
             watched.blocked_frames = rig.controller.gate.blocked_frames
             watched.adaptation = rig.controller.memory["tick"]["adaptation"].copy()
-            watched.learner = rig.live.learner if rig.live is not None else None
+            watched.learner = rig.learner
 
 
 def _figures(recording: Recording, metrics: Metrics) -> RowFigures:

@@ -5,6 +5,7 @@ is said of a field there, in the comment behind it, is said in C as well.
 """
 
 import ast
+import hashlib
 import io
 import re
 import sys
@@ -20,7 +21,21 @@ import numpy as np
 
 from pkxyz_ctrl.export.calls import CALL, Call
 from pkxyz_ctrl.export.entries import ENTRIES, MANY, Entry
+from pkxyz_ctrl.export.shared import (
+    BLOCK_ROWS,
+    EVENTS,
+    LATENESS_MOST_US,
+    MAGIC,
+    PATH,
+    SHARED,
+    Interface,
+    Outcome,
+    Phase,
+    Told,
+)
 from pkxyz_ctrl.export.stored import Stored
+from pkxyz_ctrl.loop.exchange import EXCHANGE, EXCHANGE_MEMORY
+from pkxyz_ctrl.loop.reference import REFERENCE
 from pkxyz_ctrl.safety.gate_rules import Reason
 from pkxyz_ctrl.safety.modes import Event, Mode
 from pkxyz_ctrl.safety.monitors import NodeEvent, SenseStatus
@@ -30,6 +45,7 @@ _NUMBERS = (
     ("MODE", Mode), ("EVENT", Event), ("SENSE", SenseStatus), ("NODE", NodeEvent), ("TRIP", Trip), ("CALL", Call),
     ("REFUSED", Reason),
 )  # fmt: skip
+_NUMBERS_SHARED = (("INTERFACE", Interface), ("PHASE", Phase), ("OUTCOME", Outcome), ("TOLD", Told))
 _C_TYPE = MappingProxyType(
     {"f8": "double", "i8": "int64_t", "i4": "int32_t", "i2": "int16_t", "i1": "int8_t", "u8": "uint64_t"}
     | {"u4": "uint32_t", "u2": "uint16_t", "u1": "uint8_t"}
@@ -57,17 +73,45 @@ class _Place(NamedTuple):
 
 def header(period_us: int, held: Stored) -> str:
     """``pkxyz.h``. ``period_us``: of the law that goes with it, ``held``: what of settings and memory it needs."""
-    places = {id(dtype): place for dtype, place in _defined()}
+    return _HEAD + _LAW.format(period_us=period_us, settings=held.settings, memory=held.memory) + _body() + _TAIL
+
+
+def loop_header() -> str:
+    """``pkxyz.h`` for the native loop, which takes any law, with what it shares."""
+    law = _LAW.format(period_us=0, settings=EXCHANGE.itemsize, memory=EXCHANGE_MEMORY.itemsize)
+    numbers = {"MAGIC": f"{MAGIC:#x}", "LAYOUT": f"{layout():#x}", "BLOCK_ROWS": BLOCK_ROWS, "EVENTS": EVENTS}
+    numbers["LATENESS_MOST_US"] = LATENESS_MOST_US
+    defined = "".join(f"#define PKXYZ_{name} {value}\n" for name, value in numbers.items())
+    return _HEAD + law + defined + _body() + _shared_body() + _TAIL
+
+
+@cache
+def layout() -> int:
+    """Digest of all that the native loop shares, (64 bits): whoever reads it must mean the same."""
+    return int.from_bytes(hashlib.sha256((_body() + _shared_body()).encode()).digest()[:8], "little")
+
+
+@cache
+def _body() -> str:
     taken = [argument.dtype for entry in ENTRIES for argument in entry.arguments if argument.dtype is not None]
-    records = _in_order([*taken, CALL])
-    names = {id(dtype): places[id(dtype)].c_name for dtype in records}
-    sizes = {"settings": held.settings, "memory": held.memory}
-    parts = [_HEAD.format(period_us=period_us, **sizes)]
-    parts += [_enumeration(prefix, kind) for prefix, kind in _NUMBERS]
-    parts += [_struct(dtype, places[id(dtype)], names) for dtype in records]
+    records, names = _in_order([*taken, CALL]), _names()
+    parts = [_enumeration(prefix, kind) for prefix, kind in _NUMBERS]
+    parts += [_struct(dtype, names) for dtype in records]
     for entry in ENTRIES:
         parts.append(f"/* {entry.about}\n   Returns 0; anything else: 0 V, at once. */\n{_prototype(entry, names)};\n")
-    return "\n".join([*parts, _TAIL])
+    return "\n".join(["", *parts, ""])
+
+
+@cache
+def _shared_body() -> str:
+    known = {id(dtype) for dtype in _in_order([EXCHANGE, EXCHANGE_MEMORY, REFERENCE])}
+    parts = [_enumeration(prefix, kind) for prefix, kind in _NUMBERS_SHARED]
+    parts += [_struct(dtype, _names()) for dtype in _in_order([SHARED, PATH]) if id(dtype) not in known]
+    return "\n".join([*parts, ""])
+
+
+def _names() -> dict[int, str]:
+    return {id(dtype): place.c_name for dtype, place in _defined()}
 
 
 def struct_name(dtype: Dtype) -> str:
@@ -108,7 +152,8 @@ def _enumeration(prefix: str, kind: type[IntEnum] | type[IntFlag]) -> str:
     return f"enum {{ /* {kind.__name__} */\n" + "\n".join(lines) + "\n};\n"
 
 
-def _struct(dtype: Dtype, place: _Place, names: dict[int, str]) -> str:
+def _struct(dtype: Dtype, names: dict[int, str]) -> str:
+    place = next(place for known, place in _defined() if known is dtype)
     name = place.c_name
     lines = [f"/* {place.module.removeprefix('pkxyz_ctrl.')}.{place.name} */", "typedef struct {"]
     asserts = []
@@ -190,13 +235,15 @@ _HEAD = """/* Written by `pkxyz export`; see README.md. Do not edit: the object 
 
 #ifdef __cplusplus
 #define PKXYZ_ASSERT(fact) static_assert(fact, #fact)
-extern "C" {{
+extern "C" {
 #else
 #define PKXYZ_ASSERT(fact) _Static_assert(fact, #fact)
 #endif
 
 PKXYZ_ASSERT(sizeof(double) == 8);
+"""
 
+_LAW = """
 #define PKXYZ_PERIOD_US {period_us} /* between two calls of pkxyz_begin */
 #define PKXYZ_CONFIG_BYTES {settings} /* of pkxyz_exchange; what this law lacks stands behind and is never looked at */
 #define PKXYZ_MEMORY_BYTES {memory} /* of pkxyz_exchange_memory, likewise */

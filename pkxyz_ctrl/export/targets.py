@@ -49,10 +49,11 @@ class Target(NamedTuple):
 _CORTEX = "-mthumb -mfloat-abi=hard"
 _ON_MPS2 = "port_cortex_m.c", "-nostdlib -ffreestanding -T mps2.ld -Wl,-z,noexecstack -lgcc"
 _ON_YOURS = "port_bare.c", "-nostdlib -ffreestanding -lgcc"
+_HERE = None, "x86-64" if platform.machine() == "x86_64" else "generic", ""
 TARGETS: Final[Mapping[str, Target]] = MappingProxyType({
-    "host": Target(
-        None, "x86-64" if platform.machine() == "x86_64" else "generic", "", "this machine, with its C library",
-        True, True, True, "cc", "", "port_host.c", "",
+    "host": Target(*_HERE, "this machine, with its C library", True, True, True, "cc", "", "port_host.c", ""),
+    "linux": Target(
+        *_HERE, "this machine, with the loop at rate around it", True, True, True, "cc", "", "port_host.c", ""
     ),
     # In four parts: of three, LLVM would call helpers of another binary interface.
     "cortex-m7": Target(

@@ -2,6 +2,7 @@
 
 import errno
 import logging
+import os
 import time
 from contextlib import suppress
 from typing import Any, Protocol
@@ -49,10 +50,7 @@ def open_bus(config: CanConfig, name: str) -> can.BusABC:
             f"bus {name!r}: can.interface {config.interface!r}: its driver library is not installed on this machine"
         ) from None
     except (can.CanError, OSError, ValueError, TypeError, ImportError) as error:
-        raise ConfigError(
-            f"bus {name!r}: can.interface {config.interface!r}, channel {config.channel!r}: "
-            f"{' '.join(str(error).split()) or type(error).__name__}; see [can] and [can.options] of the bus config"
-        ) from None
+        raise refused_bus(config, name, " ".join(str(error).split()) or type(error).__name__) from None
     is_classic = opened.protocol is can.CanProtocol.CAN_20 and config.interface not in _SAYS_NOTHING_OF_FD
     if config.driver.fd and is_classic:
         opened.shutdown()
@@ -61,6 +59,14 @@ def open_bus(config: CanConfig, name: str) -> can.BusABC:
             "was opened; say fd = false, without data_bitrate_bit_per_s, or use another interface"
         )
     return opened
+
+
+def refused_bus(config: CanConfig, name: str, why: str) -> ConfigError:
+    """The error for a bus that can't be had, in its interface's own words."""
+    return ConfigError(
+        f"bus {name!r}: can.interface {config.interface!r}, channel {config.channel!r}: {why}; see [can] and "
+        "[can.options] of the bus config"
+    )
 
 
 def to_frame(message: can.Message) -> Frame:
@@ -122,7 +128,7 @@ class CanPort:
             self._bus.send(to_message(frame))
         except (can.CanError, OSError, ValueError) as error:
             self.refused += 1
-            self.refusal = f"the interface refuses frames ({_reason(error)})"
+            self.refusal = _refusal(_reason(error))
             self._refuses = True
             return False
         self.sent += 1
@@ -162,9 +168,7 @@ class CanPort:
     @property
     def complaint(self) -> str:
         """``; the interface ...`` where it takes no frames, or says that it is off the bus; else empty."""
-        if self._is_bus_off:
-            return f"; the interface is off the bus after too many errors (bus-off): {_BUS_OFF}"
-        return f"; {self.refusal}" if self._refuses else ""
+        return complaint_of(self._is_bus_off, self.refusal if self._refuses else "")
 
     def unsent(self) -> int:
         """0: python-can doesn't tell what still waits."""
@@ -178,9 +182,28 @@ class CanPort:
             self._bus.flush_tx_buffer()
 
 
+def complaint_of(is_bus_off: bool, refusal: str) -> str:
+    """``; the interface ...``: that it is off the bus, or why it takes no frames; empty where neither is so."""
+    if is_bus_off:
+        return f"; the interface is off the bus after too many errors (bus-off): {_BUS_OFF}"
+    return f"; {refusal}" if refusal else ""
+
+
+def refusal_of(number: int) -> str:
+    """A sentence on a frame that was refused with an errno."""
+    return _refusal(_with_remedy(os.strerror(number), number))
+
+
+def _refusal(why: str) -> str:
+    return f"the interface refuses frames ({why})"
+
+
 def _reason(error: Exception) -> str:
     """Why a frame was not taken, in the interface's words, and what to do where that is known."""
     number = getattr(error, "error_code", None) or getattr(error, "errno", None)
-    words = " ".join(str(error).split()) or type(error).__name__
+    return _with_remedy(" ".join(str(error).split()) or type(error).__name__, number)
+
+
+def _with_remedy(words: str, number: object) -> str:
     remedy = _REMEDIES.get(number) if isinstance(number, int) else None
     return words if remedy is None else f"{words}; {remedy}"

@@ -144,7 +144,7 @@ class Controller:
         if self.exchange["blocked"][0]:
             raise StartUpError(self.faults[-1])
         if come_up < 0:
-            raise StartUpError(f"{self.driver.failure}{self._complaints}")
+            raise StartUpError(self.failure)
         return bool(come_up)
 
     def stop(self, t_us: int) -> None:
@@ -176,7 +176,7 @@ class Controller:
         told = self._begin(self.record, self.exchange, t_us)
         self._pass_on(told, t_us)
         if told & NOT_RESTARTED:
-            self.faults.append(f"start-up after a clear: {self.driver.failure}{self._complaints}")
+            self._not_restarted()
 
     def receive(self, frame: Frame, t_us: int) -> bool:
         """Take a frame from the bus; True once this tick's sense values are there."""
@@ -225,6 +225,9 @@ class Controller:
                 held = self.exchange["held_against"][0] if can_id == self.driver.drive_id else self.gate.memory
                 self.faults.append(self.gate.blocked(frame, self._mode[0], reason, held[0], t_us))
 
+    def _not_restarted(self) -> None:
+        self.faults.append(f"start-up after a clear: {self.failure}")
+
     # -- modes ------------------------------------------------------------------------------------------------------
 
     def _enter(self) -> None:
@@ -235,6 +238,11 @@ class Controller:
             emergencies = "".join(f"\n{e.told_at(begun_us)}." for e in self.driver.emergencies)
             detail = "".join(f" [{words}]" for words in (self.driver.failure, self.driver.foreign) if words)
             self.faults.append(f"at {row['t_us'] * 1e-6:.4f} s: {reason}{detail}{emergencies}{self._complaints}")
+
+    @property
+    def failure(self) -> str:
+        """The driver's, and what else stands in the way."""
+        return f"{self.driver.failure}{self._complaints}"
 
     @property
     def _complaints(self) -> str:

@@ -83,7 +83,8 @@ HOUSE: Mapping[str, Room] = MappingProxyType({
     ),
     "hil.conformance": Room(("sim.config", "sim", "pkxyz_ctrl.*", "hil.bus", "hil.node", "hil.plant", "hil.lanes")),
     "hil.operate": Room(("pkxyz_ctrl.*", "hil.bus", "hil.lanes")),
-    "hil.runs": Room(("sim.config", "pkxyz_ctrl.*", "hil.recording", "hil.faults", "hil.lanes")),
+    "hil.native": Room(("pkxyz_ctrl.*", "hil.bus", "hil.recording", "hil.lanes")),
+    "hil.runs": Room(("sim.config", "pkxyz_ctrl.*", "hil.recording", "hil.faults", "hil.lanes", "hil.native")),
     "hil.server": Room(("pkxyz_ctrl.*", "hil.bus", "hil.recording", "hil.operate", "hil.runs")),
     # many times, for one question
     "hil.studies.spread": Room(("pkxyz_ctrl.*",)),

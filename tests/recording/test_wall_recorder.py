@@ -130,7 +130,7 @@ def test_a_writer_that_is_killed_is_told_and_all_but_its_last_block_opens(folder
         recorder.frame(FRAMES[0], 0)  # what waits is handed on when something comes
         sent(recorder, rows[500:501])
         rows[500:-1] = rows[501:]
-    os.kill(recorder._child, signal.SIGKILL)
+    os.kill(recorder.writer_pid, signal.SIGKILL)
     with pytest.raises(RecordingError, match=r"the process that writes it was killed by signal 9; what it had written"):
         sent(recorder, rows[501:])
     recorder.close()
@@ -143,10 +143,10 @@ def test_a_writer_that_is_killed_is_told_and_all_but_its_last_block_opens(folder
 
 def test_what_the_writer_was_too_slow_for_is_said_in_the_recording(folder):
     recorder, rows = WallRecorder(folder.recording, folder.frames, metadata(), "bus"), random_rows(45_000)
-    os.kill(recorder._child, signal.SIGSTOP)
+    os.kill(recorder.writer_pid, signal.SIGSTOP)
     sent(recorder, rows)  # 20 MB, which is more than may wait
     assert recorder.lost_bytes > 0
-    os.kill(recorder._child, signal.SIGCONT)
+    os.kill(recorder.writer_pid, signal.SIGCONT)
     recorder.close()
     recording = Recording.open(folder.recording)
     assert 0 < recording.ticks < len(rows)
@@ -241,11 +241,11 @@ def test_rows_that_the_writer_is_too_slow_for_are_counted(folder):
     recorder = WallRecorder(folder.recording, folder.frames, metadata(), "bus")
     row = random_rows(1)
     data, sent = row.view(np.uint8).data, 2 * (_WAITING_MAX_BYTES + _PIPE_BYTES) // ROW.itemsize
-    os.kill(recorder._child, signal.SIGSTOP)
+    os.kill(recorder.writer_pid, signal.SIGSTOP)
     for tick in range(sent):
         row["tick"] = tick
         recorder.row(data)
-    os.kill(recorder._child, signal.SIGCONT)
+    os.kill(recorder.writer_pid, signal.SIGCONT)
     recorder.close()
     kept = Recording.open(folder.recording)["tick"]
     assert 0 < recorder.lost_rows == sent - len(kept)

@@ -1,0 +1,75 @@
+"""Writes recording and frame log of a native loop: the writer reads the ring, which the loop never waits for.
+
+A pipe that only the loop holds open tells the writer when it is gone, however it ended, and the loop when the writer
+is.
+"""
+
+import os
+import select
+from pathlib import Path
+from typing import Any
+
+from hil.native.mapped import Mapped
+from hil.recording.writer_process import Read, Watch, WriterProcess
+
+_LOOK_S = 0.005
+_READ_MOST_BYTES = 1 << 20
+
+
+class RingRecorder:
+    """Rows and frames on their way from the ring to disk. ``pipe`` is for the loop to inherit."""
+
+    def __init__(
+        self, mapped: Mapped, recording: Path, frames: Path, metadata: dict[str, Any], channel: str,
+        watch: Watch = lambda row: None,
+    ) -> None:  # fmt: skip
+        """Files to write. Forks: make it before the loop is begun. ``watch`` is called in the writer's process."""
+        self._mapped = mapped
+        alive, self.pipe = os.pipe()
+
+        def begin() -> Read:
+            os.close(self.pipe)
+            return _RingReader(mapped, alive)
+
+        self._writer = WriterProcess(recording, frames, metadata, channel, watch, begin)
+        self.writer_pid = self._writer.pid
+        os.close(alive)
+
+    @property
+    def lost_rows(self) -> int:
+        """Rows for which the writer was too slow, ticks whole."""
+        return int(self._mapped.shared["ring"]["lost_rows"][0, 0])
+
+    def handed_over(self) -> None:
+        """The loop has inherited the pipe, and is the only one to hold it from now on."""
+        if self.pipe >= 0:
+            os.close(self.pipe)
+            self.pipe = -1
+
+    def close(self) -> None:
+        """Let the writer finish. Raises ``RecordingError`` if it could not write all."""
+        self.handed_over()
+        self._writer.wait()
+
+
+class _RingReader:
+    """``writer_process.Read`` of the ring."""
+
+    def __init__(self, mapped: Mapped, alive: int) -> None:
+        self._ring, self._bytes = mapped.shared["ring"][0, 0], mapped.ring
+        self._alive = alive
+
+    def __call__(self) -> bytes:
+        is_alive = True
+        while True:
+            tail = int(self._ring["tail"])
+            count = min(int(self._ring["head"]) - tail, _READ_MOST_BYTES)
+            if count or not is_alive:
+                part = self._at(tail % len(self._bytes), count)
+                self._ring["tail"] = tail + count
+                return part
+            is_alive = not select.select((self._alive,), (), (), _LOOK_S)[0]
+
+    def _at(self, begin: int, count: int) -> bytes:
+        first = bytes(self._bytes[begin : begin + count])
+        return first + bytes(self._bytes[: count - len(first)])

@@ -1,0 +1,17 @@
+/* Ctrl-C, SIGTERM and SIGHUP, taken note of where they may end something and not in the middle of it. */
+#ifndef ENDING_H
+#define ENDING_H
+
+void ending_begin(int recorder);
+
+/* Why the end was asked for, a PKXYZ_OUTCOME; 0 if nobody did. */
+int ending_asked(void);
+int ending_signal(void);
+
+/* For the loop itself: it can't go on. */
+void ending_ask(int outcome);
+
+/* Once a tick: is the recorder still there? */
+void ending_look(void);
+
+#endif

@@ -1,0 +1,100 @@
+/* loop FILE [PIPE]: control one stage at rate, as FILE says, and leave there what happened.
+   PIPE: descriptor of a pipe that somebody reads for as long as he takes the rows. */
+#define _GNU_SOURCE
+#include <errno.h>
+#include <fcntl.h>
+#include <stdio.h>
+#include <stdlib.h>
+#include <string.h>
+#include <sys/mman.h>
+#include <sys/stat.h>
+#include <unistd.h>
+
+#include "clock.h"
+#include "controller.h"
+#include "ending.h"
+#include "loop.h"
+#include "path.h"
+#include "port.h"
+#include "ring.h"
+#include "ticks.h"
+#include "told.h"
+
+static const char *const WORDS[] = {
+    "", "done", "ended from outside", "the bus can't be had", "the amplifier could not be brought to operation",
+    "the amplifier has fallen silent", "nobody takes the rows any more", "the path was not sampled in time",
+    "a kernel failed",
+};
+
+static int refuse(const char *file, const char *words)
+{
+    fprintf(stderr, "loop: %s: %s\n", file, words);
+    return 2;
+}
+
+/* The whole file, in memory now and not when it is first needed. */
+static pkxyz_shared *mapped(const char *file, int64_t *size)
+{
+    struct stat found;
+    const int opened = open(file, O_RDWR | O_CLOEXEC);
+    if (opened < 0 || fstat(opened, &found) != 0)
+        return 0;
+    *size = found.st_size;
+    void *place = mmap(0, (size_t)found.st_size, PROT_READ | PROT_WRITE, MAP_SHARED | MAP_POPULATE, opened, 0);
+    close(opened);
+    return place == MAP_FAILED ? 0 : place;
+}
+
+static const char *misfit(const pkxyz_shared *shared, int64_t size)
+{
+    const pkxyz_shared_settings *settings = shared->settings;
+    if (size < (int64_t)sizeof *shared || settings->magic != PKXYZ_MAGIC)
+        return "is not what this program goes by";
+    if (settings->layout != PKXYZ_LAYOUT)
+        return "was written for another version of this program; build both anew";
+    if (settings->blocks < 1 || settings->ring_bytes < 1 ||
+        size != (int64_t)sizeof *shared + settings->blocks * (int64_t)sizeof(pkxyz_shared_path) + settings->ring_bytes)
+        return "is cut short";
+    return 0;
+}
+
+int main(int argc, char **argv)
+{
+    int64_t size = 0;
+    if (argc < 2 || argc > 3)
+        return refuse("FILE [PIPE]", "give the file that says what to do");
+    pkxyz_shared *shared = mapped(argv[1], &size);
+    if (!shared)
+        return refuse(argv[1], strerror(errno));
+    const char *wrong = misfit(shared, size);
+    if (wrong)
+        return refuse(argv[1], wrong);
+    pkxyz_shared_settings *settings = shared->settings;
+    pkxyz_shared_state *state = shared->state;
+    pkxyz_shared_path *blocks = (void *)(shared + 1);
+
+    ending_begin(argc > 2 ? atoi(argv[2]) : -1);
+    clock_begin(settings->spin_us);
+    state->begun_ns = clock_begun_ns();
+    path_begin(blocks, settings->blocks);
+    ring_begin(shared->ring, (uint8_t *)(blocks + settings->blocks), settings->ring_bytes);
+    told_begin(shared);
+    controller_begin(shared);
+    ticks_begin(settings, state);
+
+    int outcome = PKXYZ_OUTCOME_REFUSED;
+    if (port_open(settings, state, (char *)state->refusal, sizeof state->refusal) == 0) {
+        outcome = loop(shared);
+        port_close();
+    }
+    state->signal = ending_signal();
+    state->status = controller_status();
+    state->outcome = outcome;
+    state->phase = PKXYZ_PHASE_ENDED;
+    ring_end();
+    if (argc == 2) /* nobody else puts it into words */
+        fprintf(stderr, "loop: %s\nloop: %s%s%s; %lld ticks, %lld of %lld rows lost\n", state->real_time, WORDS[outcome],
+                *state->refusal ? ": " : "", state->refusal, (long long)state->ticks, (long long)shared->ring->lost_rows,
+                (long long)settings->ticks);
+    return outcome == PKXYZ_OUTCOME_DONE ? 0 : 1;
+}
