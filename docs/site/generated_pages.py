@@ -46,7 +46,7 @@ API: dict[str, tuple[str, ...]] = {
     "One device": ("pkxyz_ctrl.stage.Stage", "pkxyz_ctrl.stage.StageDomainError"),
     "A stage in operation": (
         "pkxyz_ctrl.client.plain.connect", "pkxyz_ctrl.client.plain.Stage", "pkxyz_ctrl.client.stage.connect_async",
-        "pkxyz_ctrl.client.reply",
+        "pkxyz_ctrl.client.reply", "pkxyz_ctrl.client.scan.PathPreview", "pkxyz_ctrl.client.scan.ScanFrame",
     ),
     "Trajectories": ("pkxyz_ctrl.trajectory.Trajectory", "pkxyz_ctrl.trajectory.check.check_against"),
     "Configuration files": ("pkxyz_ctrl.config.files.load", "pkxyz_ctrl.config.files.parse"),

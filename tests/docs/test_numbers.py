@@ -116,6 +116,7 @@ def test_the_modes_that_a_law_acts_on() -> None:
     words = f"{hz[0]:.0f}, {hz[1]:.0f} and {hz[2]:.0f} Hz"
     assert words in page("docs/learn/index.md")
     assert words in page("docs/do/own-law.md")
+    assert words in page("docs/understand/margins.md")
     assert stage.quality_factor == 20
 
 
