@@ -32,6 +32,7 @@ COMMANDS = {
     "operate": ("hil.commands.operation.operate:operate", "The loop that serve operates."),
     "check-amplifier": ("hil.commands.check_amplifier:check_amplifier", "May this amplifier be enabled?"),
     "export": ("hil.commands.export:export", "The controller as C for a board."),
+    "emulate": ("hil.commands.emulate:emulate", "The loop with the board emulated."),
     "dbc": ("hil.commands.dbc:dbc", "The DBC of a bus, for CAN tools."),
     "latency": ("hil.commands.latency:latency", "How late this machine wakes up."),
     "doctor": ("hil.commands.doctor:doctor", "What this machine has and lacks."),

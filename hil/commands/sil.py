@@ -65,7 +65,7 @@ def sil(
     if as_json:
         print(json.dumps(summary.as_json() | {"folder": str(folder)}, allow_nan=False))
     else:
-        _show(summary, folder)
+        show(summary, folder)
     raise typer.Exit(130 if summary.interrupted else 0 if summary.ok else 1)
 
 
@@ -94,7 +94,8 @@ def _ran(
     return summary, folder.path
 
 
-def _show(summary: "Summary", folder: Path) -> None:
+def show(summary: "Summary", folder: Path) -> None:
+    """What came of a run, and where it is."""
     from hil.runs.metrics import bound_words
 
     table = plain_table("check", "value", "bound", "", left=("",))

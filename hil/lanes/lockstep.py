@@ -124,7 +124,7 @@ class LockstepRig:
         if injection is not None:
             injection.before_power_on()
         self.node.power_on()
-        start(self.clock, self.port, self.controller)
+        self._bring_up()
         before = self.wire.statistics()
         reference, record = _exchange_in_blocks(self, blocks)
         try:
@@ -132,8 +132,6 @@ class LockstepRig:
             taking: Callable[[int], object] = record
             if injection is not None:
                 clock, taking = injection.arm(), injection.clearing(record, reference.begin_anew)
-            if not self.controller.can.driver.protection:
-                clock = _Draining(clock, self._endpoint, self.controller)
             with _seldom_collected():
                 self._run_ticks(clock, reference, taking, record)
         except ControllerKilledError:
@@ -145,10 +143,16 @@ class LockstepRig:
                 self.log.close()
         return self.controller.missed_ticks, self.wire.bus_load(before)
 
+    def _bring_up(self) -> None:
+        """The amplifier, to operation. Raises ``StartUpError``."""
+        start(self.clock, self.port, self.controller)
+
     def _run_ticks(
         self, clock: Clock, reference: "_Reference", taking: Callable[[int], object], record: "_Recorder"
     ) -> None:
         """Whole ticks as long as nothing happens in them; the others event by event."""
+        if not self.controller.can.driver.protection:
+            clock = _Draining(clock, self._endpoint, self.controller)
         ticks, tick, t_us = record.ticks, 0, self.clock.now_us + self.controller.period_us
         is_watched = self.injection is not None and self.injection.watched is not None
         stretches = None if is_watched else self._stretches

@@ -74,18 +74,23 @@ def run_into(
     scenario: Scenario,
     lane: Lane,
     on_progress: Callable[[int, int], None] = lambda done, total: None,
+    run: Callable[..., lanes.LaneResult] = lanes.run,
 ) -> Summary:
-    """Run ``scenario`` in lockstep or in the fast lane and leave everything in ``folder`` but the picture.
+    """Run ``scenario`` in lockstep or in the fast lane, or in another one by its own ``run``, and leave everything in
+    ``folder`` but the picture.
 
     Interrupted by the keyboard, it keeps what was recorded and says so in the summary. Raises ``ConfigError`` for a
     bus that the lane can't use, and it or ``RecordingError`` when the disk fails.
     """
     require_bus(scenario, lane)
     with folder.taken():
-        return _run_into(folder, scenario, lane, on_progress)
+        return _run_into(folder, scenario, lane, on_progress, run)
 
 
-def _run_into(folder: RunFolder, scenario: Scenario, lane: Lane, on_progress: Callable[[int, int], None]) -> Summary:
+def _run_into(
+    folder: RunFolder, scenario: Scenario, lane: Lane, on_progress: Callable[[int, int], None],
+    run: Callable[..., lanes.LaneResult],
+) -> Summary:  # fmt: skip
     begun = Begun.begin(folder, scenario, lane)
     result: lanes.LaneResult | None = None
     with RecordingWriter(folder.recording, begun.metadata) as recording:
@@ -97,7 +102,7 @@ def _run_into(folder: RunFolder, scenario: Scenario, lane: Lane, on_progress: Ca
         try:
             setup = scenario.setup()
             with folder.in_one_line():
-                result = lanes.run(setup, lane, on_block=on_block, on_progress=on_progress, frame_log=folder.frames)
+                result = run(setup, lane, on_block=on_block, on_progress=on_progress, frame_log=folder.frames)
         except KeyboardInterrupt:
             pass
     rows = begun.metrics.figures()
@@ -132,10 +137,11 @@ def _figures_of(result: lanes.LaneResult) -> LoopFigures:
 
 def require_bus(scenario: Scenario, lane: Lane) -> None:
     """Raise ``ConfigError`` if the lane needs frames and the bus config has none."""
-    if lane == Lane.LOCKSTEP and scenario.bus.can is None:
+    has_frames = lane in (Lane.LOCKSTEP, Lane.EMULATED)
+    if has_frames and scenario.bus.can is None:
+        instead = "use --lane fast or another --bus" if lane == Lane.LOCKSTEP else "use another --bus"
         raise ConfigError(
-            f"bus {scenario.bus.name!r} has no [can] and carries no frames, which the lockstep lane needs; "
-            "use --lane fast or another --bus"
+            f"bus {scenario.bus.name!r} has no [can] and carries no frames, which the {lane} lane needs; {instead}"
         )
-    if lane != Lane.LOCKSTEP and (scenario.config.faults or scenario.config.clear_s is not None):
+    if not has_frames and (scenario.config.faults or scenario.config.clear_s is not None):
         raise ConfigError(f"the {lane} lane has no frames and nobody in whom something could fail; use --lane lockstep")

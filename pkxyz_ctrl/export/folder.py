@@ -82,17 +82,21 @@ def require_exportable(law: Records, name: str, target: str) -> None:
         )
 
 
+def require_room(reference: Records, instead: str) -> None:
+    """Raises ``ExportError`` for a path that a board's flash has no room for; ``instead`` says what to do."""
+    if reference.nbytes > REFERENCE_MAX_BYTES:
+        raise ExportError(
+            f"the reference takes {reference.nbytes / 2**20:.1f} MiB, more than a board's flash; {instead}"
+        )
+
+
 def write(out: Path, target_name: str, exported: Exported) -> dict[str, Any]:
     """Write the folder, which must be empty or not there; returns its manifest. Raises ``ExportError``, ``OSError``."""
     target = target_of(target_name)
     require_exportable(exported.law, exported.controller, target_name)
-    size = exported.reference.nbytes
-    if not target.is_hosted and size > REFERENCE_MAX_BYTES:
+    if not target.is_hosted:
         rows = REFERENCE_MAX_BYTES // exported.reference.itemsize
-        raise ExportError(
-            f"the reference takes {size / 2**20:.1f} MiB, more than a board's flash; give --ticks {rows} or less, and "
-            "stream the rest"
-        )
+        require_room(exported.reference, f"give --ticks {rows} or less, and stream the rest")
     test = self_test(exported.config, exported.reference, exported.calls)
     lowered = lower(kernels(), target)
     files = _files(target_name, target, exported, test, lowered)
@@ -122,14 +126,17 @@ def _files(name: str, target: Target, exported: Exported, test: SelfTest, lowere
     files |= {
         file: (PORT / file).read_bytes() for file in (target.port, *target.link.split()) if (PORT / file).is_file()
     }
-    texts = {
+    texts = sources(exported) | {"pkxyz.s": lowered.assembly, "selftest.c": _self_test_c(test)}
+    return files | {file: text.encode() for file, text in texts.items()} | {"pkxyz.o": lowered.code}
+
+
+def sources(exported: Exported) -> dict[str, str]:
+    """What any program around the object is compiled with: the records, the settings, the path."""
+    return {
         "pkxyz.h": header(int(exported.law["period_us"][0]), exported.stored),
-        "pkxyz.s": lowered.assembly,
         "config.c": _config_c(exported),
         "reference.c": _constant("pkxyz_path_words", exported.reference),
-        "selftest.c": _self_test_c(test),
     }
-    return files | {file: text.encode() for file, text in texts.items()} | {"pkxyz.o": lowered.code}
 
 
 def _filled(file: str, values: dict[str, str]) -> bytes:

@@ -5,7 +5,6 @@ that setting once, when it is imported, hence the process. Its output and its ma
 the versions are pinned, and a test compares bits.
 """
 
-import hashlib
 import json
 import os
 import subprocess
@@ -14,8 +13,7 @@ import tempfile
 from pathlib import Path
 from typing import NamedTuple
 
-import llvmlite
-import numba
+from pkxyz_ctrl.export.kept import kept
 
 
 class ExportError(ValueError):
@@ -31,29 +29,9 @@ class Kernels(NamedTuple):
 
 def kernels() -> Kernels:
     """Those of ``entries.ENTRIES``, from the folder of compiled kernels if they lie there. Takes a minute if not."""
-    kept = _kept()
-    if kept is not None and kept.is_file():
-        text = kept.read_text(encoding="utf-8")
-    else:
-        text = _emitted()
-        if kept is not None:
-            beside = kept.with_suffix(f".{os.getpid()}")
-            beside.write_text(text, encoding="utf-8")
-            beside.replace(kept)
+    text = kept("export.ll", ("entries.py", "emit.py"), lambda: _emitted().encode()).decode()
     first, _, ir = text.partition("\n")
     return Kernels(ir, json.loads(first))
-
-
-def _kept() -> Path | None:
-    """A file in numba's cache folder, which goes with the digest of every kernel's source."""
-    folder = os.environ.get("NUMBA_CACHE_DIR")
-    if folder is None or not Path(folder).is_dir():
-        return None
-    here = Path(__file__).parent
-    digest = hashlib.sha256(f"{numba.__version__} {llvmlite.__version__}".encode())
-    for name in ("entries.py", "emit.py"):
-        digest.update((here / name).read_bytes())
-    return Path(folder) / f"export-{digest.hexdigest()[:16]}.ll"
 
 
 def _emitted() -> str:

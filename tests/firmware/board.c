@@ -1,10 +1,11 @@
 /* Segments from a file of the host through the exported object, on the emulated board: back go a hash of each tick's
    row and the time that the call took by the board's own counter, and last the memory. */
+#include "host_files.h"
 #include "pkxyz.h"
 
 void *memset(void *to, int value, size_t size); /* of the port: there need be no C library */
 
-enum { PATH_MOST = 2048, TICKS_MOST = 2048, SYS_OPEN = 1, SYS_CLOSE = 2, SYS_WRITE = 5, SYS_READ = 6 };
+enum { PATH_MOST = 2048, TICKS_MOST = 2048 };
 #define SYSTICK_CONTROL (*(volatile uint32_t *)0xe000e010)
 #define SYSTICK_RELOAD (*(volatile uint32_t *)0xe000e014)
 #define SYSTICK_VALUE (*(volatile uint32_t *)0xe000e018)
@@ -19,27 +20,6 @@ static pkxyz_cycle_memory memory;
 static pkxyz_reference path[PATH_MOST];
 static pkxyz_cycle_input inputs[TICKS_MOST];
 static struct { uint64_t hash; uint32_t counts, status; } results[TICKS_MOST];
-
-static uint32_t host(uint32_t operation, const void *argument)
-{
-    register uint32_t r0 __asm__("r0") = operation;
-    register const void *r1 __asm__("r1") = argument;
-    __asm__ volatile("bkpt 0xab" : "+r"(r0) : "r"(r1) : "memory");
-    return r0;
-}
-
-static uint32_t opened(const char *name, uint32_t length, uint32_t mode)
-{
-    const uint32_t words[3] = {(uint32_t)name, mode, length};
-    return host(SYS_OPEN, words);
-}
-
-/* 1 if that many bytes were moved, else 0. */
-static int moved(uint32_t operation, uint32_t file, const void *bytes, size_t size)
-{
-    const uint32_t words[3] = {file, (uint32_t)bytes, size};
-    return host(operation, words) == 0;
-}
 
 static uint64_t hashed(const void *record, size_t size)
 {
@@ -57,7 +37,7 @@ static uint64_t hashed(const void *record, size_t size)
 int main(void)
 {
     int32_t head[4]; /* rows of the path, ticks, and 1 where a memory of zeros begins, in the mode that follows */
-    uint32_t from = opened("segments", 8, 1), to = opened("results", 7, 5);
+    uint32_t from = opened("segments", 8, TO_READ), to = opened("results", 7, TO_WRITE);
     SYSTICK_RELOAD = 0xffffff;
     SYSTICK_CONTROL = 5; /* counts down with the processor's clock */
     while (moved(SYS_READ, from, head, sizeof head)) {
@@ -81,6 +61,6 @@ int main(void)
         if (!moved(SYS_WRITE, to, results, sizeof results[0] * head[1]) || !moved(SYS_WRITE, to, &memory, sizeof memory))
             return 6;
     }
-    host(SYS_CLOSE, &to);
+    closed(to);
     return 0;
 }

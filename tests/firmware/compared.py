@@ -7,7 +7,7 @@ from pathlib import Path
 from typing import NamedTuple
 
 import numpy as np
-from exchanges import Exchange, exchanges
+from exchanges import Exchange
 from exchanges import missing as missing_in
 from frames import judged, missing
 from guarded import Guarded
@@ -95,14 +95,13 @@ def first_difference(law: Law, library: ctypes.CDLL) -> str:
     return "" if same else f"{law.name}: memory at the end"
 
 
-def exchanges_compared(library: ctypes.CDLL) -> list[str]:
+def exchanges_compared(played: list[Exchange], library: ctypes.CDLL) -> list[str]:
     """What every call of every exchange left: frames with the gate's verdicts, rows, and the memory in the end."""
     begin_s = time.monotonic()
-    played_here = list(exchanges())
-    failures = [f"the exchanges had no {name}" for name in missing_in(played_here)]
-    failures += [found for exchange in played_here if (found := parted(exchange, library))]
-    calls = sum(len(exchange.calls) for exchange in played_here)
-    print(f"host: {calls} calls of {len(played_here)} exchanges compared, {time.monotonic() - begin_s:.0f} s")
+    failures = [f"the exchanges had no {name}" for name in missing_in(played)]
+    failures += [found for exchange in played if (found := parted(exchange, library))]
+    calls = sum(len(exchange.calls) for exchange in played)
+    print(f"host: {calls} calls of {len(played)} exchanges compared, {time.monotonic() - begin_s:.0f} s")
     return failures
 
 

@@ -13,7 +13,7 @@ import numpy as np
 from compared import Law
 from debian import fetched
 from disassembly import fused_instructions, stack_bound
-from exchanges import hashes
+from exchanges import Exchange, hashes
 from numpy.typing import NDArray
 
 from pkxyz_ctrl.export.elf import loaded_bytes, symbols
@@ -21,6 +21,7 @@ from pkxyz_ctrl.export.entries import ENTRIES
 from pkxyz_ctrl.export.targets import TARGETS
 from pkxyz_ctrl.export.words import canonical
 from pkxyz_ctrl.loop import cycle as cycling
+from pkxyz_ctrl.loop.exchange import EXCHANGE_MEMORY
 from pkxyz_ctrl.safety.modes import Mode
 
 Records = NDArray[np.void]
@@ -33,7 +34,7 @@ CODE_MOST, HELD_MOST, STACK_MOST = 56_000, 20 << 10, 2 << 10
 """Bytes of code, of law and memory together, and of stack on a Cortex-M7."""
 
 
-def compared_on_board(laws: list[Law], board: Path) -> list[str]:
+def compared_on_board(laws: list[Law], exchanges: list[Exchange], board: Path) -> list[str]:
     """The same on the emulated Cortex-M7, by a hash of each row; and how many instructions each tick took."""
     tools, why_not = board_tools()
     if tools is None:
@@ -56,7 +57,7 @@ def compared_on_board(laws: list[Law], board: Path) -> list[str]:
     print(
         f"Cortex-M7: {sum(len(s.rows) for law in laws for s in law.segments)} ticks, {time.monotonic() - begin_s:.0f} s"
     )
-    return list(board_differences(laws, (board / "results").read_bytes()))
+    return [*board_differences(laws, (board / "results").read_bytes()), *exchanges_on_board(exchanges, board, tools)]
 
 
 QEMU = ("-M", "mps2-an500", "-nographic", "-monitor", "none", "-serial", "null", "-semihosting-config",
@@ -92,6 +93,30 @@ def board_differences(laws: list[Law], results: bytes) -> Iterator[str]:
         print(f"{law.name:28} {middle:8.0f} {high:8.0f} {most:8.0f}   {most / MHZ:.1f} us")
 
 
+def exchanges_on_board(exchanges: list[Exchange], board: Path, tools: "Tools") -> list[str]:
+    """What every call of every exchange left there, and the memory in the end."""
+    begin_s, failures = time.monotonic(), []
+    with (board / "exchanges").open("wb") as file:
+        for exchange in exchanges:
+            head = np.array([len(exchange.reference), len(exchange.calls)], np.int32)
+            file.writelines(a.tobytes() for a in (head, exchange.config, exchange.reference, exchange.calls))
+    done = tools.run("qemu-system-arm", *QEMU, "-kernel", "converse.elf", cwd=board)
+    if done.returncode != 0:
+        return [f"converse.elf ended with {done.returncode}: {done.stdout[-200:]} {done.stderr[-200:]}"]
+    left, at = (board / "digests").read_bytes(), 0
+    for exchange in exchanges:
+        count = len(exchange.calls)
+        same = np.frombuffer(left, np.uint64, count, at) == exchange.digests
+        memory = np.frombuffer(left, EXCHANGE_MEMORY, 1, at + 8 * count)
+        at += 8 * count + EXCHANGE_MEMORY.itemsize
+        if not same.all():
+            failures.append(f"Cortex-M7, {exchange.name}: call {int(same.argmin())} of {count}")
+        elif not np.array_equal(canonical(memory)[: len(exchange.held)], exchange.held):
+            failures.append(f"Cortex-M7, {exchange.name}: memory at the end")
+    print(f"Cortex-M7: {len(exchanges)} exchanges compared, {time.monotonic() - begin_s:.0f} s")
+    return failures
+
+
 class Tools(NamedTuple):
     """Where the programs are, and what they need to run."""
 
@@ -120,7 +145,7 @@ def board_tools() -> tuple[Tools | None, str]:
 
 def built(board: Path, tools: Tools) -> list[str]:
     """Link ``board.c`` with the exported object, run the folder's own self-test, and look at what was linked."""
-    for name in ("board.c", "periods.c"):
+    for name in ("board.c", "periods.c", "converse.c", "host_files.h"):
         shutil.copy(HERE / name, board)
     flags = ["-std=c11", "-O2", "-fno-strict-aliasing", *TARGETS["cortex-m7"].flags.split()]
     link = TARGETS["cortex-m7"].link.split()
@@ -128,6 +153,7 @@ def built(board: Path, tools: Tools) -> list[str]:
     for out, sources in (
         ("board.elf", ["board.c", "selftest.c", "port_cortex_m.c"]),
         ("selftest.elf", ["main.c", "config.c", "reference.c", "selftest.c", "port_cortex_m.c"]),
+        ("converse.elf", ["converse.c", "config.c", "reference.c", "selftest.c", "port_cortex_m.c"]),
         ("periods.elf", ["periods.c", "config.c", "reference.c", "selftest.c", "port_cortex_m.c"]),
     ):
         done = tools.run("arm-none-eabi-gcc", *flags, "-o", out, *sources, "pkxyz.o", *link, cwd=board)

@@ -4,20 +4,14 @@
 #include "main.c"
 #undef main
 
-enum { PERIODS_MOST = 4096, SYS_OPEN = 1, SYS_CLOSE = 2, SYS_WRITE = 5 };
+#include "host_files.h"
+
+enum { PERIODS_MOST = 4096 };
 #define SYSTICK_CONTROL (*(volatile uint32_t *)0xe000e010)
 #define SYSTICK_RELOAD (*(volatile uint32_t *)0xe000e014)
 #define SYSTICK_VALUE (*(volatile uint32_t *)0xe000e018)
 
 static uint32_t counts[PERIODS_MOST];
-
-static uint32_t host(uint32_t operation, const void *argument)
-{
-    register uint32_t r0 __asm__("r0") = operation;
-    register const void *r1 __asm__("r1") = argument;
-    __asm__ volatile("bkpt 0xab" : "+r"(r0) : "r"(r1) : "memory");
-    return r0;
-}
 
 int main(void)
 {
@@ -40,9 +34,8 @@ int main(void)
         if (calls[n].kind == PKXYZ_CALL_FINISH)
             periods++;
     }
-    const uint32_t opened[3] = {(uint32_t)"counts", 5, 6};
-    const uint32_t file = host(SYS_OPEN, opened), written[3] = {file, (uint32_t)counts, sizeof counts[0] * periods};
-    int failed = host(SYS_WRITE, written) != 0;
-    host(SYS_CLOSE, &file);
+    const uint32_t file = opened("counts", 6, TO_WRITE);
+    const int failed = !moved(SYS_WRITE, file, counts, sizeof counts[0] * periods);
+    closed(file);
     return failed;
 }

@@ -17,10 +17,12 @@ from concurrent.futures import ProcessPoolExecutor
 from pathlib import Path
 
 import numpy as np
+from closed_loop import closed_loop
 from compared import Law, compared_here, exchanges_compared, first_difference, frames_compared, shared
 from disassembly import fused_instructions
+from exchanges import exchanges
 from numpy.typing import NDArray
-from on_board import HELD_MOST, SCRATCH, compared_on_board
+from on_board import HELD_MOST, SCRATCH, board_tools, compared_on_board
 from segments import TICKS, segments
 
 from hil.commands.export import exported_of
@@ -58,17 +60,21 @@ def main(ticks: int) -> int:
         work = Path(folder)
         host, board = exported("host", work), exported("cortex-m7", work)
         again, others = beside.submit(anew), {name: beside.submit(lowered, name) for name in TARGETS}
+        board_tools()  # fetched once, before two processes look for them
+        closed = beside.submit(closed_loop)
         failures += own_test(host)
         laws = played(ticks)
         failures += covered(laws)
         failures += too_large(laws)
         library = shared(host / "pkxyz.o", host)
         failures += compared_here(laws, library)
-        failures += exchanges_compared(library)
+        conversations = list(exchanges())
+        failures += exchanges_compared(conversations, library)
         failures += frames_compared(library)
         failures += planted(laws[0], host)
         failures += clean(board, {name: other.result() for name, other in others.items()}, again.result())
-        failures += compared_on_board(laws, board)
+        failures += compared_on_board(laws, conversations, board)
+        failures += closed.result()
     for line in failures:
         print(f"FAILED: {line}")
     print(f"{'failed' if failures else 'passed'}, {time.monotonic() - begin_s:.0f} s in all")

@@ -81,6 +81,7 @@ HOUSE: Mapping[str, Room] = MappingProxyType({
     "hil.lanes": Room(
         ("sim.config", "sim", "pkxyz_ctrl.*", "hil.bus", "hil.node", "hil.plant", "hil.faults")
     ),
+    "hil.emulator": Room(("pkxyz_ctrl.*", "hil.faults", "hil.lanes")),
     "hil.conformance": Room(("sim.config", "sim", "pkxyz_ctrl.*", "hil.bus", "hil.node", "hil.plant", "hil.lanes")),
     "hil.operate": Room(("pkxyz_ctrl.*", "hil.bus", "hil.lanes")),
     "hil.native": Room(("pkxyz_ctrl.*", "hil.bus", "hil.recording", "hil.lanes")),
@@ -122,8 +123,8 @@ HOUSE: Mapping[str, Room] = MappingProxyType({
         "hil.pictures", "hil.pictures.wafer", "hil.screen", "hil.api",
     )),
     "hil.commands": Room((
-        "pkxyz_ctrl.*", "hil.recording", "hil.faults", "hil.lanes", "hil.conformance", "hil.runs", "hil.studies",
-        "hil.pictures", "hil.screen", "hil.bench.rigs", "hil.bench", "hil.commands.studies",
+        "pkxyz_ctrl.*", "hil.recording", "hil.faults", "hil.lanes", "hil.emulator", "hil.conformance", "hil.runs",
+        "hil.studies", "hil.pictures", "hil.screen", "hil.bench.rigs", "hil.bench", "hil.commands.studies",
     )),
     "hil.commands.operation": Room((
         "pkxyz_ctrl.*", "hil.lanes", "hil.conformance", "hil.operate", "hil.server", "hil.screen", "hil.commands",

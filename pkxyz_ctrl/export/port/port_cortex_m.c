@@ -23,7 +23,7 @@ PLAIN_LOOP void *memset(void *to, int value, size_t size)
     return to;
 }
 
-static int semihosting(int operation, const void *argument)
+int port_semihosting(int operation, const void *argument)
 {
     register int r0 __asm__("r0") = operation;
     register const void *r1 __asm__("r1") = argument;
@@ -33,14 +33,14 @@ static int semihosting(int operation, const void *argument)
 
 void port_print(const char *line)
 {
-    semihosting(4, line); /* SYS_WRITE0 */
-    semihosting(4, "\n");
+    port_semihosting(4, line); /* SYS_WRITE0 */
+    port_semihosting(4, "\n");
 }
 
 void port_exit(int code)
 {
     const uint32_t ended[2] = {0x20026, (uint32_t)code}; /* ADP_Stopped_ApplicationExit */
-    semihosting(0x20, ended); /* SYS_EXIT_EXTENDED */
+    port_semihosting(0x20, ended); /* SYS_EXIT_EXTENDED */
     for (;;) {
     }
 }
@@ -62,7 +62,13 @@ static void stop(void)
     port_exit(3);
 }
 
-__attribute__((section(".vectors"), used)) static const void *const vectors[16] = {
+/* Of the board's own interrupts the first is somebody's who defines it. */
+__attribute__((weak)) void interrupt_0(void)
+{
+    stop();
+}
+
+__attribute__((section(".vectors"), used)) static const void *const vectors[17] = {
     &stack_top, (const void *)start, (const void *)stop, (const void *)stop, (const void *)stop, (const void *)stop,
-    (const void *)stop,
+    (const void *)stop, [16] = (const void *)interrupt_0,
 };
