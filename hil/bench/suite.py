@@ -13,6 +13,7 @@ from hil.bench import (
     learning,
     limits,
     margins,
+    native,
     operate,
     parts,
     plant,
@@ -50,6 +51,7 @@ MEASUREMENTS: dict[str, Measurement] = {
     "wire": parts.wire,
     "bus": limits.bus_cycle,
     "limits": limits.limits,
+    "native": native.native,
     "operate": operate.operate,
 }
 """A measurement's name is what its figures' names begin with."""

@@ -1,5 +1,6 @@
 """``pkxyz export``: the controller as C for another processor."""
 
+import dataclasses
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
@@ -21,7 +22,8 @@ TEST_TICKS = 1000
 def export(
     scenario: Annotated[str, typer.Argument(help="A shipped scenario's name or a TOML file.")] = "raster",
     target: Annotated[
-        str, typer.Option(help="The processor: host, cortex-m7, cortex-m4, aarch64 or riscv32.")
+        str,
+        typer.Option(help="host, linux (with a loop at rate), cortex-m7, cortex-m4, aarch64 or riscv32."),
     ] = "cortex-m7",
     out: Annotated[Path | None, typer.Option(help="Folder to write, new or empty; default: export/<target>.")] = None,
     stage: Annotated[str | None, typer.Option(help="Name or file, instead of the scenario's.")] = None,
@@ -47,7 +49,8 @@ def export(
 
         loaded = load_scenario(scenario, stage=stage, controller=controller, bus=bus)
         require_exportable(loaded.setup().law, loaded.controller.name, target)
-        manifest = write(path, target, exported_of(loaded, ticks))
+        beside = run_beside(loaded, ticks) if target_of(target).has_loop else ()
+        manifest = write(path, target, exported_of(loaded, ticks)._replace(beside=beside))
     except ExportError as error:
         raise ConfigError(str(error)) from None
     except OSError as error:
@@ -70,8 +73,6 @@ def exported_of(loaded: "Scenario", ticks: int | None) -> "Exported":
 
     Raises ``ConfigError`` for a bus without CAN.
     """
-    import dataclasses
-
     from hil.lanes.blocks import PREVIEW_ROWS, Blocks
     from hil.lanes.lockstep import LockstepRig
     from hil.runs.scenario import resolve
@@ -91,3 +92,28 @@ def exported_of(loaded: "Scenario", ticks: int | None) -> "Exported":
     assert isinstance(rig.controller, RecordedController)
     names = loaded.config.name, loaded.controller.name
     return Exported(rig.controller.record, reference, rig.controller.calls, *names, resolve(loaded)["digest"])
+
+
+def run_beside(loaded: "Scenario", ticks: int | None) -> tuple[tuple[str, bytes], ...]:
+    """What the loop at rate goes by, and the folder that it fills. Raises ``ConfigError`` for what it does not take."""
+    import tempfile
+
+    from hil.lanes.lane import Lane
+    from hil.lanes.wall import COMPANY_S, require_real_bus
+    from hil.native.settings import require_native
+    from hil.native.standalone import standalone
+    from hil.recording.journal import JournalWriter, journal_of
+    from hil.runs.run_folder import RunFolder, metadata_of
+
+    can = require_real_bus(loaded.bus)
+    if ticks is not None:
+        lasting = min(loaded.config.duration_s, ticks * loaded.bus.period_s)
+        loaded = dataclasses.replace(loaded, config=loaded.config.model_copy(update={"duration_s": lasting}))
+    setup = loaded.setup()
+    require_native(setup, can)
+    with tempfile.TemporaryDirectory(prefix="pkxyz-export-") as scratch:
+        folder = RunFolder(Path(scratch) / "run")
+        resolved = folder.write_config(loaded)
+        JournalWriter(journal_of(folder.recording), metadata_of(loaded, Lane.WALL, resolved)).close()
+        left = tuple((f"run/{path.name}", path.read_bytes()) for path in sorted(folder.path.iterdir()))
+    return (("loop.bin", standalone(setup, can, COMPANY_S)), *left)

@@ -40,6 +40,11 @@ class Mapped:
         """By which a process that inherits the descriptor opens it."""
         return f"/proc/self/fd/{self.descriptor}"
 
+    @property
+    def content(self) -> bytes:
+        """All of it."""
+        return bytes(self._memory[:])
+
     def close(self) -> None:
         """Nobody inherits it any more; what is mapped stays."""
         os.close(self.descriptor)

@@ -138,7 +138,7 @@ def measure(period_us: int, seconds: float, cyclictest: str | None = None) -> La
     controller.memory["mode"] = Mode.IDLE  # as after the start-up, which a played amplifier cannot answer
     reference = reference_rows(setup.trajectory.sample(0, setup.ticks + PREVIEW_ROWS, period_us))
     cycling.cycle(setup.law, cycling.new_memory(), reference)
-    beside = _start_cyclictest(cyclictest, period_us, seconds)
+    beside = start_cyclictest(cyclictest, period_us, seconds)
     with Ending() as ending:
         clock = TickClock(
             WallClock(), period_us, latest_start_us=period_us // 3, guard_us=period_us // 8, leave=ending.check
@@ -185,7 +185,8 @@ def _played(setup: Setup) -> list[Frame]:
     ]
 
 
-def _start_cyclictest(path: str | None, period_us: int, seconds: float) -> "subprocess.Popen[str] | None":
+def start_cyclictest(path: str | None, period_us: int, seconds: float) -> "subprocess.Popen[str] | None":
+    """``cyclictest`` at ``path`` for so long, at our priority; None for None. Raises ``ConfigError``."""
     if path is None:
         return None
     real_time = ["-m", "-p", str(FIFO_PRIORITY)] if os.geteuid() == 0 else []

@@ -20,7 +20,7 @@ from pkxyz_ctrl.export.kernels import ExportError, kernels
 from pkxyz_ctrl.export.lowering import Lowered, lower
 from pkxyz_ctrl.export.selftest import EVERY, SelfTest, self_test
 from pkxyz_ctrl.export.stored import Stored, stored_in_exchange
-from pkxyz_ctrl.export.structs import header, struct_name
+from pkxyz_ctrl.export.structs import header, loop_header, struct_name
 from pkxyz_ctrl.export.targets import TARGETS, Target
 from pkxyz_ctrl.export.words import CANONICAL_NAN, FNV_OFFSET, FNV_PRIME, c_words, double_words, words_of
 from pkxyz_ctrl.loop.exchange import EXCHANGE_MEMORY
@@ -36,6 +36,22 @@ BUSY_MOST = 0.8
 """Share of a period that the longest tick may take: frames, interrupts and caches want the rest."""
 
 
+LOOP_SOURCES = Path(__file__).parent / "linux"
+"""The loop at rate around the kernels, in C."""
+_LOOP_RULE = """
+loop/loop: $(wildcard loop/*.c loop/*.h) pkxyz.h pkxyz.o
+\t$(CC) $(CFLAGS) -I. -o $@ $(wildcard loop/*.c) pkxyz.o
+"""
+_LOOP_README = """
+## The loop at rate
+
+`loop/` is a program around the same object: one of the ports `port_can.c` (the kernel's CAN sockets) and `port_unix.c`,
+absolute deadlines, SCHED_FIFO and locked memory where permitted. `loop/loop loop.bin` starts the amplifier, runs the
+scenario, leads the stage down at its end or on SIGTERM, and leaves rows and frames in `run/`, which `pkxyz replay run`
+reads. `loop.bin` holds bus, law and path and stays as it is.
+"""
+
+
 class Exported(NamedTuple):
     """What is to be exported: what the controller goes by, (1,) of ``exchange.EXCHANGE``, the reference's rows (n,),
     calls (m,) of an exchange for the self-test, names for people.
@@ -47,6 +63,8 @@ class Exported(NamedTuple):
     scenario: str
     controller: str
     config_digest: str
+    beside: tuple[tuple[str, bytes], ...] = ()
+    """Files that the target has besides, by name."""
 
     @property
     def law(self) -> Records:
@@ -106,6 +124,7 @@ def write(out: Path, target_name: str, exported: Exported) -> dict[str, Any]:
     if any(out.iterdir()):
         raise ExportError(f"--out: {out}: is not empty, and nothing is overwritten; give a new folder, or empty it")
     for name, content in sorted(files.items()):
+        (out / name).parent.mkdir(exist_ok=True)
         (out / name).write_bytes(content)
     return manifest
 
@@ -120,20 +139,25 @@ def _files(name: str, target: Target, exported: Exported, test: SelfTest, lowere
         "memory_bytes": str(exported.stored.memory), "row_bytes": str(ROW.itemsize),
         "reference_bytes": str(exported.reference.nbytes), "rows": str(len(exported.reference)),
         "owed": ", ".join(lowered.owed) or "nothing",
-        "port": target.port, "link": target.link,
+        "port": target.port, "link": target.link, "loop_rule": _LOOP_RULE if target.has_loop else "",
+        "loop_made": " loop/loop" if target.has_loop else "", "loop_readme": _LOOP_README if target.has_loop else "",
     }  # fmt: skip
     files = {file: _filled(file, values) for file in ("main.c", "Makefile", "CMakeLists.txt", "README.md")}
     files |= {
         file: (PORT / file).read_bytes() for file in (target.port, *target.link.split()) if (PORT / file).is_file()
     }
-    texts = sources(exported) | {"pkxyz.s": lowered.assembly, "selftest.c": _self_test_c(test)}
+    if target.has_loop:
+        files |= {f"loop/{path.name}": path.read_bytes() for path in sorted(LOOP_SOURCES.iterdir())}
+    files |= dict(exported.beside)
+    texts = sources(exported, has_loop=target.has_loop)
+    texts |= {"pkxyz.s": lowered.assembly, "selftest.c": _self_test_c(test)}
     return files | {file: text.encode() for file, text in texts.items()} | {"pkxyz.o": lowered.code}
 
 
-def sources(exported: Exported) -> dict[str, str]:
+def sources(exported: Exported, *, has_loop: bool = False) -> dict[str, str]:
     """What any program around the object is compiled with: the records, the settings, the path."""
     return {
-        "pkxyz.h": header(int(exported.law["period_us"][0]), exported.stored),
+        "pkxyz.h": (loop_header if has_loop else header)(int(exported.law["period_us"][0]), exported.stored),
         "config.c": _config_c(exported),
         "reference.c": _constant("pkxyz_path_words", exported.reference),
     }

@@ -14,12 +14,12 @@ import llvmlite
 import numba
 
 from pkxyz_ctrl.compiled.kernel_cache import digest_of_kernels
+from pkxyz_ctrl.export.folder import LOOP_SOURCES
 from pkxyz_ctrl.export.kernels import ExportError, kernels
 from pkxyz_ctrl.export.lowering import lower
 from pkxyz_ctrl.export.structs import loop_header
 from pkxyz_ctrl.export.targets import TARGETS
 
-SOURCES = Path(__file__).parent / "linux"
 FLAGS = ("-std=c11", "-O2", "-Wall", "-Wextra", "-fno-strict-aliasing", "-ffp-contract=off")
 """Records are read as words, too: no strict aliasing."""
 
@@ -63,7 +63,7 @@ def build(folder: Path, with_compiler: str) -> None:
     """Header, object and sources into ``folder``, and ``loop`` out of them. Raises ``ExportError``."""
     (folder / "pkxyz.h").write_text(loop_header(), encoding="utf-8")
     (folder / "pkxyz.o").write_bytes(lower(kernels(), TARGETS["linux"]).code)
-    sources = [str(path) for path in sorted(SOURCES.glob("*.c"))]
+    sources = [str(path) for path in sorted(LOOP_SOURCES.glob("*.c"))]
     words = [with_compiler, *FLAGS, "-I", str(folder), "-o", str(folder / "loop"), *sources, str(folder / "pkxyz.o")]
     done = subprocess.run(words, check=False, capture_output=True, text=True)
     if done.returncode != 0:
@@ -77,6 +77,6 @@ def _place() -> Path | None:
     if folder is None or not Path(folder).is_dir():
         return None
     digest = hashlib.sha256(f"{numba.__version__} {llvmlite.__version__} {digest_of_kernels()} {compiler()}".encode())
-    for path in sorted([*Path(__file__).parent.glob("*.py"), *SOURCES.glob("*.[ch]")]):
+    for path in sorted([*Path(__file__).parent.glob("*.py"), *LOOP_SOURCES.iterdir()]):
         digest.update(path.read_bytes())
     return Path(folder) / f"loop-{digest.hexdigest()[:16]}"

@@ -76,9 +76,10 @@ def header(period_us: int, held: Stored) -> str:
     return _HEAD + _LAW.format(period_us=period_us, settings=held.settings, memory=held.memory) + _body() + _TAIL
 
 
-def loop_header() -> str:
-    """``pkxyz.h`` for the native loop, which takes any law, with what it shares."""
-    law = _LAW.format(period_us=0, settings=EXCHANGE.itemsize, memory=EXCHANGE_MEMORY.itemsize)
+def loop_header(period_us: int = 0, held: Stored | None = None) -> str:
+    """``pkxyz.h`` with what the native loop shares, which itself takes any law."""
+    held = held or Stored(EXCHANGE.itemsize, EXCHANGE_MEMORY.itemsize)
+    law = _LAW.format(period_us=period_us, settings=held.settings, memory=held.memory)
     numbers = {"MAGIC": f"{MAGIC:#x}", "LAYOUT": f"{layout():#x}", "BLOCK_ROWS": BLOCK_ROWS, "EVENTS": EVENTS}
     numbers["LATENESS_MOST_US"] = LATENESS_MOST_US
     defined = "".join(f"#define PKXYZ_{name} {value}\n" for name, value in numbers.items())

@@ -16,6 +16,7 @@ class Target(NamedTuple):
     ``link``: what the Makefile calls, with what; ``port``: the file that stands in for the board's own.
     ``tick_most_us``: what the longest tick takes, where that is long, by ``make test-firmware`` and one instruction
     a cycle: 25 200 and 5 100 for frames and gate at 480 MHz on a Cortex-M7, 619 640 at 168 MHz on a Cortex-M4.
+    ``has_loop``: the program that runs it at rate goes with it.
     """
 
     triple: str | None
@@ -30,6 +31,7 @@ class Target(NamedTuple):
     port: str
     link: str
     tick_most_us: int = 0
+    has_loop: bool = False
 
     @property
     def llvm_triple(self) -> str:
@@ -53,7 +55,8 @@ _HERE = None, "x86-64" if platform.machine() == "x86_64" else "generic", ""
 TARGETS: Final[Mapping[str, Target]] = MappingProxyType({
     "host": Target(*_HERE, "this machine, with its C library", True, True, True, "cc", "", "port_host.c", ""),
     "linux": Target(
-        *_HERE, "this machine, with the loop at rate around it", True, True, True, "cc", "", "port_host.c", ""
+        *_HERE, "this machine, with the loop at rate around it", True, True, True, "cc", "", "port_host.c", "",
+        has_loop=True,
     ),
     # In four parts: of three, LLVM would call helpers of another binary interface.
     "cortex-m7": Target(

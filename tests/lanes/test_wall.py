@@ -9,13 +9,20 @@ import signal
 import subprocess
 import sys
 import time
-from contextlib import contextmanager
-from pathlib import Path
 
 import can
 import numpy as np
 import pytest
-from patience import patient_bus, patient_law
+from two_processes import (
+    ROOT,
+    assert_ended_by_the_controller,
+    bench_in,
+    controller,
+    driving,
+    is_driving,
+    next_with,
+    served,
+)
 
 from hil.bus.unix_bus import UnixBus
 from hil.commands import run as run_cli
@@ -32,117 +39,20 @@ from pkxyz_ctrl.safety.modes import NODE_EXPECTED, Mode
 
 pytestmark = pytest.mark.at_rate
 
-ROOT = Path(__file__).parents[2]
 PERIOD_US = 1000
 DRIVE_TIMEOUT_US = 20_000
 EMCY, SDO_REPLY, SDO_REQUEST = 0x08A, 0x58A, 0x60A
-SCENARIO = """
-name = "to_and_fro"
-duration_s = 1.8
-seed = 3
-stage = "reconstructed"
-plant = "nominal"
-controller = "patient.toml"
-bus = "{bus}"
-[[reference]]
-kind = "hold"
-duration_s = 0.02
-measured = false
-[[reference]]
-kind = "move"
-to_m = [0.0, 0.0, 19.2495e-6]
-velocity_max_m_per_s = 0.1e-3
-acceleration_max_m_per_s2 = 0.02
-jerk_max_m_per_s3 = 5.0
-[[reference]]
-kind = "move"
-to_m = [3.0e-6, -2.0e-6, 19.2495e-6]
-velocity_max_m_per_s = 0.02e-3
-acceleration_max_m_per_s2 = 0.005
-jerk_max_m_per_s3 = 1.0
-"""
 
 
 @pytest.fixture(scope="module")
 def bench(tmp_path_factory):
-    """A folder with a scenario, a controller that forgives missed ticks, and a patient and an impatient bus."""
-    folder = tmp_path_factory.mktemp("wall")
-    patient_law(folder)
-    patient_bus(folder / "quick.toml", is_node_patient=False)
-    patient_bus(folder / "slow.toml")
-    for name in ("quick", "slow"):
-        (folder / f"on_{name}.toml").write_text(SCENARIO.format(bus=f"{name}.toml"), encoding="utf-8")
-    return folder
-
-
-def started(folder, *words, stdout=subprocess.PIPE):
-    return subprocess.Popen(
-        [sys.executable, "-m", "hil.cli", *map(str, words)], cwd=folder, text=True,
-        env={**os.environ, "PYTHONPATH": str(ROOT)}, stdout=stdout, stderr=subprocess.PIPE,
-    )  # fmt: skip
+    return bench_in(tmp_path_factory.mktemp("wall"))
 
 
 @pytest.fixture(scope="module")
 def changes(bench):
-    """Serves node and plant in a process; gives a function that waits for a state and returns all changes so far."""
-    words = ("plant", "on_slow.toml", "--bus", "slow.toml", "--truth", "truth.bin", "--json")
-    with (bench / "changes").open("wb") as out:
-        process = started(bench, *words, stdout=out)
-
-    def seen(state, driven):
-        end_s = time.monotonic() + 60
-        while True:
-            lines = [json.loads(line) for line in (bench / "changes").read_text(encoding="utf-8").splitlines()]
-            if lines and (lines[-1]["state"], lines[-1]["driven"]) == (state, driven):
-                return lines
-            assert time.monotonic() < end_s, f"the node is not {state}, driven {driven}: {lines}"
-            time.sleep(0.02)
-
-    yield seen
-    process.terminate()
-    _, err = process.communicate(timeout=60)
-    assert process.returncode == 0, err
-
-
-@contextmanager
-def controller(folder, *words):
-    """A controller in its process, which does not outlive the test."""
-    process = started(folder, "run", *words)
-    try:
-        yield process
-    finally:
-        if process.poll() is None:
-            process.kill()
-            process.communicate()
-
-
-def is_driving(observer, run):
-    """Whether within a minute, and before the node complains, the observer on the bus sees
-    voltages for some ticks of a controller's process.
-    """
-    end_s, driven = time.monotonic() + 60, 0
-    while driven < 200 and run.poll() is None and time.monotonic() < end_s:
-        message = observer.recv(0.1)
-        if driven and message is not None and message.arbitration_id == EMCY and any(message.data):
-            return False
-        driven += message is not None and message.arbitration_id == 0x30A and any(message.data[:6])
-    return driven == 200
-
-
-@contextmanager
-def driving(folder, observer, *words):
-    """A controller in its process that drives the combs. A machine that stands still puts it in fault at 0 V instead,
-    so it may begin three times.
-    """
-    said = []
-    for _ in range(3):
-        with controller(folder, *words) as run:
-            if is_driving(observer, run):
-                yield run
-                return
-            run.terminate()
-            said.append(run.communicate(timeout=60))
-    pytest.fail(f"no voltages came: {said}")
+    with served(bench) as seen:
+        yield seen
 
 
 def truth_of(folder, rows, since):
@@ -248,15 +158,6 @@ def test_killed_controller_leaves_0_v_in_the_time_of_its_drive_frames_and_then_n
     assert (np.diff(killed["tick"]) == 1).all()
 
 
-def next_with(bus, can_id):
-    end_s = time.monotonic() + 10
-    while time.monotonic() < end_s:
-        message = bus.recv(0.1)
-        if message is not None and message.arbitration_id == can_id:
-            return message
-    raise AssertionError(f"no frame 0x{can_id:03X} came")
-
-
 def test_a_stopped_controller_goes_on_and_sigterm_ends_it_at_0_v(bench, changes):
     """Asleep for 40 ms: missed ticks are skipped whole and counted, and with its monitor off the run goes on."""
     changes("pre-operational", False)
@@ -300,17 +201,6 @@ def test_ctrl_c_ends_at_0_v(bench, changes):
     assert json.loads(out)["interrupted"]
     assert changes("pre-operational", False)[-2]["driven"]
     assert_ended_by_the_controller(bench / "interrupted" / "frames.log")
-
-
-def assert_ended_by_the_controller(log):
-    """It led the stage down to 0 V, and the node did not have to find out that it is gone."""
-    frames = list(can.LogReader(log))
-    most = np.array([np.frombuffer(m.data[:6], "<i2").max() for m in frames if m.arbitration_id == 0x30A], float)
-    last = np.flatnonzero(most)[-1]
-    assert 0.0 == most[-1] < most[last] < 0.4 * most[last - 11]  # of 12 ticks on the way
-    assert (np.diff(most[last - 11 : last + 1]) <= 50).all()
-    driven = next(i for i, m in enumerate(frames) if m.arbitration_id == 0x30A and any(m.data[:6]))
-    assert not any(message.arbitration_id == EMCY for message in frames[driven:])
 
 
 def test_a_full_disk_ends_at_0_v_with_one_line_and_what_was_written_opens(bench, changes):

@@ -1,8 +1,9 @@
-/* loop FILE [PIPE]: control one stage at rate, as FILE says, and leave there what happened.
-   PIPE: descriptor of a pipe that somebody reads for as long as he takes the rows. */
+/* loop FILE: control one stage at rate, as FILE says, and leave rows and frames in the folder "run" beside it.
+   loop FILE PIPE: what happens stands in FILE, and is taken from there by whoever reads the pipe as long as he does. */
 #define _GNU_SOURCE
 #include <errno.h>
 #include <fcntl.h>
+#include <limits.h>
 #include <stdio.h>
 #include <stdlib.h>
 #include <string.h>
@@ -13,6 +14,7 @@
 #include "clock.h"
 #include "controller.h"
 #include "ending.h"
+#include "leave.h"
 #include "loop.h"
 #include "path.h"
 #include "port.h"
@@ -32,15 +34,16 @@ static int refuse(const char *file, const char *words)
     return 2;
 }
 
-/* The whole file, in memory now and not when it is first needed. */
-static pkxyz_shared *mapped(const char *file, int64_t *size)
+/* The whole file, in memory now and not when it is first needed; where it is not shared it stays as it is. */
+static pkxyz_shared *mapped(const char *file, int is_shared, int64_t *size)
 {
     struct stat found;
-    const int opened = open(file, O_RDWR | O_CLOEXEC);
+    const int opened = open(file, (is_shared ? O_RDWR : O_RDONLY) | O_CLOEXEC);
     if (opened < 0 || fstat(opened, &found) != 0)
         return 0;
     *size = found.st_size;
-    void *place = mmap(0, (size_t)found.st_size, PROT_READ | PROT_WRITE, MAP_SHARED | MAP_POPULATE, opened, 0);
+    const int how = (is_shared ? MAP_SHARED : MAP_PRIVATE) | MAP_POPULATE;
+    void *place = mmap(0, (size_t)found.st_size, PROT_READ | PROT_WRITE, how, opened, 0);
     close(opened);
     return place == MAP_FAILED ? 0 : place;
 }
@@ -63,7 +66,7 @@ int main(int argc, char **argv)
     int64_t size = 0;
     if (argc < 2 || argc > 3)
         return refuse("FILE [PIPE]", "give the file that says what to do");
-    pkxyz_shared *shared = mapped(argv[1], &size);
+    pkxyz_shared *shared = mapped(argv[1], argc > 2, &size);
     if (!shared)
         return refuse(argv[1], strerror(errno));
     const char *wrong = misfit(shared, size);
@@ -72,12 +75,13 @@ int main(int argc, char **argv)
     pkxyz_shared_settings *settings = shared->settings;
     pkxyz_shared_state *state = shared->state;
     pkxyz_shared_path *blocks = (void *)(shared + 1);
+    uint8_t *ring_bytes = (uint8_t *)(blocks + settings->blocks);
 
     ending_begin(argc > 2 ? atoi(argv[2]) : -1);
     clock_begin(settings->spin_us);
     state->begun_ns = clock_begun_ns();
     path_begin(blocks, settings->blocks);
-    ring_begin(shared->ring, (uint8_t *)(blocks + settings->blocks), settings->ring_bytes);
+    ring_begin(shared->ring, ring_bytes, settings->ring_bytes);
     told_begin(shared);
     controller_begin(shared);
     ticks_begin(settings, state);
@@ -92,9 +96,15 @@ int main(int argc, char **argv)
     state->outcome = outcome;
     state->phase = PKXYZ_PHASE_ENDED;
     ring_end();
-    if (argc == 2) /* nobody else puts it into words */
+    if (argc == 2) { /* nobody else records it, or puts it into words */
+        char folder[PATH_MAX];
+        const char *slash = strrchr(argv[1], '/');
+        snprintf(folder, sizeof folder, "%.*srun", slash ? (int)(slash + 1 - argv[1]) : 0, argv[1]);
+        if (leave(shared->ring, ring_bytes, settings->ring_bytes, folder, (const char *)settings->channel) != 0)
+            return refuse(folder, strerror(errno));
         fprintf(stderr, "loop: %s\nloop: %s%s%s; %lld ticks, %lld of %lld rows lost\n", state->real_time, WORDS[outcome],
                 *state->refusal ? ": " : "", state->refusal, (long long)state->ticks, (long long)shared->ring->lost_rows,
                 (long long)settings->ticks);
+    }
     return outcome == PKXYZ_OUTCOME_DONE ? 0 : 1;
 }

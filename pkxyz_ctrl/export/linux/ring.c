@@ -5,9 +5,6 @@
 #include <string.h>
 #include <time.h>
 
-/* Kinds of entries: a frame's is twice its flags. A frame: kind, length, time in us (8 bytes), identifier (4), data.
-   A row: kind, then the row. The end: kind, then how many bytes were lost (8). All little-endian, nothing between. */
-enum { ROW = 1, END = 3, HEAD = 14 };
 enum { PATIENCE_MS = 2000 };
 
 static pkxyz_shared_ring *ring;
@@ -53,18 +50,18 @@ void ring_hand_over(void)
 
 void ring_frame(const frame *noted, int64_t t_us)
 {
-    uint8_t entry[HEAD + FRAME_BYTES];
+    uint8_t entry[RING_FRAME_HEAD + FRAME_BYTES];
     entry[0] = (uint8_t)(noted->flags << 1);
     entry[1] = (uint8_t)noted->length;
     memcpy(entry + 2, &t_us, 8);
     memcpy(entry + 10, &noted->can_id, 4);
-    memcpy(entry + HEAD, noted->data, (size_t)noted->length);
-    put(entry, HEAD + noted->length);
+    memcpy(entry + RING_FRAME_HEAD, noted->data, (size_t)noted->length);
+    put(entry, RING_FRAME_HEAD + noted->length);
 }
 
 void ring_row(const pkxyz_row *row)
 {
-    const uint8_t kind = ROW;
+    const uint8_t kind = RING_ROW;
     put(&kind, 1);
     put(row, sizeof *row);
     ring->lost_rows += is_lost;
@@ -73,7 +70,7 @@ void ring_row(const pkxyz_row *row)
 
 void ring_end(void)
 {
-    const uint8_t kind = END;
+    const uint8_t kind = RING_END;
     const struct timespec moment = {0, 1000000};
     ring_hand_over();
     for (int n = 0; n < PATIENCE_MS && written + 9 - tail() > size; n++)

@@ -1,0 +1,142 @@
+"""Controller and plant as two processes of ``pkxyz`` that meet on Unix sockets, and an observer on their bus."""
+
+import json
+import os
+import subprocess
+import sys
+import time
+from contextlib import contextmanager
+from pathlib import Path
+
+import can
+import numpy as np
+import pytest
+from patience import patient_bus, patient_law
+
+ROOT = Path(__file__).parents[2]
+DRIVE, EMCY = 0x30A, 0x08A
+SCENARIO = """
+name = "to_and_fro"
+duration_s = 1.8
+seed = 3
+stage = "reconstructed"
+plant = "nominal"
+controller = "patient.toml"
+bus = "{bus}"
+[[reference]]
+kind = "hold"
+duration_s = 0.02
+measured = false
+[[reference]]
+kind = "move"
+to_m = [0.0, 0.0, 19.2495e-6]
+velocity_max_m_per_s = 0.1e-3
+acceleration_max_m_per_s2 = 0.02
+jerk_max_m_per_s3 = 5.0
+[[reference]]
+kind = "move"
+to_m = [3.0e-6, -2.0e-6, 19.2495e-6]
+velocity_max_m_per_s = 0.02e-3
+acceleration_max_m_per_s2 = 0.005
+jerk_max_m_per_s3 = 1.0
+"""
+
+
+def bench_in(folder):
+    """Into a folder: a scenario, a controller that forgives missed ticks, and a patient and an impatient bus."""
+    patient_law(folder)
+    patient_bus(folder / "quick.toml", is_node_patient=False)
+    patient_bus(folder / "slow.toml")
+    for name in ("quick", "slow"):
+        (folder / f"on_{name}.toml").write_text(SCENARIO.format(bus=f"{name}.toml"), encoding="utf-8")
+    return folder
+
+
+def started(folder, *words, stdout=subprocess.PIPE):
+    return subprocess.Popen(
+        [sys.executable, "-m", "hil.cli", *map(str, words)], cwd=folder, text=True,
+        env={**os.environ, "PYTHONPATH": str(ROOT)}, stdout=stdout, stderr=subprocess.PIPE,
+    )  # fmt: skip
+
+
+@contextmanager
+def served(folder):
+    """Serves node and plant in a process; gives a function that waits for a state and returns all changes so far."""
+    words = ("plant", "on_slow.toml", "--bus", "slow.toml", "--truth", "truth.bin", "--json")
+    with (folder / "changes").open("wb") as out:
+        process = started(folder, *words, stdout=out)
+
+    def seen(state, driven):
+        end_s = time.monotonic() + 60
+        while True:
+            lines = [json.loads(line) for line in (folder / "changes").read_text(encoding="utf-8").splitlines()]
+            if lines and (lines[-1]["state"], lines[-1]["driven"]) == (state, driven):
+                return lines
+            assert time.monotonic() < end_s, f"the node is not {state}, driven {driven}: {lines}"
+            time.sleep(0.02)
+
+    yield seen
+    process.terminate()
+    _, err = process.communicate(timeout=60)
+    assert process.returncode == 0, err
+
+
+@contextmanager
+def controller(folder, *words):
+    """A controller in its process, which does not outlive the test."""
+    process = started(folder, "run", *words)
+    try:
+        yield process
+    finally:
+        if process.poll() is None:
+            process.kill()
+            process.communicate()
+
+
+def is_driving(observer, run):
+    """Whether within a minute, and before the node complains, the observer on the bus sees
+    voltages for some ticks of a controller's process.
+    """
+    end_s, driven = time.monotonic() + 60, 0
+    while driven < 200 and run.poll() is None and time.monotonic() < end_s:
+        message = observer.recv(0.1)
+        if driven and message is not None and message.arbitration_id == EMCY and any(message.data):
+            return False
+        driven += message is not None and message.arbitration_id == DRIVE and any(message.data[:6])
+    return driven == 200
+
+
+@contextmanager
+def driving(folder, observer, *words):
+    """A controller in its process that drives the combs. A machine that stands still puts it in fault at 0 V instead,
+    so it may begin three times.
+    """
+    said = []
+    for _ in range(3):
+        with controller(folder, *words) as run:
+            if is_driving(observer, run):
+                yield run
+                return
+            run.terminate()
+            said.append(run.communicate(timeout=60))
+    pytest.fail(f"no voltages came: {said}")
+
+
+def next_with(bus, can_id):
+    end_s = time.monotonic() + 10
+    while time.monotonic() < end_s:
+        message = bus.recv(0.1)
+        if message is not None and message.arbitration_id == can_id:
+            return message
+    raise AssertionError(f"no frame 0x{can_id:03X} came")
+
+
+def assert_ended_by_the_controller(log):
+    """It led the stage down to 0 V, and the node did not have to find out that it is gone."""
+    frames = list(can.LogReader(log))
+    most = np.array([np.frombuffer(m.data[:6], "<i2").max() for m in frames if m.arbitration_id == DRIVE], float)
+    last = np.flatnonzero(most)[-1]
+    assert 0.0 == most[-1] < most[last] < 0.4 * most[last - 11]  # of 12 ticks on the way
+    assert (np.diff(most[last - 11 : last + 1]) <= 50).all()
+    driven = next(i for i, m in enumerate(frames) if m.arbitration_id == DRIVE and any(m.data[:6]))
+    assert not any(message.arbitration_id == EMCY for message in frames[driven:])
