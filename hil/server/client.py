@@ -37,7 +37,8 @@ class Client:
 
     def __init__(self, number: int) -> None:
         self.number = number
-        self.said: asyncio.Queue[str | bytes] = asyncio.Queue(SAID_MOST)
+        self.said: asyncio.Queue[str | bytes | None] = asyncio.Queue(SAID_MOST)
+        self._status: str | None = None  # the newest that waits; None in the queue stands for it
         self.fields: tuple[str, ...] = ()
         self.precision: Precision = "f4"
         self.tags: dict[int, Any] = {}
@@ -47,12 +48,17 @@ class Client:
 
     def tell(self, message: dict[str, Any]) -> None:
         """Queue a message; a client that takes none of hundreds is given up."""
-        self.tell_text(json.dumps(message, allow_nan=False))
+        self._put(json.dumps(message, allow_nan=False))
 
-    def tell_text(self, text: str) -> None:
-        """The same, of what is a text already."""
+    def tell_status(self, text: str) -> None:
+        """Queue where the stage is, in place of what waits of that: one who is slow is not late as well."""
+        if self._status is None:
+            self._put(None)
+        self._status = text
+
+    def _put(self, said: str | bytes | None) -> None:
         try:
-            self.said.put_nowait(text)
+            self.said.put_nowait(said)
         except asyncio.QueueFull:
             self.is_hopeless = True
 
@@ -75,15 +81,14 @@ class Client:
         self._give(packed(block, "f4"))
 
     def _give(self, block: bytes) -> None:
-        try:
-            self.said.put_nowait(block)
-            self._blocks += 1
-        except asyncio.QueueFull:
-            self.is_hopeless = True
+        self._put(block)
+        self._blocks += 1
 
     async def next_said(self) -> str | bytes:
         """What comes next."""
         said = await self.said.get()
-        if isinstance(said, bytes):
+        if said is None:
+            said, self._status = str(self._status), None
+        elif isinstance(said, bytes):
             self._blocks -= 1
         return said

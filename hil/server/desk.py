@@ -118,9 +118,9 @@ class Desk:
         elif what == "stop":
             self.stops += 1
             self._feeding = self._asked_for = None
-            command_id = self.link.next_id()
-            client.tags[command_id] = tag
-            self._stopping.ask(command_id)
+            stop_id = self.link.next_id()
+            client.tags[stop_id] = tag
+            self._stopping.ask(stop_id)
         elif what == "subscribe":
             self._subscribe(client, message)
         elif what == "take_control":
@@ -364,7 +364,7 @@ class Desk:
         }
         text = json.dumps({"status": status}, allow_nan=False)
         for client in self.clients:
-            client.tell_text(text)
+            client.tell_status(text)
 
     def _ranges_at(self, target_m: np.ndarray) -> list[list[float | None]]:
         """How far each axis can go; looked for when the target is another."""

@@ -1,8 +1,9 @@
 """Hostile clients against `pkxyz serve` itself: ``python tests/server/hostile.py [MESSAGES]``; writes hostile.json.
 
-Eight connections send random messages as fast as they are taken, others subscribe and never read, others come without
-a token or from another page. Meanwhile one looks on. Reported are what moved, the server's memory, and ticks
-missed beside as long without them. On a busy machine ticks are missed in either.
+The stage holds in the middle, in closed loop, under a law and on a bus that bear a machine which stands still. Eight
+connections send random messages as fast as they are taken, others subscribe and never read, others come without a
+token or from another page. Nobody stops or releases the stage, which anyone may. Meanwhile one looks on. Reported are
+what moved, the server's memory, and ticks missed, beside as long with a program that is as busy and asks nobody.
 """
 
 import asyncio
@@ -15,17 +16,22 @@ import sys
 import tempfile
 import time
 from pathlib import Path
+from typing import Any
 
 import numpy as np
-from websockets.asyncio.client import connect
+from websockets.asyncio.client import ClientConnection, connect
 from websockets.exceptions import ConnectionClosed, InvalidStatus
+
+sys.path.append(str(Path(__file__).parents[1] / "rigs"))
+from patience import patient_bus, patient_law
 
 from hil.operate.commands import Verb
 from pkxyz_ctrl.client.protocol import SUBPROTOCOL, TOKEN_PREFIX
-from pkxyz_ctrl.client.stage import AsyncStage, connect_async
+from pkxyz_ctrl.client.stage import connect_async
 
 SENDERS, NOT_READING, STRANGERS = 8, 12, 200
 FREE = ("stop", "release")  # need no control, and do what they say
+MEMORY_MORE_MB, SOME_TICKS = 200.0, 20
 REPORT = Path(__file__).with_suffix(".json")
 NAME = f"hostile-{os.getpid()}"
 
@@ -87,53 +93,68 @@ async def strangers(address: str) -> int:
     return inside
 
 
-async def measured(url: str, token: str, server: int, messages: int) -> dict[str, object]:
-    """One looks on, the others come."""
+async def measured(url: str, token: str, server: int, messages: int) -> dict[str, Any]:
+    """The stage holds in closed loop, one looks on, the others come; then a program as busy that asks nobody."""
     address = url.replace("http", "ws", 1).rstrip("/") + "/stage"
     async with connect_async(url, token, control=True) as stage:
         while stage.status.activity == "starting":
             await stage.next_status()
-        at_rest_mb = resident_mb(server)
-        begin, before = time.monotonic(), await _missed(stage)
-        deaf = []
-        for _ in range(NOT_READING):
-            socket = await connect(address, subprotocols=[SUBPROTOCOL, TOKEN_PREFIX + token], max_queue=1)  # type: ignore[list-item]
-            await socket.send('{"do": "subscribe", "fields": ["estimate_m", "voltage_v", "reference_m"]}')
-            socket.transport.pause_reading()
-            deaf.append(socket)
-        target = np.array((await stage.next_status()).target_m)
-        most_mb = at_rest_mb
+        for verb in (stage.home, stage.enable):
+            await verb()
+        await stage.move_to(*stage.description["middle_m"])
+        at_rest_mb, begun = resident_mb(server), await stage.next_status()
+        begin_s, activities, most_mb = time.monotonic(), set(), at_rest_mb
+        deaf = [await _deaf(address, token) for _ in range(NOT_READING)]
         each = messages // SENDERS
         work = asyncio.gather(*(sending(address, token, each, seed) for seed in range(SENDERS)), strangers(address))
         while not work.done():
-            await asyncio.sleep(0.2)
+            activities.add((await stage.next_status()).activity)
             most_mb = max(most_mb, resident_mb(server))
         *senders, inside = await work
-        lasted_s, missed = time.monotonic() - begin, await _missed(stage) - before
-        status = await stage.next_status()
-        moved_m = float(np.abs(np.array(status.target_m) - target).max())
+        lasted_s, ended = time.monotonic() - begin_s, await stage.next_status()
         for socket in deaf:
             socket.transport.abort()
-        quiet_from = await _missed(stage)
-        await asyncio.sleep(lasted_s)
+        await asyncio.sleep(1.0)
+        quiet_from = (await stage.next_status()).missed_ticks
+        await _as_busy(lasted_s)
+        quiet_to = (await stage.next_status()).missed_ticks
         return {
             "messages": sum(s["sent"] for s in senders), "thrown_out": sum(s["thrown_out"] for s in senders),
             "strangers": STRANGERS, "strangers_inside": inside, "not_reading": NOT_READING,
-            "seconds": round(lasted_s, 1), "target_moved_m": moved_m, "activity": status.activity,
+            "seconds": round(lasted_s, 1), "activities": sorted(activities), "last_fault": ended.last_fault,
+            "target_moved_m": float(np.abs(ended.target_m - begun.target_m).max()),
+            "position_moved_m": float(np.abs(ended.position_m - begun.position_m).max()),
             "memory_before_mb": round(at_rest_mb, 1), "memory_most_mb": round(most_mb, 1),
-            "ticks_missed": missed, "ticks_missed_as_long_without": await _missed(stage) - quiet_from,
+            "ticks": round(lasted_s * 1e6 / stage.description["period_us"]),
+            "ticks_missed": ended.missed_ticks - begun.missed_ticks,
+            "ticks_missed_beside_a_busy_program": quiet_to - quiet_from,
             "load_average": round(os.getloadavg()[0], 1), "cores": os.cpu_count(),
         }  # fmt: skip
 
 
-async def _missed(stage: AsyncStage) -> int:
-    return (await stage.next_status()).missed_ticks
+async def _deaf(address: str, token: str) -> ClientConnection:
+    """One that asks for telemetry and takes none."""
+    socket = await connect(address, subprotocols=[SUBPROTOCOL, TOKEN_PREFIX + token], max_queue=1)  # type: ignore[list-item]
+    await socket.send('{"do": "subscribe", "fields": ["estimate_m", "voltage_v", "reference_m"]}')
+    socket.transport.pause_reading()
+    return socket
+
+
+async def _as_busy(seconds: float) -> None:
+    """Messages made and thrown away: what a program costs the machine that keeps a core busy, whatever it does."""
+    rng, end_s = np.random.default_rng(0), time.monotonic() + seconds
+    while time.monotonic() < end_s:
+        random_text(rng)
+        await asyncio.sleep(0)
 
 
 def main() -> None:
     messages = int(sys.argv[1]) if len(sys.argv) > 1 else 100_000
-    with tempfile.TemporaryDirectory() as folder:
-        words = ["serve", "--name", NAME, "--port", "0", "--json", "--saves", folder, "--settings", folder]
+    with tempfile.TemporaryDirectory() as place:
+        folder = Path(place)
+        law, bus = patient_law(folder, "youla"), patient_bus(folder / "bus.toml", "unix_2k")
+        words = ["serve", "--name", NAME, "--port", "0", "--json", "--controller", str(law), "--bus", str(bus)]
+        words += ["--silence-s", "10", "--saves", place, "--settings", place]
         process = subprocess.Popen([sys.executable, "-m", "hil", *words], stdout=subprocess.PIPE, text=True)
         try:
             assert process.stdout is not None
@@ -144,8 +165,13 @@ def main() -> None:
             process.wait(30)
     REPORT.write_text(json.dumps(found, indent=1) + "\n", encoding="utf-8")
     print(json.dumps(found, indent=1))
+    assert found["messages"] == messages
+    assert found["activities"] == ["holding"]
     assert found["target_moved_m"] == 0.0
+    assert found["position_moved_m"] < 30e-9
     assert found["strangers_inside"] == 0
+    assert found["memory_most_mb"] < found["memory_before_mb"] + MEMORY_MORE_MB
+    assert found["ticks_missed"] <= 1.1 * found["ticks_missed_beside_a_busy_program"] + SOME_TICKS
 
 
 if __name__ == "__main__":

@@ -276,8 +276,8 @@ def test_10_000_random_messages_move_nothing_and_nobody_without_control_can(rig)
 
 def test_a_client_that_reads_nothing_is_given_up(rig):
     client = rig.desk.enter()
-    for _ in range(SAID_MOST + 5):
-        rig.desk.tell_status()
+    for tag in range(SAID_MOST + 5):
+        rig.ask(client, do="move", tag=tag)
     assert client.is_hopeless
     assert client.said.qsize() <= SAID_MOST
 
@@ -351,9 +351,8 @@ def test_a_client_that_takes_nothing_ends_nobody_elses_telemetry(rig):
 
     def script() -> Script:
         yield from rig.wait_s(0.01)
-        for _ in range(SAID_MOST + 5):
-            rig.desk.tell_status()
-            rig.heard(other)
+        for tag in range(SAID_MOST + 5):
+            rig.ask(stalled, do="move", tag=tag)
         for client in (stalled, other):
             rig.ask(client, do="subscribe", fields=["tick"])
         yield from rig.wait_s(0.01)

@@ -5,7 +5,7 @@ import asyncio
 import numpy as np
 import pytest
 
-from hil.server.client import Client, Moment
+from hil.server.client import SAID_MOST, Client, Moment
 from pkxyz_ctrl.client.protocol import Block, packed
 
 pytestmark = pytest.mark.at_rate
@@ -27,6 +27,24 @@ def test_one_that_opens_recordings_and_reads_nothing_fills_no_memory():
     assert client.said.empty()
     client.show(moment)
     assert (client.lost, client.said.qsize()) == (0, 1)
+
+
+def test_one_that_is_slow_is_told_where_the_stage_is_now_and_not_where_it_was():
+    """A page on a machine without a core to spare was some 40 s behind, then thrown out for what waited."""
+    client = Client(1)
+    for n in range(3):
+        client.tell_status(f"status {n}")
+    client.tell({"answer": "done"})
+    client.tell_status("status 3")
+    said = []
+    while not client.said.empty():
+        said.append(asyncio.run(client.next_said()))
+    assert said == ["status 3", '{"answer": "done"}']
+    client.tell_status("status 4")
+    assert asyncio.run(client.next_said()) == "status 4"
+    for n in range(10 * SAID_MOST):
+        client.tell_status(f"status {n}")
+    assert (client.said.qsize(), client.is_hopeless) == (1, False)
 
 
 def test_what_clients_see_alike_is_packed_once_and_is_what_each_asked_for():
