@@ -9,7 +9,7 @@ import pytest
 from hypothesis import HealthCheck, settings
 
 import pkxyz_ctrl  # noqa: F401
-from hil.pictures import aside
+from hil.pictures import drawing_process
 from hil.screen import terminal
 
 # Whether an example is slow is the machine's affair, and no test's.
@@ -23,7 +23,7 @@ settings.load_profile("same every time")
 def pictures_in_place() -> Iterator[None]:
     """A command that is called within a test draws within it: the cores are busy with other tests."""
     with pytest.MonkeyPatch.context() as patched:
-        patched.setattr(aside, "cores", lambda: 1)
+        patched.setattr(drawing_process, "cores", lambda: 1)
         yield
 
 

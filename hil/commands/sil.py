@@ -9,7 +9,7 @@ import typer
 
 from hil.commands.run import Adapted, Apply, Learn, Refresh, ReplaceEarlier, learning_of
 from hil.lanes.lane import Lane
-from hil.pictures.aside import Aside
+from hil.pictures.drawing_process import DrawingProcess
 from hil.screen.choices import InProcessLane, require_simulated
 from hil.screen.figures import error_lines, lacking_lines, where_to_read
 from hil.screen.first_run import say_if_compiling
@@ -49,7 +49,7 @@ def sil(
     """
     lane = Lane(in_process.value)
     find("scenarios", scenario)  # a typo is said before anything is compiled
-    with Aside() as pictures:
+    with DrawingProcess() as pictures:
         say_if_compiling(quiet=as_json)
         from hil.faults.fault import parse
         from hil.runs.scenario import load_scenario
@@ -70,7 +70,7 @@ def sil(
 
 
 def _ran(
-    loaded: "Scenario", lane: Lane, out: Path | None, replace_earlier: bool, pictures: Aside, *, quiet: bool
+    loaded: "Scenario", lane: Lane, out: Path | None, replace_earlier: bool, pictures: DrawingProcess, *, quiet: bool
 ) -> "tuple[Summary, Path]":
     """The run into its folder, with its picture."""
     from hil.recording.recording import RecordingError

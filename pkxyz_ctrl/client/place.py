@@ -67,10 +67,10 @@ def _is_alive(pid: object) -> bool:
         return False
     except PermissionError:
         return True
-    return not _waits_to_be_buried(pid)
+    return not _is_zombie(pid)
 
 
-def _waits_to_be_buried(pid: int) -> bool:
+def _is_zombie(pid: int) -> bool:
     """Whether it has ended and only its parent does not know, as far as the system tells."""
     try:
         stat = Path(f"/proc/{pid}/stat").read_text(encoding="ascii", errors="replace")

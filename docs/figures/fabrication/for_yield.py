@@ -7,7 +7,7 @@ from pathlib import Path
 
 import numpy as np
 
-from hil.pictures.wafer.drawings import DrawnOne, draw_drawings
+from hil.pictures.wafer.drawings import DrawingFigures, draw_drawings
 
 HERE = Path(__file__).parent
 
@@ -16,7 +16,7 @@ def main() -> None:
     """Draw it."""
     found = json.loads((HERE / "for_yield.json").read_text(encoding="utf-8"))
     drawings = [
-        DrawnOne(name, row["works"], np.array(row["error_nm"]), row["effects"])
+        DrawingFigures(name, row["works"], np.array(row["error_nm"]), row["effects"])
         for name, row in found["drawings"].items()
     ]
     draw_drawings(drawings, found["limit_nm"], HERE.parent / "for_yield.png")

@@ -118,7 +118,7 @@ class Asked:
 
     def _compared(self, others: dict[str, StageConfig], choice: "Choice") -> dict[str, Any]:
         """Shares of each drawing on fresh wafers, gains of the chosen one, effects of each source; and the picture."""
-        from hil.pictures.wafer.drawings import ERROR, DrawnOne, draw_drawings
+        from hil.pictures.wafer.drawings import ERROR, DrawingFigures, draw_drawings
         from hil.studies.wafer.drawing_search import gained
         from hil.studies.wafer.effects import effects
         from hil.studies.wafer.shares import share_of
@@ -138,7 +138,7 @@ class Asked:
                 "shares": {n.removeprefix("ok."): asdict(share_of(v, each.columns["device"])) for n, v in ok.items()},
                 "effects": effect,
             }  # fmt: skip
-            drawn.append(DrawnOne(name, each.share.value, each.columns[ERROR], effect))
+            drawn.append(DrawingFigures(name, each.share.value, each.columns[ERROR], effect))
         limit = problem.process.closed_loop.get(ERROR)
         draw_drawings(drawn, None if limit is None else limit.max, self.out / "drawings.png")
         return {"drawings": rows}

@@ -20,7 +20,7 @@ _LEAST_NM = 0.3
 
 
 @dataclass(frozen=True)
-class DrawnOne:
+class DrawingFigures:
     """A drawing in the picture."""
 
     name: str
@@ -32,7 +32,7 @@ class DrawnOne:
     """as ``effects`` has them"""
 
 
-def draw_drawings(drawings: list[DrawnOne], limit_nm: float | None, path: Path) -> None:
+def draw_drawings(drawings: list[DrawingFigures], limit_nm: float | None, path: Path) -> None:
     """Errors of all devices by the share that stays below, and what one standard deviation of each source makes of
     the error.
     """
@@ -53,7 +53,7 @@ def draw_drawings(drawings: list[DrawnOne], limit_nm: float | None, path: Path) 
     save(figure, path)
 
 
-def _bars(plot: Axes, drawings: list[DrawnOne]) -> None:
+def _bars(plot: Axes, drawings: list[DrawingFigures]) -> None:
     """Beyond the mean device's error, in squares: noise is no effect."""
     added = [{name: _added(d.effects, name) for name in d.effects if name != MEAN} for d in drawings]
     names = sorted({name for each in added for name in each}, key=lambda n: max(each.get(n, 0.0) for each in added))

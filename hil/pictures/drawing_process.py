@@ -23,7 +23,7 @@ if TYPE_CHECKING:
 _DRAWN = b"drawn"
 
 
-class Aside:
+class DrawingProcess:
     """Used as a context: within it the process is there, after it it is gone, whatever happened."""
 
     def __init__(self) -> None:
@@ -33,7 +33,7 @@ class Aside:
         if cores() > 1:  # else it would only take the time of the run
             beside = os.environ | {"PYTHONPATH": os.pathsep.join(filter(None, sys.path)), "PYTHONSAFEPATH": "1"}
             self._process = subprocess.Popen(
-                [sys.executable, "-c", "from hil.pictures.aside import work; work()"],
+                [sys.executable, "-c", "from hil.pictures.drawing_process import work; work()"],
                 env=beside, stdin=subprocess.PIPE, stdout=subprocess.PIPE, stderr=subprocess.DEVNULL,
                 start_new_session=True,  # Ctrl-C is for the run; whether it is drawn is decided there
             )  # fmt: skip

@@ -7,8 +7,8 @@ import pytest
 
 import hil.pictures.run
 from hil.lanes.lane import Lane
-from hil.pictures import aside
-from hil.pictures.aside import Aside
+from hil.pictures import drawing_process
+from hil.pictures.drawing_process import DrawingProcess
 from hil.runs.run import run_into
 from hil.runs.run_folder import RunFolder
 from hil.runs.scenario import load_scenario
@@ -24,7 +24,7 @@ def ran(tmp_path: Path) -> tuple[RunFolder, Summary]:
 
 @pytest.fixture
 def two_cores(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(aside, "cores", lambda: 2)
+    monkeypatch.setattr(drawing_process, "cores", lambda: 2)
 
 
 def is_there(pid: int) -> bool:
@@ -41,7 +41,7 @@ def test_it_draws_the_same_picture_and_is_gone_afterwards(ran, monkeypatch):
     hil.pictures.run.draw(folder, summary)
     here = folder.picture.read_bytes()
     folder.picture.unlink()
-    with Aside() as pictures:
+    with DrawingProcess() as pictures:
         pid = pictures._process.pid
         with monkeypatch.context() as patched:
             patched.setattr(hil.pictures.run, "draw", None)
@@ -53,7 +53,7 @@ def test_it_draws_the_same_picture_and_is_gone_afterwards(ran, monkeypatch):
 @pytest.mark.usefixtures("two_cores")
 def test_where_it_was_killed_the_picture_is_drawn_here(ran):
     folder, summary = ran
-    with Aside() as pictures:
+    with DrawingProcess() as pictures:
         pictures._process.kill()
         pictures._process.wait()
         pictures.draw(folder, summary)
@@ -64,7 +64,7 @@ def test_where_it_was_killed_the_picture_is_drawn_here(ran):
 def test_what_it_can_t_write_is_told_as_ever(ran):
     folder, summary = ran
     folder.picture.mkdir()
-    with Aside() as pictures, pytest.raises(ConfigError, match=r"report\.png: cannot be written"):
+    with DrawingProcess() as pictures, pytest.raises(ConfigError, match=r"report\.png: cannot be written"):
         pictures.draw(folder, summary)
 
 
@@ -73,7 +73,7 @@ def test_a_run_that_ends_early_does_not_wait_for_it():
     pids = []
 
     def interrupted() -> None:
-        with Aside() as pictures:
+        with DrawingProcess() as pictures:
             pids.append(pictures._process.pid)
             raise KeyboardInterrupt
 
@@ -84,7 +84,7 @@ def test_a_run_that_ends_early_does_not_wait_for_it():
 
 def test_on_a_single_core_there_is_none(ran):
     folder, summary = ran
-    with Aside() as pictures:
+    with DrawingProcess() as pictures:
         assert pictures._process is None
         pictures.draw(folder, summary)
     assert folder.picture.is_file()
