@@ -171,8 +171,8 @@ def from_the_side(plot: Any, stage: Stage, theme: Theme) -> None:
     arrow(plot, (table + 0.36, 0), (table + 0.36, z), theme.ink, "<|-|>", 0.9)
     plot.text(table + 0.39, z / 2, "$L_2\\sin\\alpha$\n$= z_0 + z$", color=theme.ink, fontsize=10.5, va="center")
     arrow(plot, (pin, -0.30), (table, -0.30), theme.ink, "<|-|>", 0.9)
-    for x, top in ((pin, -0.02), (table, z - 0.04)):
-        plot.plot([x, x], [top, -0.33], color=theme.faint, linewidth=0.5)
+    for x, top, end in ((pin, -0.02, -0.33), (table, z - 0.04, 0.13), (table, 0.04, -0.33)):  # not through the words
+        plot.plot([x, x], [top, end], color=theme.faint, linewidth=0.5)
     plot.text(
         (pin + table) / 2, -0.33, "$\\delta = L_2\\cos\\alpha$", color=theme.ink, fontsize=10.5, ha="center", va="top"
     )

@@ -18,11 +18,11 @@ from hil.pictures.style import (
     PINK,
     REFERENCE,
     SKY,
+    SMALL_PT,
     TINY_PT,
     VERMILION,
     bound,
     dress,
-    legend,
     save,
     sheet,
 )  # fmt: skip
@@ -97,7 +97,7 @@ def effort(loop: Loop) -> float:
 
 def draw(all_loops: dict[str, Loop]) -> Figure:
     """|S| of x, and the loops of x in the Nyquist plane beside the disk of margin 0.6."""
-    figure = sheet(11, 4.2)
+    figure = sheet(11, 4.5)
     left, right = figure.subplots(1, 2)
     frequency = np.unique(np.r_[np.geomspace(10, 2499, 800), np.linspace(500, 800, 600)])
     for name in SHOWN:
@@ -110,7 +110,7 @@ def draw(all_loops: dict[str, Loop]) -> Figure:
     left.text(195.0, 0.032, "200 Hz", fontsize=TINY_PT, color=MUTED, ha="right", va="bottom")
     left.set(xlim=(10, 2500), ylim=(0.03, 4))
     dress(left, "frequency (Hz)", "|S|", "Sensitivity in x")
-    legend(left, "lower right", anchor=(0.98, 0.0))
+    figure.legend(frameon=False, fontsize=SMALL_PT, loc="outside lower center", ncols=len(SHOWN))
     turn = 0.3 * np.exp(1j * np.linspace(0, 2 * np.pi, 200))
     edge = -(1 + turn) / (1 - turn)  # of L that some factor of the disk takes to -1
     right.fill(edge.real, edge.imag, color=BAD_WASH, lw=0)

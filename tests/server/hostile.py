@@ -108,10 +108,12 @@ async def measured(url: str, token: str, server: int, messages: int) -> dict[str
         each = messages // SENDERS
         work = asyncio.gather(*(sending(address, token, each, seed) for seed in range(SENDERS)), strangers(address))
         while not work.done():
-            activities.add((await stage.next_status()).activity)
+            await asyncio.sleep(0.2)
+            activities.add(stage.status.activity)
             most_mb = max(most_mb, resident_mb(server))
         *senders, inside = await work
         lasted_s, ended = time.monotonic() - begin_s, await stage.next_status()
+        activities.add(ended.activity)
         for socket in deaf:
             socket.transport.abort()
         await asyncio.sleep(1.0)
