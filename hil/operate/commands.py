@@ -144,7 +144,7 @@ SESSION = np.dtype(
         ("progress", "<f8"),  # 0..1 of a path
         ("path_row", "<f8"),  # where on the path, in its rows; NaN off it
         ("commands", "<u8"),  # taken out of the memory so far
-        ("missed", "<i8"),  # ticks, since the loop began
+        ("missed", "<i8"),  # ticks, since the loop began, in which somebody waited for one
         ("frames", "<i8"),  # sent and received
         ("wire_ns", "<i8"),  # that these took on the wire; a frame as long as the first of its length
     ],

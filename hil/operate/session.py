@@ -20,7 +20,7 @@ from hil.operate.setpoints import Setpoints
 from hil.operate.settings import Settings
 from pkxyz_ctrl.loop import in_position
 from pkxyz_ctrl.loop.controller import Controller
-from pkxyz_ctrl.safety.modes import Mode
+from pkxyz_ctrl.safety.modes import NODE_EXPECTED, Mode
 from pkxyz_ctrl.safety.trips import Trip
 from pkxyz_ctrl.trajectory.segments import Limits
 
@@ -69,6 +69,7 @@ class Session:
         self._lease: Lease | None = None
         self._offered: np.void | None = None
         self._jog_id = -1
+        self._missed = 0
         self._known_faults = len(controller.faults)
         self._server_us: int | None = None
         self._server_says = 0
@@ -100,7 +101,7 @@ class Session:
     def wants_rows(self) -> bool:
         """Whether there is a path that one more block of rows fits into."""
         path, setpoints = self.stage.path, self.stage.setpoints
-        return path is not None and path.has_room(int(setpoints.path_row) if self._is_on_path else 0)
+        return path is not None and path.has_room(int(setpoints.path_row) if setpoints.follows(path) else 0)
 
     def server_says(self, count: int) -> None:
         """The server's sign of life: a number that is another one each time."""
@@ -357,10 +358,6 @@ class Session:
 
     # -- what is told --------------------------------------------------------------------------------------------------
 
-    @property
-    def _is_on_path(self) -> bool:
-        return self.stage.setpoints.follows(self.stage.path)
-
     def _tell(self) -> None:
         state, stage = self.state, self.stage
         setpoints, path = stage.setpoints, stage.path
@@ -369,10 +366,12 @@ class Session:
         state["homed"] = stage.is_homed
         state["running_id"] = self._job.id if self._job is not None else 0
         state["target_m"], state["uncertainty_m"] = setpoints.target_m, stage.in_position["uncertainty_m"]
-        on_path = self._is_on_path
+        on_path = setpoints.follows(path)
         state["path_row"] = setpoints.path_row if on_path else np.nan
         state["progress"] = setpoints.path_row / max(1, path.rows) if on_path and path is not None else 0.0
-        state["missed"] = stage.controller.missed_ticks
+        missed = stage.controller.missed_ticks
+        state["missed"] += (missed - self._missed) * bool(NODE_EXPECTED[stage.mode])  # else nothing waits for a tick
+        self._missed = missed
 
     def _activity(self) -> Activity:
         stage, setpoints = self.stage, self.stage.setpoints
@@ -389,7 +388,7 @@ class Session:
         verb = self._job.verb if self._job is not None else None
         if setpoints.is_stopping or verb in (Verb.STOP, Verb.ABORT):
             return Activity.STOPPING
-        if self._is_on_path:
+        if setpoints.follows(stage.path):
             return Activity.SCANNING
         return Activity.JOGGING if verb is Verb.JOG else Activity.MOVING
 

@@ -10,7 +10,7 @@ from hil.runs.run_folder import RECORDING
 from hil.server.messages import AskedWrongError
 from pkxyz_ctrl.client.protocol import Block
 from pkxyz_ctrl.loop.row import ROW
-from pkxyz_ctrl.safety.modes import Mode
+from pkxyz_ctrl.safety.modes import NODE_EXPECTED, Mode
 from pkxyz_ctrl.safety.trips import explain
 
 ROWS_MOST = 30_000
@@ -61,7 +61,8 @@ def _events(
     found = [(int(tick[n]), "mode", Mode(int(mode[n])).name) for n in changes]
     begun = np.flatnonzero(np.diff(trips, prepend=0) & trips)
     found += [(int(tick[n]), "fault", explain(int(trips[n]))) for n in begun]
-    late = np.flatnonzero(overrun)
+    waited_for = NODE_EXPECTED[np.concatenate([mode[:1], mode[:-1]])] != 0  # in FAULT, say, nobody waits for a tick
+    late = np.flatnonzero((overrun != 0) & waited_for)
     for burst in np.split(late, np.flatnonzero(np.diff(tick[late]) > burst_ticks) + 1) if len(late) else ():
         count, begin, end = int(overrun[burst].sum()), int(tick[burst[0]]), int(tick[burst[-1]])
         words = f"{count} missed" + (f", tick {begin} to {end}" if end > begin else "")

@@ -61,6 +61,7 @@ class Status:
     in_sample_axes: bool
     """whether lengths are along the sample's axes, and those are not the stage's"""
     missed_ticks: int
+    """since the loop began; not while the amplifier is off or in a fault, when nothing waits for a tick"""
     bus_load: float
     """0 to 1"""
     last_fault: str

@@ -20,12 +20,14 @@ def rig(tmp_path, monkeypatch):
     return DeskRig(tmp_path, monkeypatch)
 
 
-def recorded(folder, ticks, *, period_us=200, overrun=None, first=0):
-    """A recording of a stage that tracks; ``overrun``: ticks missed before a tick."""
+def recorded(folder, ticks, *, period_us=200, overrun=None, first=0, fault_at=None):
+    """A recording of a stage that tracks, in FAULT from ``fault_at`` on; ``overrun``: ticks missed before a tick."""
     rows = np.zeros(ticks, ROW)
     rows["tick"] = first + np.arange(ticks)
     rows["t_us"] = rows["tick"] * period_us
     rows["mode"] = Mode.TRACKING
+    if fault_at is not None:
+        rows["mode"][fault_at:] = Mode.FAULT
     rows["estimate_m"] = rows["tick"][:, None] * 1e-9
     for tick, missed in (overrun or {}).items():
         rows["overrun"][tick - first] = missed
@@ -51,6 +53,14 @@ def test_a_burst_of_missed_ticks_is_one_event_and_what_lies_apart_is_another(tmp
 def test_a_burst_ends_where_nothing_was_missed_for_a_tenth_of_a_second(tmp_path, apart, events):
     recorded(tmp_path / "run", 3000, overrun={100: 1, 100 + apart: 1})
     assert len(missed(opened(tmp_path, "run", ())[0])) == events
+
+
+def test_what_is_missed_in_a_fault_is_no_event_but_what_led_to_it_is(tmp_path):
+    """Two hundred events that said nothing, of a loop in which nobody waited for a tick."""
+    recorded(tmp_path / "run", 6000, overrun={999: 9, **dict.fromkeys(range(1001, 6000, 2), 1)}, fault_at=1000)
+    assert missed(opened(tmp_path, "run", ())[0]) == [(999, "9 missed")]
+    recorded(tmp_path / "again", 2000, overrun={1000: 12, 1700: 1}, fault_at=1000)
+    assert missed(opened(tmp_path, "again", ())[0]) == [(1000, "12 missed")]
 
 
 def test_a_slower_loop_has_fewer_ticks_in_a_burst(tmp_path):
