@@ -75,6 +75,14 @@ function show(value) {
   at("fault-words").textContent = (value.last_fault || "") + (value.saved ? `\nThe 2 s before it: ${value.saved}` : "");
   at("progress").hidden = !["scanning", "paused"].includes(value.activity);
   at("progress").value = value.progress || 0;
+  showNext();
+}
+
+/** What a person does next, on the way from off to holding. */
+function showNext() {
+  const off = status?.activity === "off", words = held && !mine ? "another client has control" : !mine ? "take control to move the stage"
+    : status?.last_fault ? "clear the fault" : off && !status.homed ? "home: the sense offsets at 0 V" : off ? "enable: close the loop" : "";
+  at("next").textContent = words;
 }
 
 function combs(value) {
@@ -104,6 +112,7 @@ function log(verb, words, state) {
 
 function showControl() {
   setting.lock(mine);
+  showNext();
   at("control").textContent = mine ? "Give control" : held ? "Another has control" : "Take control";
   at("control").disabled = held && !mine;
   for (const button of document.querySelectorAll("[data-do], #move button, #scan button[name=''], #scan button:not([name]), td button"))
