@@ -30,6 +30,7 @@ CLEARS: dict[str, str] = {
     "COMB_MISFIT": _CHANNEL,
     "COMB_FORCE": _CHANNEL,
     "FOREIGN_FRAME": "clear, once the other sender is off the bus",
+    "SAFETY_OBJECTS": "clear: they are written and read back anew",
 }
 """What ends a fault, by its name without the number of a comb or the axis."""
 

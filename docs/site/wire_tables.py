@@ -24,6 +24,7 @@ EVENTS = {
         "a frame came that only this controller may send; `foreign` names the first",
         "`start()`",
     ),
+    NodeEvent.SAFETY_OBJECTS: ("the node's signature of its safety objects is another one, or stays away", "`start()`"),
 }
 """What the supervision of the node saw, and what clears it."""
 

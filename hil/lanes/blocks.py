@@ -26,7 +26,9 @@ the intervals after them."""
 @lru_cache(maxsize=4)
 def _sampled(trajectory: Trajectory, first: int, count: int, period_us: int) -> NDArray[np.void]:
     """Rows that nobody writes to: a study runs one scan again and again."""
-    return reference_rows(trajectory.sample(first, count, period_us), first)
+    rows = reference_rows(trajectory.sample(first, count, period_us), first)
+    rows["output"] = trajectory.outputs(first, count, period_us)
+    return rows
 
 
 class Handout:

@@ -14,6 +14,7 @@ from numpy.typing import NDArray
 from hil.plant.truth import observe
 from pkxyz_ctrl.core.demand import PREDICTIVE
 from pkxyz_ctrl.loop.cycle import cycle
+from pkxyz_ctrl.loop.outputs import decide
 from pkxyz_ctrl.loop.period import Period, period_of
 from pkxyz_ctrl.loop.reference import standing_still
 from sim import kernels
@@ -24,12 +25,15 @@ RunBlock = Callable[..., None]
 """``run_block``, or another of its signature."""
 
 
-def runner_of(law: Records) -> RunBlock:
-    """What runs blocks of ticks of ``law`` (1,): ``run_block``, or where a law plans in Python the same uncompiled."""
+def runner_of(law: Records, outputs: Records | None = None) -> RunBlock:
+    """What runs blocks of ticks of ``law`` (1,): ``run_block``, or where a law plans in Python the same uncompiled;
+    ``outputs`` (1,) of ``outputs.OUTPUTS`` where there are digital ones.
+    """
     if law["tick"]["kind"][0] != PREDICTIVE:
-        runner: RunBlock = run_block
+        runner: RunBlock = run_block if outputs is None else partial(run_block_with_outputs, outputs)
         return runner
-    return partial(run_block_in_steps, period_of(law, standing_still()))
+    period = period_of(law, standing_still())
+    return partial(run_block_in_steps, period) if outputs is None else partial(run_outputs_in_steps, period, outputs)
 
 
 @njit(cache=True, error_model="numpy")
@@ -73,6 +77,36 @@ def run_block(
         rows[i] = row
 
 
+@njit(cache=True, error_model="numpy")
+def switch(seen: np.void, row: np.void, bits: int, late: int) -> None:
+    """What was sent acts at this sample, or with an adapter that is a period ``late`` what was sent before."""
+    row["terminal_output"] = bits if late == 0 else seen["output_acting"]
+    seen["output_acting"] = bits
+
+
+@njit(cache=True, error_model="numpy")
+def run_block_with_outputs(
+    outputs: Records,
+    law: Records,
+    memory: Records,
+    reference: Records,
+    plant_params: Records,
+    plant_state: Records,
+    sample_us: NDArray[np.int64],
+    rows: Records,
+    count: int,
+) -> None:
+    """``run_block`` with the node's digital outputs, (1,) of ``outputs.OUTPUTS``, which act as the voltages do."""
+    seen, row, late = memory[0]["input"], memory[0]["row"], law[0]["tick"]["delay_periods"] - 1
+    due = memory[0]["tick"]["count"][late]
+    for i in range(count):
+        switch(seen, row, outputs[0]["bits"], late)
+        exchange(plant_params, plant_state, sample_us[i], due, row, seen["sense_count"])
+        cycle(law, memory, reference)
+        decide(law, memory, outputs, reference)
+        rows[i] = row
+
+
 def run_block_in_steps(
     period: Period,
     law: Records,
@@ -91,3 +125,26 @@ def run_block_in_steps(
         exchange(plant_params, plant_state, sample_us[i], due, row, seen["sense_count"])
         period(law, memory, reference)
         rows[i] = row
+
+
+def run_outputs_in_steps(
+    period: Period,
+    outputs: Records,
+    law: Records,
+    memory: Records,
+    reference: Records,
+    plant_params: Records,
+    plant_state: Records,
+    sample_us: NDArray[np.int64],
+    rows: Records,
+    count: int,
+) -> None:
+    """``run_block_with_outputs`` with ``period`` in place of the cycle, a tick at a time."""
+    late = int(law["tick"]["delay_periods"][0]) - 1
+    for i in range(count):
+        switch(memory[0]["input"], memory[0]["row"], outputs[0]["bits"], late)
+        run_block_in_steps(
+            period, law, memory, reference, plant_params, plant_state, sample_us[i : i + 1], rows[i : i + 1], 1
+        )
+        decide(law, memory, outputs, reference)
+        rows[i] = memory[0]["row"]

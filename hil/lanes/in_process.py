@@ -66,7 +66,7 @@ def run(
     law, lost = setup.law, tuple[str, ...]()
     if lane == Lane.FAST:
         plant, memory = setup.new_plant(), new_memory(Mode.IDLE)
-        run_block = runner_of(law)
+        run_block = runner_of(law, None if setup.triggers is None else setup.new_outputs())
         run_block(law, memory, standing_still(), plant.params, plant.state, np.zeros(0, np.int64), blocks.rows, 0)
         _sample_us(setup, 0, 0)
         begin_s = time.perf_counter()

@@ -26,6 +26,7 @@ class LiveReference:
         count = trajectory.duration_us // period_us + PREVIEW_ROWS + FADE_TICKS + 1
         self._base = trajectory.sample(0, count, period_us)
         self.rows = reference_rows(self._base)
+        self.rows["output"] = trajectory.outputs(0, count, period_us)
         self._written = 0
         self._due = learner.due
         while self._written < _AHEAD:

@@ -106,12 +106,13 @@ class LockstepRig:
         self.wire = Wire(self.clock, can.nominal_bitrate_bit_per_s, can.data_bitrate_bit_per_s, setup.seed)
         self.plant = plant_of(setup.new_plant(), setup.faults, setup.bus, setup.seed)
         amplifier = self.wire.attach("amplifier")
-        self.node = wired_node(can, self.clock, amplifier.send, self.plant)
+        self.node = wired_node(can, self.clock, amplifier.send, self.plant, switch=self.plant.switch)
         amplifier.on_frame = self.node.on_frame
         latency_us = (setup.bus.delay_periods - 1) * setup.bus.period_us
         self._endpoint = self.wire.attach("controller")
         self.port: Port = WirePort(self._endpoint, self.clock, latency_us)
         self.controller = controller(setup.law.copy(), setup.bus, setup.gate, self.port.send, self.port.discard_unsent)
+        self.controller.outputs[0] = setup.new_outputs()[0]
         self.injection = _injection_of(self) if setup.faults or setup.clear_s is not None else None
         self.log = FrameLog(frame_log, can.channel) if frame_log is not None else None
         if self.log is not None:

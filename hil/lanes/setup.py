@@ -13,10 +13,12 @@ from pkxyz_ctrl.config.bus import BusConfig
 from pkxyz_ctrl.config.controller import ControllerConfig
 from pkxyz_ctrl.config.files import load
 from pkxyz_ctrl.config.stage import StageConfig
+from pkxyz_ctrl.config.triggers import TriggersConfig
 from pkxyz_ctrl.design.drive_limits import count_max, slew_counts
 from pkxyz_ctrl.design.law_store import law_of
 from pkxyz_ctrl.learning import Learner, LearningConfig, timetable
 from pkxyz_ctrl.learning.store import Stored
+from pkxyz_ctrl.loop import outputs
 from pkxyz_ctrl.safety.gate import GateConfig
 from pkxyz_ctrl.stage import Stage
 from pkxyz_ctrl.trajectory import Hold, Trajectory
@@ -49,6 +51,8 @@ class Setup:
     """the correction of ``learning.file``"""
     autostart: bool = True
     """home, enable and track without being asked"""
+    triggers: TriggersConfig | None = None
+    """what goes to the node's digital outputs, besides the bits of ``trajectory``"""
 
     @property
     def ticks(self) -> int:
@@ -80,7 +84,14 @@ class Setup:
             heartbeat_timeout_max_ms=OUR_TIMEOUT_MAX_MS,
             drive_pdo=driver.drive_pdo,
             drive_channels=driver.drive_channels,
+            digital_outputs=driver.output_id >= 0,
         )
+
+    def new_outputs(self) -> NDArray[np.void]:
+        """(1,) of ``outputs.OUTPUTS`` as the run wants them, nothing seen."""
+        fresh = np.zeros(1, outputs.OUTPUTS)
+        outputs.set_up(fresh, self.triggers, self.bus.period_s)
+        return fresh
 
     def new_learner(self) -> Learner | None:
         """One that has seen nothing yet; None for a run that doesn't learn."""

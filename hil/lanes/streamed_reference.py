@@ -68,5 +68,6 @@ def write_sampled(
 ) -> None:
     """Write rows (n,) of ``REFERENCE`` that are there: the trajectory from tick ``first`` on, with what is added."""
     write_rows(rows, trajectory.sample(first, len(rows), period_us), first)
+    rows["output"] = trajectory.outputs(first, len(rows), period_us)
     if excitation is not None:
         rows["added_m"] = excitation.sample(first, len(rows))

@@ -125,6 +125,7 @@ class WallRig:
             law, setup.bus, wall_gate(setup.gate), self.port.send, self.can_port.discard_unsent,
             lambda: self.can_port.complaint,
         )  # fmt: skip
+        self.controller.outputs[0] = setup.new_outputs()[0]
         for name, *_ in TRUTH_FIELDS:
             self.controller.memory["row"][name] = np.nan  # nobody here knows it
         self._guard_us = setup.bus.period_us // GUARDS_PER_PERIOD

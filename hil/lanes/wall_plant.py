@@ -70,7 +70,7 @@ class WallPlant:
         self.clock = Lockstep()
         self.plant = PlantOnBus(setup.new_plant()) if truth is None else WitnessedPlant(setup.new_plant(), truth)
         self._port = CanPort(bus, self.wall)
-        self.node = wired_node(can_config, self.clock, self._port.send, self.plant)
+        self.node = wired_node(can_config, self.clock, self._port.send, self.plant, switch=self.plant.switch)
         self._on_change = on_change
         self._shown = (NmtState.INITIALISING, False)
 

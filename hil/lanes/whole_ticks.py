@@ -81,6 +81,7 @@ def ordinary_ticks(
             row["position_m"][i] = seen["position_m"][i]
             row["stroke_m"][i] = seen["stroke_m"][i]
             row["comb_voltage_v"][i] = seen["comb_voltage_v"][i]
+        row["terminal_output"] = seen["terminal_output"]
     return len(rows)
 
 
@@ -214,6 +215,8 @@ def _happen(
         well = _keep(bench[0], frame)
     elif frame["can_id"] == node[0]["drive_id"]:
         well = rules.on_drive(node[0], memory, frame["length"], frame["word"], now_us)
+    elif frame["can_id"] == node[0]["output_id"]:
+        well = rules.on_digital(memory, frame["length"], frame["word"])
     elif frame["can_id"] == node[0]["consumer_id"]:
         well = rules.on_heartbeat(node[0], memory, frame["length"], frame["word"], now_us)
     else:
@@ -243,6 +246,7 @@ def _exchange(params: Records, state: Records, truth: Records, lane: np.void, me
         params, state, truth, target_us - lane["plant_us"], True, output[0], output[1], output[2]
     )
     lane["plant_us"] = target_us
+    truth[0]["terminal_output"] = memory["digital"]
 
 
 @njit(cache=True, error_model="numpy")

@@ -41,6 +41,7 @@ class NativeRig:
         self.controller = Teller(setup)
         self._feeder = PathFeeder(setup, mapped.blocks)
         self._shared = mapped.shared[0]
+        self.controller.outputs[0] = setup.new_outputs()[0]
         self._shared["config"], self._shared["memory"] = self.controller.record, self.controller.exchange
         self._state = self._shared["state"][0]
         self._process: subprocess.Popen[bytes] | None = None

@@ -9,6 +9,7 @@ from enum import IntEnum
 from pathlib import Path
 
 from hil.node.alarm import Alarm, Scheduler
+from hil.node.digital import DigitalOutputs, Switch
 from hil.node.drive import DriveReceiver, Outputs
 from hil.node.emergency import HOLD_US, EmergencyProducer, ErrorCode, FrameErrors
 from hil.node.heartbeat import HeartbeatConsumer, HeartbeatProducer
@@ -17,6 +18,7 @@ from hil.node.objects import NodeObjects
 from hil.node.pdo import PdoParameters
 from hil.node.sdo_server import SdoServer
 from hil.node.sense import Plant, SenseTransmitter
+from hil.node.signature import SIGNATURE, SignatureTransmitter, signature
 from pkxyz_ctrl.can.frame import FD_FAST, UNUSUAL, Frame
 
 BOOT_US = 2_000  # from reset to boot-up message; a small microcontroller takes a few ms
@@ -41,7 +43,7 @@ class AmplifierNode:
     ``node_id`` 1 to 127; ``turnaround_us`` from the end of the SYNC to the queueing of the sense PDO; ``fd``: send FD
     frames with bit-rate switch (both formats are accepted); ``protection``: the drive PDO must carry alive counter and
     CRC, and nothing but that PDO can set a drive count other than 0; ``error_hold_us``: how long an error in a frame
-    lasts after the last such frame.
+    lasts after the last such frame; ``switch`` is told what its digital outputs put out.
     """
 
     def __init__(
@@ -57,6 +59,7 @@ class AmplifierNode:
         protection: bool,
         boot_us: int = BOOT_US,
         error_hold_us: int = HOLD_US,
+        switch: Switch = lambda bits, t_us: None,
     ) -> None:
         if not 1 <= node_id <= 127:
             raise ValueError(f"node id {node_id}: CiA 301 allows 1 to 127")
@@ -82,6 +85,9 @@ class AmplifierNode:
         self.od = od = ObjectDictionary.from_eds(eds_path, node_id)
         self._drive_pdo = PdoParameters(od, "receive", 2, values=0x6411, protection=0x2000, protected=protection)
         self._sense_pdo = PdoParameters(od, "transmit", 2, values=0x6401, protection=0x2001, protected=protection)
+        self.digital = DigitalOutputs(od, PdoParameters.plain(od, "receive", 1, 0x6200), switch)
+        signature_pdo = PdoParameters.plain(od, "transmit", 3, 0x2020)
+        self.signature = SignatureTransmitter(od, signature_pdo, self._transmit)
         self.emergency = EmergencyProducer(od, clock, self._transmit)
         self._sync_errors = FrameErrors(self.emergency, error_hold_us)
         self._drive_errors = FrameErrors(self.emergency, error_hold_us)
@@ -91,11 +97,11 @@ class AmplifierNode:
         ]
         self._drive = DriveReceiver(od, self._drive_pdo, self._drive_errors, lambda: self.outputs)
         self._sense = SenseTransmitter(
-            od, self._sense_pdo, clock, plant, self._transmit, self._heartbeat, turnaround_us
+            od, self._sense_pdo, clock, plant, self._transmit, self._heartbeat, self.signature, turnaround_us
         )
         objects = NodeObjects(
             od,
-            (self._drive_pdo, self._sense_pdo),
+            (self._drive_pdo, self._sense_pdo, self.digital.parameters, signature_pdo),
             refresh=self._refresh,
             changed=self._configure,
             may_drive=lambda: not protection and self.state is NmtState.OPERATIONAL and not self._holds,
@@ -110,6 +116,7 @@ class AmplifierNode:
         self._holds.clear()
         self._restart(0x0000, 0xFFFF)
         self._set_outputs((0, 0, 0), self._clock.now_us)
+        self.digital.put_out(0, self._clock.now_us)
 
     def on_frame(self, frame: Frame, t_us: int) -> None:
         """A frame of somebody else has ended on the wire at ``t_us`` (now)."""
@@ -155,11 +162,13 @@ class AmplifierNode:
             self._sense.stop()
             self._drive_deadline.cancel()
             self._outputs_to_error_value()
+            self.digital.to_error_value(self._clock.now_us)
         self.state = state
         self._sync_expected = None
         if state is NmtState.OPERATIONAL:
             self._drive.start()
             self._silent_syncs = 0
+            self.signature.start()
             self._sense.start()
         self._admit()
         self.emergency.permit(state in (NmtState.PRE_OPERATIONAL, NmtState.OPERATIONAL))
@@ -191,7 +200,7 @@ class AmplifierNode:
 
     def _admit(self) -> None:
         """Rebuild the table of what is received in this state (CiA 301, table 36)."""
-        receivers: dict[int, Receiver] = {}
+        receivers = dict(self.digital.receivers) if self.state is NmtState.OPERATIONAL else {}
         if self.state is NmtState.OPERATIONAL and self._drive_pdo.in_use and not self._holds:
             synchronous = self._drive_pdo.transmission_type <= 240
             receivers[self._drive_pdo.cob_id] = self._drive.receive if synchronous else self._on_drive_event
@@ -214,6 +223,8 @@ class AmplifierNode:
             self._count_silence(t_us)
             return
         self._sync_expected = self._sync_following[data]
+        self.digital.on_sync(t_us)
+        self.signature.on_sync()
         outputs, pending = None, self._drive.pending
         if pending is not None:
             outputs = self._apply(pending, t_us)
@@ -307,6 +318,7 @@ class AmplifierNode:
     def _hold(self, code: int, info: bytes) -> None:
         self._holds.add(code)
         self._outputs_to_error_value()
+        self.digital.to_error_value(self._clock.now_us)
         self._admit()
         self.emergency.begin(code, info)
 
@@ -340,6 +352,8 @@ class AmplifierNode:
         """Bring the process image to the dictionary, which does not see every cycle."""
         if index == 0x6401 and self.state is not NmtState.OPERATIONAL:
             self._sense.counts = self._plant.exchange(self._clock.now_us, None, sample=True)
+        if index == 0x2020:
+            self.od[SIGNATURE] = signature(self.od)
         if index in (0x6401, 0x2001):
             self._sense.publish()
         elif index == 0x6411:
@@ -373,6 +387,8 @@ class AmplifierNode:
                 self._drive.start()
             case self._sense_pdo.communication | self._sense_pdo.mapping:
                 self._sense.configure()
+            case 0x6200 if self.state is NmtState.OPERATIONAL:
+                self.digital.put_out(od[0x6200, 1], self._clock.now_us)
             case 0x6411 if self.state is NmtState.OPERATIONAL:
                 self._set_outputs((od[0x6411, 1], od[0x6411, 2], od[0x6411, 3]), self._clock.now_us)
         self._admit()

@@ -26,6 +26,8 @@ class NodeAtWork:
             or node._sync_expected is None
             or not drive.is_usual
             or not sense.is_usual
+            or not node.digital.is_usual
+            or node.signature.is_waiting
             or len(watched) > _WATCHED_MOST
             or node.emergency.is_waiting
         ):
@@ -41,12 +43,15 @@ class NodeAtWork:
         m["drive_counter"], m["drive_crc"] = drive.counter, drive.crc
         m["sync_expected"] = node._sync_expected[0] if node._sync_expected else 0
         m["count"], m["sense_counter"], m["sense_crc"] = sense.counts, sense.counter, sense.crc
+        m["digital"], m["signature_left"] = node.digital.bits, node.signature.left
+        m["digital_pending"] = -1 if node.digital.pending is None else node.digital.pending
         return True
 
     def _take_settings(self) -> None:
         node, c = self._node, self.record[0]
         c["drive_id"], c["sense_id"] = node._drive_pdo.cob_id, node._sense_pdo.cob_id
         c["drive_crc_start"], c["sense_crc_start"] = crc_start(int(c["drive_id"])), crc_start(int(c["sense_id"]))
+        c["output_id"] = next(iter(node.digital.receivers), -1)
         c["sync_id"] = node.od[0x1005, 0] & 0x7FF
         c["heartbeat_id"], c["flags"] = 0x700 + node.node_id, node._flags
         c["consumer_id"], c["consumer_time_us"] = -1, 0
@@ -76,6 +81,9 @@ class NodeAtWork:
         a, b, c = m["count"].tolist()
         sense.counts = sense._sent = a, b, c
         sense.counter, sense.crc = int(m["sense_counter"]), int(m["sense_crc"])
+        digital, node.signature.left = int(m["digital_pending"]), int(m["signature_left"])
+        node.digital.bits = node.od[0x6200, 1] = int(m["digital"])
+        node.digital.pending = None if digital < 0 else digital
 
 
 def _time(due_us: int | None) -> int:

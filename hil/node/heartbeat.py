@@ -23,11 +23,15 @@ class HeartbeatProducer:
         elif period_us:
             self.alarm.set(self._clock.now_us + period_us)
 
-    def ride(self, now_us: int, cycle_us: int) -> None:
-        """A sense PDO has just been queued: go along if the next one, ``cycle_us`` from now, would be too late."""
+    def ride(self, now_us: int, cycle_us: int) -> bool:
+        """A sense PDO has just been queued: go along if the next one, ``cycle_us`` from now, would be too late. Whether
+        it does.
+        """
         due_us = self.alarm.due_us
-        if due_us is not None and now_us + cycle_us >= due_us:
-            self._beat(now_us)
+        if due_us is None or now_us + cycle_us < due_us:
+            return False
+        self._beat(now_us)
+        return True
 
     def _beat(self, now_us: int) -> None:
         self._send()

@@ -46,7 +46,7 @@ class Layout:
 class PdoParameters:
     """One PDO: communication parameter and mapping parameter in the dictionary, checked as a whole.
 
-    ``values`` is the object whose three subs are the process values, ``protection`` the one that holds the alive
+    ``values`` is the object whose ``channels`` subs are the process values, ``protection`` the one that holds the alive
     counter (sub 1) and the CRC (sub 2). With ``protected`` a mapping without both is refused.
     """
 
@@ -59,6 +59,7 @@ class PdoParameters:
         values: int,
         protection: int,
         protected: bool,
+        channels: int = 3,
     ) -> None:
         self._od = od
         self.direction = direction
@@ -66,12 +67,19 @@ class PdoParameters:
         self.mapping = self.communication + MAPPING_OFFSET
         self._protection = protection
         self._protected = protected
-        plain = tuple((values, subindex) for subindex in (1, 2, 3))
+        plain = tuple((values, 1 + n) for n in range(channels))
         self.protected_fields = (*plain, (protection, 1), (protection, 2))
         if not protected:
-            od.install(self.mapping, 0, 3)
-            od.install(self.mapping, 4, 0)
-            od.install(self.mapping, 5, 0)
+            od.install(self.mapping, 0, channels)
+            for behind in (1, 2):
+                od.install(self.mapping, channels + behind, 0)
+
+    @classmethod
+    def plain(
+        cls, od: ObjectDictionary, direction: Literal["receive", "transmit"], number: int, value: int
+    ) -> "PdoParameters":
+        """Of one value, sub 1 of ``value``, without alive counter and CRC."""
+        return cls(od, direction, number, values=value, protection=0x2000, protected=False, channels=1)
 
     @property
     def in_use(self) -> bool:

@@ -20,6 +20,7 @@ NODE = np.dtype(
         ("drive_id", "i4"),
         ("sense_id", "i4"),
         ("heartbeat_id", "i4"),
+        ("output_id", "i4"),  # of the digital outputs' PDO; -1: not in use
         ("consumer_id", "i4"),  # whose heartbeat is waited for
         ("flags", "i4"),  # of the frames that it sends
         ("drive_crc_start", "i4"),  # what the identifier and the constants of the CRC leave, for seven bytes behind it
@@ -53,6 +54,9 @@ NODE_MEMORY = np.dtype(
         ("count", "i4", (3,)),  # last sample
         ("sense_counter", "i4"),
         ("sense_crc", "i4"),
+        ("digital", "i4"),  # bits at the digital outputs ...
+        ("digital_pending", "i4"),  # ... and those that wait for the SYNC; -1: none
+        ("signature_left", "i4"),  # SYNCs until the signature is due; 0: never
     ],
     align=True,
 )
@@ -103,12 +107,14 @@ def on_drive(config: np.void, memory: np.void, length: int, word: int, t_us: int
 @njit(cache=True, error_model="numpy")
 def on_sync(config: np.void, memory: np.void, length: int, word: int, t_us: int) -> bool:
     """A SYNC: what is pending becomes the output, and a sample is due. False, and nothing is done, for one that is out
-    of step, finds nothing pending or would make too large a step.
+    of step, finds nothing pending, asks for the signature or would make too large a step.
     """
     overflow, counter = config["sync_overflow"], word & 0xFF
     if length != (1 if overflow else 0) or counter != memory["sync_expected"]:
         return False
     if memory["is_pending"] == 0 or t_us >= memory["good_us"] or memory["due_us"] != NEVER_US:
+        return False
+    if memory["signature_left"] == 1:
         return False
     pending, output, step = memory["pending"], memory["output"], config["step_max"]
     if pending[0] != 0 or pending[1] != 0 or pending[2] != 0:
@@ -119,10 +125,23 @@ def on_sync(config: np.void, memory: np.void, length: int, word: int, t_us: int)
         output[comb] = pending[comb]
     memory["sync_expected"] = counter % overflow + 1 if overflow else 0
     memory["is_pending"] = 0
+    if memory["signature_left"] > 0:
+        memory["signature_left"] -= 1
+    if memory["digital_pending"] >= 0:
+        memory["digital"], memory["digital_pending"] = memory["digital_pending"], -1
     memory["drive_deadline_us"] = t_us + config["drive_timeout_us"]
     memory["cycle_us"] = t_us - memory["sync_us"]
     memory["sync_us"] = t_us
     memory["due_us"] = t_us + config["turnaround_us"]
+    return True
+
+
+@njit(cache=True, error_model="numpy")
+def on_digital(memory: np.void, length: int, word: int) -> bool:
+    """A frame with digital outputs. False for one that has not their length."""
+    if length != 1:
+        return False
+    memory["digital_pending"] = word & 0xFF
     return True
 
 

@@ -10,6 +10,7 @@ from hil.node.drive import Outputs
 from hil.node.heartbeat import HeartbeatProducer
 from hil.node.object_dictionary import ObjectDictionary
 from hil.node.pdo import PdoParameters
+from hil.node.signature import SignatureTransmitter
 
 _pack_protected = struct.Struct("<3hBB").pack
 _INPUT = 0x6401
@@ -41,6 +42,7 @@ class SenseTransmitter:
         plant: Plant,
         send: Callable[[int, bytes], None],
         heartbeat: HeartbeatProducer,
+        signature: SignatureTransmitter,
         turnaround_us: int,
     ) -> None:
         self._od = od
@@ -49,6 +51,7 @@ class SenseTransmitter:
         self._plant = plant
         self._send = send
         self._heartbeat = heartbeat
+        self._signature = signature
         self._w0, self._w1, self._w2 = WORDS
         self.turnaround_us = turnaround_us
         self._event = Alarm(clock, self._on_event)
@@ -137,7 +140,7 @@ class SenseTransmitter:
             return  # stopped meanwhile, or overtaken by a SYNC that came too soon
         self.due_us = None
         self._transmit()
-        self._heartbeat.ride(now_us, self.cycle_us)
+        self._signature.ride(self._heartbeat.ride(now_us, self.cycle_us))
 
     def _on_event(self, now_us: int) -> None:
         self.counts = self._plant.exchange(now_us, None, sample=True)

@@ -4,6 +4,7 @@ from collections.abc import Callable
 
 from hil.node.alarm import Scheduler
 from hil.node.amplifier import AmplifierNode
+from hil.node.digital import Switch
 from hil.node.sense import Plant
 from pkxyz_ctrl.can.frame import Frame
 from pkxyz_ctrl.config.bus import CanConfig
@@ -19,9 +20,12 @@ def wired_node(
     send: Callable[[Frame], object],
     plant: Plant,
     node_type: type[AmplifierNode] = AmplifierNode,
+    switch: Switch = lambda bits, t_us: None,
 ) -> AmplifierNode:
-    """Node between ``send`` and ``plant``, not yet powered on. ``node_type``: one with a defect, say."""
+    """Node between ``send`` and ``plant``, not yet powered on. ``node_type``: one with a defect, say; ``switch`` is
+    told what its digital outputs put out.
+    """
     return node_type(
         can.driver.node_id, clock, send, plant, EDS,
-        turnaround_us=can.turnaround_us, fd=can.driver.fd, protection=can.driver.protection,
+        turnaround_us=can.turnaround_us, fd=can.driver.fd, protection=can.driver.protection, switch=switch,
     )  # fmt: skip

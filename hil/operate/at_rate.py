@@ -24,8 +24,6 @@ from hil.operate.tick_frames import TickFrames
 from pkxyz_ctrl.can.frame import Frame
 from pkxyz_ctrl.client import place
 from pkxyz_ctrl.config.bus import CanConfig
-from pkxyz_ctrl.loop import in_position
-from pkxyz_ctrl.loop.in_position import IN_POSITION
 from pkxyz_ctrl.loop.row import ROW
 from pkxyz_ctrl.stage import Stage
 from pkxyz_ctrl.trajectory.check import DriveLimits
@@ -110,7 +108,9 @@ class OperatedLoop:
         if block is not None:
             rows = np.frombuffer(block, PATH_BLOCK)[0]
             count = min(int(rows["count"]), len(rows["motion"]))
-            self._session.take_rows(int(rows["path"]), int(rows["first"]), rows["motion"][:count])
+            self._session.take_rows(
+                int(rows["path"]), int(rows["first"]), rows["motion"][:count], rows["output"][:count]
+            )
 
 
 def operate(setup: Setup, settings: Settings, name: str, files: dict[str, str], say: Callable[[str], object]) -> int:
@@ -149,17 +149,13 @@ def _session_of(setup: Setup, settings: Settings, rig: WallRig, memory: StageMem
 
 def rehearse(reach: Reach, settings: Settings) -> None:
     """Look, move, pause, follow, refuse once without a stage: what is loaded at its first use costs a tick some ms."""
-    zero = np.zeros(3)
-    in_position.look(
-        np.zeros(1, IN_POSITION)[0], np.zeros((9, 3)), zero, zero, zero, settings.window_m, settings.sigmas
-    )
     setpoints = Setpoints(500, 1, 20)
     start, near_m = np.zeros(3), np.array([0.0, 0.0, 1e-6])
     for position in (near_m, np.full(3, 1.0), np.full(3, 1e-3)):
         reach.target_refusal(position)
     reach.farthest(near_m, 0, 1.0)
     path = PathStream(1, 2, start, reach)
-    path.take(1, 0, np.zeros((2, 9)))
+    path.take(1, 0, np.zeros((2, 9)), np.zeros(2, np.int32))
     motion = setpoints.plan(near_m, settings.limits)
     reach.motion_refusal(*setpoints.looked_at(motion))
     steps: tuple[Callable[[], object], ...] = (

@@ -32,6 +32,7 @@ class Verb(IntEnum):
     SAMPLE = 17
     QUIET = 18
     LAW = 19
+    TRIGGER = 20
 
 
 MEANING: Final[dict[Verb, str]] = {
@@ -53,6 +54,7 @@ MEANING: Final[dict[Verb, str]] = {
     Verb.SAMPLE: "where the sample lies: targets and positions are in its coordinates from now on",
     Verb.QUIET: "quiet holds: less noise and less rejection while the set-point stands; or no longer",
     Verb.LAW: "another law, taken over without a jump; while the stage holds, or is off",
+    Verb.TRIGGER: "positions along an axis at which the node's digital outputs pulse; no longer, with a count of 0",
     Verb.RELEASE: "0 V at once, whatever runs; a fault that has to be cleared",
 }
 
@@ -113,6 +115,11 @@ COMMAND = np.dtype(
         ("matrix", "<f8", (3, 4)),  # SAMPLE, as of ``SampleAxes.matrix``
         ("on", "<i4"),  # QUIET
         ("law", "<u8"),  # LAW: number of the one that was offered
+        ("axis", "<i4"),  # TRIGGER: of the stage, 0 to 2 ...
+        ("direction", "<i4"),
+        ("first_m", "<f8"),
+        ("pitch_m", "<f8"),
+        ("count", "<i8"),
         ("path", "<u8"),  # PATH: number of the path whose rows are streamed ...
         ("rows", "<u8"),  # ... and how many it has
         ("start_m", "<f8", (3,)),  # ... and where it begins
@@ -156,9 +163,16 @@ TICK = np.dtype([("row", ROW), ("session", SESSION)], align=True)
 
 PATH_ROWS = 64
 PATH_BLOCK = np.dtype(
-    [("path", "<u8"), ("first", "<u8"), ("count", "<u8"), ("motion", "<f8", (PATH_ROWS, 9))], align=True
+    [
+        ("path", "<u8"),
+        ("first", "<u8"),
+        ("count", "<u8"),
+        ("motion", "<f8", (PATH_ROWS, 9)),
+        ("output", "<i4", (PATH_ROWS,)),
+    ],
+    align=True,
 )
-"""Rows of a path, as ``Trajectory.sample`` gives them."""
+"""Rows of a path, as ``Trajectory.sample`` and ``Trajectory.outputs`` give them."""
 
 
 def new_command(verb: Verb, command_id: int) -> NDArray[np.void]:

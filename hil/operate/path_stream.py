@@ -23,6 +23,7 @@ class PathStream:
         self.objection: str | None = None
         self._reach = reach
         self._kept = np.zeros((_KEPT_ROWS, 9))
+        self._outputs = np.zeros(_KEPT_ROWS, np.int64)
         self._known = 0
         self._before = np.concatenate([start_m, np.zeros(6)])
 
@@ -35,8 +36,10 @@ class PathStream:
         """Whether one more block would overwrite nothing that is still needed at ``row``."""
         return self._known + PATH_ROWS - row < _KEPT_ROWS - PATH_ROWS
 
-    def take(self, number: int, first: int, motion: Array) -> None:
-        """A block (n, 9) of the rows from ``first`` on; one of another path, or out of turn, is left aside."""
+    def take(self, number: int, first: int, motion: Array, outputs: NDArray[np.int32]) -> None:
+        """A block (n, 9) of the rows from ``first`` on, with their trigger bits (n,); one of another path, or out of
+        turn, is left aside.
+        """
         if number != self.number or first != self._known or self.objection is not None or not len(motion):
             return
         rows = np.concatenate([self._before[None], motion])
@@ -45,7 +48,8 @@ class PathStream:
             return
         self.objection = self._reach.motion_refusal(rows)
         if self.objection is None:
-            self._kept[np.arange(first, first + len(motion)) % _KEPT_ROWS] = motion
+            places = np.arange(first, first + len(motion)) % _KEPT_ROWS
+            self._kept[places], self._outputs[places] = motion, outputs
             self._before = motion[-1].copy()
             self._known = first + len(motion)
 
@@ -53,6 +57,11 @@ class PathStream:
         return min(row, self.rows) < self._known
 
     def sample(self, first: int, count: int) -> Array:
+        return self._kept[self._places(np.arange(first, first + count))]
+
+    def outputs(self, rows: NDArray[np.int64]) -> NDArray[np.int64]:
+        return self._outputs[self._places(rows)]
+
+    def _places(self, rows: NDArray[np.int64]) -> NDArray[np.int64]:
         last = min(self.rows, self._known - 1)
-        wanted = np.clip(np.arange(first, first + count), 0, max(last, 0))
-        return self._kept[wanted % _KEPT_ROWS]
+        return np.clip(rows, 0, max(last, 0)) % _KEPT_ROWS

@@ -1,7 +1,7 @@
 """The verbs that take time, each as a generator that is resumed once a tick and returns what was reached, in words."""
 
 from collections.abc import Generator
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
@@ -11,7 +11,6 @@ from hil.operate.reach import Reach
 from hil.operate.setpoints import Setpoints
 from hil.operate.settings import Settings
 from pkxyz_ctrl.loop.controller import Controller
-from pkxyz_ctrl.loop.in_position import IN_POSITION
 from pkxyz_ctrl.safety.modes import LOOP_CLOSED, MODE_FACTS, Event, Mode, refusal
 from pkxyz_ctrl.trajectory import TrajectoryError
 from pkxyz_ctrl.trajectory.segments import Limits
@@ -44,7 +43,6 @@ class Operated:
     reach: Reach
     settings: Settings
     period_s: float
-    in_position: NDArray[np.void] = field(default_factory=lambda: np.zeros(1, IN_POSITION))
     path: PathStream | None = None
     """that is being followed"""
     said: str = ""
@@ -68,9 +66,8 @@ class Operated:
     @property
     def is_in_position(self) -> bool:
         """Whether the estimate has been within the window of the target for the dwell, and the set-point is there."""
-        return self.setpoints.has_arrived and bool(
-            self.in_position["ticks"][0] * self.period_s >= self.settings.dwell_s
-        )
+        ticks = int(self.controller.outputs["position"]["ticks"][0])
+        return self.setpoints.has_arrived and 0 < ticks >= int(self.controller.outputs["dwell_ticks"][0])
 
     def where(self, position_m: Array) -> str:
         """A position (3,) of the stage in words: where on the sample."""

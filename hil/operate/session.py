@@ -11,6 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from hil.operate import law_change, procedures
+from hil.operate.aiming import aim
 from hil.operate.commands import ANSWER, SESSION, Activity, State, Verb
 from hil.operate.path_stream import PathStream
 from hil.operate.procedures import AbortedError, Lease, Operated, RefusedError, Steps
@@ -18,7 +19,7 @@ from hil.operate.reach import Reach
 from hil.operate.sample_axes import PLAIN, Turn
 from hil.operate.setpoints import Setpoints
 from hil.operate.settings import Settings
-from pkxyz_ctrl.loop import in_position
+from pkxyz_ctrl.loop import outputs
 from pkxyz_ctrl.loop.controller import Controller
 from pkxyz_ctrl.safety.modes import NODE_EXPECTED, Mode
 from pkxyz_ctrl.safety.trips import Trip
@@ -31,7 +32,7 @@ Say = Callable[[bytes], object]
 _WORDS_BYTES = ANSWER["words"].itemsize
 _MODAL = frozenset({Verb.HOME, Verb.ENABLE, Verb.CLEAR, Verb.AUTO_ZERO, Verb.PATH, Verb.LAW})
 """Begun only while nothing else runs."""
-_AT_ONCE = frozenset({Verb.SETTLE, Verb.LIMITS, Verb.SAMPLE, Verb.QUIET})
+_AT_ONCE = frozenset({Verb.SETTLE, Verb.LIMITS, Verb.SAMPLE, Verb.QUIET, Verb.TRIGGER})
 """Done within a tick."""
 _LEAST, _MOST = 1e-12, 1e6
 _SIGMAS_MOST = 10.0
@@ -58,6 +59,7 @@ class Session:
         delay = int(law["tick"]["delay_periods"][0])
         setpoints = Setpoints(period_us, delay, int(law["feed_hold_ticks"][0]))
         self.stage = Operated(controller, setpoints, reach, settings, period_us * 1e-6)
+        outputs.settle(controller.outputs, settings.window_m, settings.sigmas, settings.dwell_s, period_us * 1e-6)
         self.settings = settings
         self.state = np.zeros(1, SESSION)
         self.state["matrix"], self.state["law"] = PLAIN, law_name.encode()[: law_change.NAME_BYTES]
@@ -88,10 +90,10 @@ class Session:
         except RefusedError as refused:
             self._answer(int(command["id"]), verb, State.REFUSED, str(refused))
 
-    def take_rows(self, number: int, first: int, motion: Array) -> None:
-        """Rows (n, 9) of the path that is followed; others are left aside."""
+    def take_rows(self, number: int, first: int, motion: Array, output: NDArray[np.int32]) -> None:
+        """Rows (n, 9) of the path that is followed, and their trigger bits (n,); others are left aside."""
         if self.stage.path is not None:
-            self.stage.path.take(number, first, motion)
+            self.stage.path.take(number, first, motion, output)
 
     def offer(self, offered: np.void) -> None:
         """A law, a record of ``law_change.OFFER``, for a command that will name its number."""
@@ -118,7 +120,6 @@ class Session:
         self.now_us += self._period_us * (1 + int(row["overrun"]))
         if len(controller.faults) > self._known_faults:
             self._note_fault("\n".join(controller.faults[self._known_faults :]))
-        self._look_at_position(row)
         self._look_at_leases()
         self._job = self._step(self._job)
         self._beside = self._step(self._beside)
@@ -207,12 +208,15 @@ class Session:
         if verb is Verb.QUIET:
             self.stage.controller.hold_quietly(bool(command["on"]))
             return "holds are quiet: less noise, less rejection" if command["on"] else "holds are as stiff as moves"
+        if verb is Verb.TRIGGER:
+            return aim(self.stage.controller, command)
         window_m, dwell_s, sigmas = (float(command[name]) for name in ("window_m", "dwell_s", "sigmas"))
         if not 0.0 <= sigmas <= _SIGMAS_MOST:
             raise RefusedError(f"sigmas {sigmas:g}, limits 0 to {_SIGMAS_MOST:g}")
         if not 0.1e-9 <= window_m <= 10e-6 or not 0.0 <= dwell_s <= 10.0:
             raise RefusedError(f"window {window_m:g} m, limits 1e-10 to 1e-05 m; dwell {dwell_s:g} s, limits 0 to 10 s")
         self.settings.window_m, self.settings.dwell_s, self.settings.sigmas = window_m, dwell_s, sigmas
+        outputs.settle(self.stage.controller.outputs, window_m, sigmas, dwell_s, self.stage.period_s)
         of_it = f", {sigmas:g} standard deviations of the estimate included" if sigmas else ""
         return f"in position within {window_m * 1e9:g} nm for {dwell_s * 1e3:g} ms{of_it}"
 
@@ -326,16 +330,6 @@ class Session:
         self._beside = None
         self._answer(0, 0, State.ABORTED, words)
 
-    def _look_at_position(self, row: np.void) -> None:
-        stage, settings = self.stage, self.settings
-        state, gain = stage.in_position[0], stage.controller.law["tick"]["estimator"]["gain"][0]
-        in_position.look(
-            state, gain, stage.setpoints.target_m, row["estimate_m"], row["innovation_m"], settings.window_m,
-            settings.sigmas,
-        )  # fmt: skip
-        if not stage.is_driven:
-            state["ticks"] = 0
-
     def _look_at_leases(self) -> None:
         if self._lease is not None:
             self._lease.look(self.now_us)
@@ -360,12 +354,12 @@ class Session:
 
     def _tell(self) -> None:
         state, stage = self.state, self.stage
-        setpoints, path = stage.setpoints, stage.path
+        setpoints, path, position = stage.setpoints, stage.path, stage.controller.outputs["position"]
         state["activity"] = int(self._activity())
         state["in_position"] = stage.is_in_position and stage.is_driven
         state["homed"] = stage.is_homed
         state["running_id"] = self._job.id if self._job is not None else 0
-        state["target_m"], state["uncertainty_m"] = setpoints.target_m, stage.in_position["uncertainty_m"]
+        state["target_m"], state["uncertainty_m"] = setpoints.target_m, position["uncertainty_m"]
         on_path = setpoints.follows(path)
         state["path_row"] = setpoints.path_row if on_path else np.nan
         state["progress"] = setpoints.path_row / max(1, path.rows) if on_path and path is not None else 0.0

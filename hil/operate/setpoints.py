@@ -38,6 +38,10 @@ class Source(Protocol):
         """Whether all rows up to this one can be sampled."""
         ...
 
+    def outputs(self, rows: NDArray[np.int64]) -> NDArray[np.int64]:
+        """Trigger bits (n,) of rows (n,)."""
+        ...
+
 
 class Standing:
     """At rest at a position (3,)."""
@@ -53,6 +57,9 @@ class Standing:
     def has(self, row: int) -> bool:
         return True
 
+    def outputs(self, rows: NDArray[np.int64]) -> NDArray[np.int64]:
+        return np.zeros(len(rows), np.int64)
+
 
 class Going:
     """A motion that was planned in flight."""
@@ -67,6 +74,9 @@ class Going:
 
     def has(self, row: int) -> bool:
         return True
+
+    def outputs(self, rows: NDArray[np.int64]) -> NDArray[np.int64]:
+        return np.zeros(len(rows), np.int64)
 
 
 class Setpoints:
@@ -211,6 +221,8 @@ class Setpoints:
     def _sample(self, count: int) -> None:
         first, at = self._filled, self._filled - self._base
         write_rows(self._rows[at : at + count], self._motion(first, count), first)
+        on_path = np.array([math.floor(self._feed.at(row) + 0.5) for row in range(first, first + count)])
+        self._rows["output"][at : at + count] = self._source.outputs(on_path)
         self._filled = first + count
 
     def _motion(self, first: int, count: int) -> Array:

@@ -85,6 +85,10 @@ class PlantOnBus:
         self.plant_us = target_us
         return self.sensed
 
+    def switch(self, bits: int, t_us: int) -> None:
+        """The node's digital outputs put out ``bits`` from ``t_us`` on, which at a SYNC is when it samples."""
+        self.record["terminal_output"] = bits
+
     def look(self, t_us: int) -> None:
         """It is ``t_us``, and no sample brings the truth in ``record`` to it: bring it there."""
         self.exchange(t_us, None, sample=False)

@@ -28,5 +28,5 @@ def observe(plant: np.void, state: np.void, out: np.void) -> None:
         out["comb_voltage_v"][i] = state["voltage_v"][i]
 
 
-TRUTH_BYTES = 3 * 3 * np.dtype("f8").itemsize
-"""Length of the three fields, which end a ``ROW``."""
+TRUTH_BYTES = (3 * 3 + 1) * np.dtype("f8").itemsize
+"""Length of the three fields and of ``terminal_output``, which end a ``ROW``."""

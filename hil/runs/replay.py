@@ -22,6 +22,7 @@ from hil.runs.versions import versions
 from pkxyz_ctrl.config.controller import ControllerConfig
 from pkxyz_ctrl.config.files import read_toml
 from pkxyz_ctrl.loop import cycle as cycling
+from pkxyz_ctrl.loop.outputs import decide
 from pkxyz_ctrl.loop.period import period_of
 from pkxyz_ctrl.loop.reference import standing_still
 from pkxyz_ctrl.loop.row import CONTROLLER_FIELDS, ROW, columns
@@ -32,7 +33,7 @@ Rows = NDArray[np.void]
 
 _INPUTS = {  # of the cycle, by the row's name for them
     "request": "event", "sense_status": "sense_status", "node_events": "node_events", "overrun": "overrun",
-    "sense_count": "sense_count", "outside_trips": "trips", "quiet": "quiet",
+    "sense_count": "sense_count", "outside_trips": "trips", "quiet": "quiet", "output_acting": "output_acting",
 }  # fmt: skip
 _FOUND_OUT = int(SenseStatus.IMPLAUSIBLE)
 """Bits of the sense status that the tick itself adds."""
@@ -127,6 +128,7 @@ class _Player:
         self._memory = cycling.new_memory(Mode.IDLE)
         self._handout = Handout(scenario.trajectory, scenario.bus.period_us, learner=setup.new_learner())
         self._cycle = period_of(self._law, standing_still())
+        self._outputs = setup.new_outputs()
 
     def play(self, recorded: Rows) -> Rows:
         """The rows (n,) that the inputs of these rows (n,), which follow those of the last call, lead to."""
@@ -144,6 +146,7 @@ class _Player:
             for n in range(begin, begin + count):
                 seen[0] = inputs[n]
                 cycle(law, memory, reference)
+                decide(law, memory, self._outputs, reference)
                 replayed[n] = row[0]
             self._handout.see(replayed[begin : begin + count])
             begin += count

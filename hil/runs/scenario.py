@@ -23,6 +23,7 @@ from pkxyz_ctrl.config.bus import BusConfig
 from pkxyz_ctrl.config.controller import ControllerConfig
 from pkxyz_ctrl.config.files import ConfigError, FrozenModel
 from pkxyz_ctrl.config.stage import StageConfig
+from pkxyz_ctrl.config.triggers import TriggersConfig
 from pkxyz_ctrl.learning import LearningConfig, LearningError
 from pkxyz_ctrl.learning.learner import require_followed
 from pkxyz_ctrl.learning.store import Stored
@@ -65,7 +66,14 @@ class ScenarioConfig(FrozenModel):
     """how long after a fault decision somebody clears the fault; absent: nobody does"""
     learning: LearningConfig | None = None
     """for a reference that repeats; unset: nothing is learnt"""
+    triggers: TriggersConfig | None = None
+    """what goes to the node's digital outputs; absent: nothing"""
     checks: dict[str, Bound] = Field(default_factory=dict)
+
+    @property
+    def pixels(self) -> int | None:
+        """Of each line, for triggers; None: the reference has none."""
+        return None if self.triggers is None else self.triggers.pixels
 
     @field_validator("checks", mode="after")
     @classmethod
@@ -102,7 +110,7 @@ class Scenario:
         return Setup(
             self.stage, self.device, self.plant, self.controller, self.bus, self.trajectory,
             self.config.duration_s, self.config.seed, faults=self.config.faults, clear_s=self.config.clear_s,
-            learning=self.config.learning, stored=self.stored(),
+            learning=self.config.learning, stored=self.stored(), triggers=self.config.triggers,
         )  # fmt: skip
 
     def stored(self) -> Stored | None:
@@ -206,7 +214,7 @@ def _resolved(
         raise ConfigError("\n".join(dict.fromkeys(problems)))
     try:
         if held is None:
-            trajectory = Trajectory(in_folder(scenario.reference, source.parent))
+            trajectory = Trajectory(in_folder(scenario.reference, source.parent), scenario.pixels)
             _check_duration(source, scenario, trajectory)  # first: to look at each instant of ten hours takes minutes
         else:
             trajectory = _held_trajectory(
@@ -249,7 +257,7 @@ def _held_trajectory(scenario: ScenarioConfig, folder: Path, sha256: dict[str, s
         segment.model_copy(update={"file": table_name(n)}) if isinstance(segment, Table) else segment
         for n, segment in enumerate(scenario.reference)
     ]
-    trajectory = Trajectory(in_folder(held, folder))
+    trajectory = Trajectory(in_folder(held, folder), scenario.pixels)
     for n, segment in enumerate(trajectory.segments):
         if segment.source_sha256 != sha256.get(f"reference.{n}"):
             raise ConfigError(f"{folder}: reference.{n}: its table is not the one of the run")

@@ -15,7 +15,7 @@ from hil.operate.commands import FINAL, State, Verb
 from hil.server.client import Client, Moment
 from hil.server.designing import offer_of
 from hil.server.link import Answer, BusyError, Link
-from hil.server.messages import FIELDS, AskedWrongError, number, of_sample, shown, tag_of
+from hil.server.messages import FIELDS, AskedWrongError, number, of_sample, pixels_of, shown, tag_of, trigger_of
 from hil.server.messages import answer as answer_of
 from hil.server.opening import listed, opened, values_of
 from hil.server.paths import Feeding, Planner, StagePath
@@ -216,8 +216,8 @@ class Desk:
             raise AskedWrongError(f"there is nothing called {what!r} to do") from None
         if verb in (Verb.SAMPLE, Verb.LAW):
             raise AskedWrongError(f"{what} is asked otherwise")
-        if verb is Verb.QUIET:
-            fields["on"] = int(bool(message.get("on", True)))
+        if verb in (Verb.TRIGGER, Verb.QUIET):
+            fields = trigger_of(message) if verb is Verb.TRIGGER else {"on": int(bool(message.get("on", True)))}
         if verb is Verb.MOVE and "to" in message:
             fields["target_m"] = self._setting.position(message["to"])
         elif verb is Verb.MOVE:
@@ -239,12 +239,13 @@ class Desk:
         self._tell(Verb(verb).name.lower(), command_id, State.ACCEPTED, "")
 
     async def _planned(self, message: dict[str, Any]) -> StagePath:
+        pixels = pixels_of(message)
         if "scenario" in message:
-            return await self._plan(self._planner.of_scenario, str(message["scenario"]))
+            return await self._plan(self._planner.of_scenario, str(message["scenario"]), pixels)
         if "table" in message:
             limits = {name.replace("_m_per_s", "_max_m_per_s"): message.get(name) for name in _LIMITS}
             return await self._plan(self._planner.of_table, str(message["table"]), limits)
-        return await self._plan(self._planner.of_segments, message.get("segments"))
+        return await self._plan(self._planner.of_segments, message.get("segments"), pixels)
 
     async def _send_path(self, client: Client, message: dict[str, Any], tag: Any, stops: int) -> None:
         path = await self._planned(message)

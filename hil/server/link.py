@@ -121,11 +121,11 @@ class Link:
             raise BusyError("the loop is not there yet")
         self._laws.write(offered)
 
-    def rows(self, path: int, first: int, motion: Array) -> None:
-        """Rows (n, 9) of a path, n at most ``PATH_ROWS``."""
+    def rows(self, path: int, first: int, motion: Array, outputs: NDArray[np.int64]) -> None:
+        """Rows (n, 9) of a path and their trigger bits (n,), n at most ``PATH_ROWS``."""
         block = np.zeros(1, PATH_BLOCK)
         block["path"], block["first"], block["count"] = path, first, len(motion)
-        block["motion"][0, : len(motion)] = motion
+        block["motion"][0, : len(motion)], block["output"][0, : len(motion)] = motion, outputs
         assert len(motion) <= PATH_ROWS
         self._path.write(block.view(np.uint8).data)
 

@@ -16,6 +16,7 @@ _OF_SESSION = {"path_row": "path_row", "in_position": "in_position"}
 FIELDS = frozenset({*(name for name in ROW.names or () if ROW[name].base.kind in "fi"), *_OF_SESSION})
 """Of telemetry."""
 _URGENT_MOST = 300
+_PIXELS_MOST = 1_000_000
 _PLACES = frozenset({"reference_m", "measurement_m", "estimate_m", "position_m"})
 _WAYS = frozenset({"estimate_m_per_s", "innovation_m"})
 
@@ -67,6 +68,20 @@ def number(message: dict[str, Any], name: str, absent: float | None) -> float:
     if isinstance(value, bool) or not isinstance(value, int | float):
         raise AskedWrongError(f"{name} is a number, not {value!r}")
     return float(value)
+
+
+def pixels_of(message: dict[str, Any]) -> int:
+    """Of each line of a path, for triggers. Raises ``AskedWrongError``."""
+    return round(min(max(number(message, "pixels", 0.0), 0.0), _PIXELS_MOST))
+
+
+def trigger_of(message: dict[str, Any]) -> dict[str, Any]:
+    """Fields of a command that says at which positions the outputs pulse. Raises ``AskedWrongError``."""
+    if message.get("axis", "x") not in ("x", "y", "z"):
+        raise AskedWrongError("a trigger needs axis x, y or z")
+    numbers = {name: number(message, of, 0.0) for name, of in (("first_m", "start_m"), ("pitch_m", "pitch_m"))}
+    whole = {name: int(number(message, name, 0.0)) for name in ("count", "direction")}
+    return {"axis": "xyz".index(message.get("axis", "x")), **numbers, **whole}
 
 
 def of_sample(ticks: NDArray[np.void]) -> dict[str, NDArray[Any]]:

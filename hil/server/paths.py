@@ -21,7 +21,7 @@ from pkxyz_ctrl.config.controller import ControllerConfig
 from pkxyz_ctrl.config.files import ConfigError, FrozenModel, load, parse
 from pkxyz_ctrl.config.stage import StageConfig
 from pkxyz_ctrl.stage import Stage
-from pkxyz_ctrl.trajectory import Raster, Segment, Trajectory
+from pkxyz_ctrl.trajectory import Segment, Trajectory
 from pkxyz_ctrl.trajectory.check import DriveLimits, check_against
 from pkxyz_ctrl.trajectory.table import Table, in_folder
 
@@ -43,10 +43,9 @@ class _OfSample(Trajectory):
     itself, it stands.
     """
 
-    def __init__(self, segments: Sequence[Segment], turn: Turn) -> None:
-        super().__init__(segments)
+    def __init__(self, segments: Sequence[Segment], turn: Turn, pixels: int = 0) -> None:
+        super().__init__(segments, pixels)
         self.turn = turn
-        self.lines_a_frame = [segment.lines if isinstance(segment, Raster) else 1 for segment in segments]
         begins = [s.t_start_us for s in self.segments if s.kind not in _LEADING]
         self.begin_us = begins[0] if begins else 0
 
@@ -87,16 +86,15 @@ class StagePath:
         """Rows (count, 9)."""
         return self.trajectory.sample(self.first_tick + first, count, self.period_us)
 
+    def outputs(self, first: int, count: int) -> NDArray[np.int64]:
+        """Trigger bits (count,) of rows."""
+        return self.trajectory.outputs(self.first_tick + first, count, self.period_us)
+
     @property
     def lines(self) -> list[tuple[int, int, int]]:
         """Of each line of a raster its first and last row, and the number of its frame."""
-        found, frame = [], 0
-        for timed, lines in zip(self.trajectory.segments, self.trajectory.lines_a_frame, strict=True):
-            for n, (begin_us, end_us) in enumerate(timed.lines_us):
-                first, last = (-(-t // self.period_us) - self.first_tick for t in (begin_us, end_us))
-                found.append((first, last, frame + n // lines))
-            frame = found[-1][2] + 1 if timed.lines_us else frame
-        return found
+        rows = self.trajectory.line_rows(self.period_us) - (self.first_tick, self.first_tick, 0)
+        return [(int(first), int(last), int(frame)) for first, last, frame in rows]
 
     @property
     def backward(self) -> list[bool]:
@@ -157,19 +155,21 @@ class Planner:
         found = [self._reach.range_along(target_m, axis) for axis in range(3)]
         return [[None, None] if low_high is None else list(low_high) for low_high in found]
 
-    def of_scenario(self, name: str) -> StagePath:
-        """The reference of a shipped scenario: names only, as a client can't be let into our files."""
+    def of_scenario(self, name: str, pixels: int = 0) -> StagePath:
+        """The reference of a shipped scenario, with so many pixels on each line: names only, as a client can't be let
+        into our files.
+        """
         if "/" in name or "\\" in name or "." in name:
             raise ConfigError(f"{name!r}: the name of a shipped scenario is wanted; a file of yours is sent as a table")
         scenario = load_scenario(name)
-        return self._path(in_folder(scenario.config.reference, scenario.source.parent), name)
+        return self._path(in_folder(scenario.config.reference, scenario.source.parent), name, pixels)
 
-    def of_segments(self, segments: Any, name: str = "scan") -> StagePath:
+    def of_segments(self, segments: Any, pixels: int = 0, name: str = "scan") -> StagePath:
         """Segments as in the ``[[reference]]`` of a scenario file."""
         parsed = parse({"reference": segments}, _Segments, "the path")
         if any(isinstance(segment, Table) for segment in parsed.reference):
             raise ConfigError("the path: a table is sent by itself, not by the name of a file")
-        return self._path(parsed.reference, name)
+        return self._path(parsed.reference, name, pixels)
 
     def of_table(self, text: str, limits: dict[str, float]) -> StagePath:
         """A table of positions at instants, as the text of a CSV file."""
@@ -182,8 +182,8 @@ class Planner:
             except ConfigError as error:
                 raise ConfigError(str(error).replace(str(file), "the table")) from None
 
-    def _path(self, segments: Sequence[Segment], name: str) -> StagePath:
-        trajectory = _OfSample(segments, self.turn)
+    def _path(self, segments: Sequence[Segment], name: str, pixels: int = 0) -> StagePath:
+        trajectory = _OfSample(segments, self.turn, pixels)
         check_against(self.stage, trajectory, self._drive)
         if any(segment.jumps_us for segment in trajectory.segments):
             raise ConfigError(
@@ -210,6 +210,7 @@ class Feeding:
             if self._sent >= self.path.rows or self._sent > at + _AHEAD_ROWS:
                 break
             count = min(PATH_ROWS, self.path.rows - self._sent)
-            self._link.rows(self.number, self._sent, self.path.sample(self._sent, count))
+            path, first = self.path, self._sent
+            self._link.rows(self.number, first, path.sample(first, count), path.outputs(first, count))
             self._sent += count
         return self._sent < self.path.rows

@@ -7,6 +7,7 @@ import numpy as np
 
 from hil.operate.commands import ACTIVITY_WORDS, Activity
 from hil.operate.sample_axes import Turn
+from pkxyz_ctrl.config.triggers import BITS
 from pkxyz_ctrl.safety.modes import LOOP_CLOSED, MODE_FACTS, Mode
 
 _LOAD_OVER_US = 500_000
@@ -50,6 +51,7 @@ def status_of(tick: np.void, description: dict[str, Any], bus_load: float) -> di
         "law": session["law"].decode(errors="replace"), "quiet": bool(row["quiet"]),
         "in_sample_axes": not turn.is_plain,
         "voltage_v": voltage, "headroom_v": most_v - max(voltage), "saturated": bool(row["saturated"]),
+        "outputs": [name for name, bit in BITS.items() if int(row["output_acting"]) & bit],
         "progress": float(session["progress"]), "missed_ticks": int(session["missed"]),
         "frames": int(session["frames"]), "bus_load": round(bus_load, 4),
     }  # fmt: skip

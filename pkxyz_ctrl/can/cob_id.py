@@ -6,9 +6,11 @@ NMT = 0x000
 SYNC = 0x080
 EMCY_BASE = 0x080  # plus node id
 SENSE_BASE = 0x280  # TPDO2: analogue inputs (CiA 401)
+OUTPUT_BASE = 0x200  # RPDO1: digital outputs (CiA 401)
 DRIVE_BASE = 0x300  # RPDO2: analogue outputs (CiA 401)
 PDO_STEP = 0x100  # from one PDO of the predefined connection set to the next
 USUAL_PDO = 2
+SIGNATURE_PDO = 3  # TPDO with the signature of the safety objects
 SDO_RESPONSE_BASE = 0x580  # server to client
 SDO_REQUEST_BASE = 0x600  # client to server
 HEARTBEAT_BASE = 0x700
@@ -47,3 +49,11 @@ def drive(node_id: int, pdo: int) -> int:
 def sense(node_id: int, pdo: int) -> int:
     """Identifier of TPDO ``pdo``, 1 to 4."""
     return SENSE_BASE + (pdo - USUAL_PDO) * PDO_STEP + node_id
+
+
+def state_name(node_state: int) -> str:
+    """``pre-operational``: what a heartbeat's number means."""
+    try:
+        return NmtState(node_state).name.lower().replace("_", "-")
+    except ValueError:
+        return f"unknown state 0x{node_state:02X}"

@@ -17,6 +17,8 @@ from pkxyz_ctrl.compiled.direct_call import direct
 
 Counts = tuple[int, int, int]
 
+OUTPUT_NAMES = ("line", "pixel", "frame", "position", "in position")
+"""What the bits of the digital outputs are, in RPDO 1, the lowest first."""
 COUNTS_MIN = -32768
 COUNTS_MAX = 32767
 COUNTER_MAX = 255

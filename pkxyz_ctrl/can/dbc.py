@@ -10,7 +10,7 @@ from cantools.database.conversion import BaseConversion
 
 from . import cob_id
 from .cob_id import NmtCommand, NmtState
-from .codec import AnalogScale
+from .codec import OUTPUT_NAMES, AnalogScale
 from .driver_config import DriverConfig
 
 CONTROLLER = "Controller"
@@ -20,6 +20,7 @@ GENERATED = "generated from "
 
 _DRIVE_INDEX = 0x6411
 _SENSE_INDEX = 0x6401
+_OUTPUT_INDEX = 0x6200
 _PROTECTION = (0x2000, 0x2001)  # alive counter and CRC-8 of both process PDOs
 _SIGNED_TYPES = canopen.objectdictionary.datatypes.SIGNED_TYPES
 _FEMTO = 1e15
@@ -51,7 +52,10 @@ def database_from_eds(
         _heartbeat(AMPLIFIER, node_id),
         _heartbeat(CONTROLLER, driver.controller_node_id),
     ]
+    unused = {0x1400: driver.output_id < 0, 0x1802: driver.signature_id < 0}
     for index in dictionary:
+        if unused.get(index):
+            continue
         if 0x1400 <= index < 0x1600:
             messages.append(_pdo(dictionary, index, CONTROLLER, conversions, protected=driver.protection))
         elif 0x1800 <= index < 0x1A00:
@@ -85,6 +89,10 @@ def _pdo(
         if mapped_index in _PROTECTION and not protected:
             continue
         variable = dictionary.get_variable(mapped_index, subindex)
+        if mapped_index == _OUTPUT_INDEX:
+            signals += [Signal(f"Trigger_{_identifier(name)}", bit + n, 1) for n, name in enumerate(OUTPUT_NAMES)]
+            bit += length
+            continue
         unit, conversion = conversions.get(mapped_index, (None, BaseConversion.factory()))
         is_signed = variable.data_type in _SIGNED_TYPES
         lowest, highest = (-(1 << length - 1), (1 << length - 1) - 1) if is_signed else (0, (1 << length) - 1)

@@ -14,6 +14,7 @@ from numpy.typing import NDArray
 from pkxyz_ctrl.compiled.direct_call import direct
 
 from . import cob_id, driver_rules, start_sequence
+from .cob_id import state_name
 from .codec import Counts, ProcessCodec
 from .driver_config import DriverConfig
 from .driver_rules import (
@@ -24,6 +25,7 @@ from .driver_rules import (
     NODE_HEARTBEAT_LOST,
     NODE_NOT_OPERATIONAL,
     NODE_REBOOTED,
+    SAFETY_OBJECTS,
     DriverState,
     Failure,
 )
@@ -31,11 +33,11 @@ from .emergency import Emergency, decode_emergency
 from .frame import FD_FAST, Frame
 from .process_pdo import pdo_record
 from .sense_input import SenseInput
-from .startup import Setting, failure_words, lost, never_booted, start_record, state_name, table
+from .startup import Setting, failure_words, lost, never_booted, start_record, table
 
 __all__ = [
     "FOREIGN_FRAME", "NODE_EMERGENCY", "NODE_HEARTBEAT_LOST", "NODE_NOT_OPERATIONAL", "NODE_REBOOTED",
-    "AmplifierDriver", "DriverState",
+    "SAFETY_OBJECTS", "AmplifierDriver", "DriverState",
 ]  # fmt: skip
 
 Frames = tuple[Frame, ...]
@@ -78,9 +80,12 @@ class AmplifierDriver:
         settings: tuple[Setting, ...] = (),
         record: Records | None = None,
         memory: Records | None = None,
+        *,
+        period_us: int = 1000,
+        short_frame_us: int = 65,
     ) -> None:
         """``settings``: what the start-up goes by, in place of ``startup.table``; ``record`` and ``memory``: where they
-        are to stand.
+        are to stand. ``period_us`` of the loop; ``short_frame_us``: what a frame of one byte takes at most.
         """
         self.config = config
         self._settings = settings if settings else table(config, count_step_max)
@@ -97,9 +102,11 @@ class AmplifierDriver:
             self.drive_id: "a drive PDO",
             cob_id.SDO_REQUEST_BASE + config.node_id: "an SDO request",
             cob_id.HEARTBEAT_BASE + config.controller_node_id: "a controller's heartbeat",
+            cob_id.OUTPUT_BASE + config.node_id: "an RPDO 1",
         }
         self._flags = FD_FAST if config.fd else 0
         self._configure()
+        self.record["period_us"], self.record["short_frame_us"] = period_us, short_frame_us
         driver_rules.switch_on(self.memory)
         c, m = self.record, self.memory
         self._start = direct(start_sequence.begin, c, m, 0)
@@ -114,6 +121,9 @@ class AmplifierDriver:
         to["start"] = start_record(config, self._settings)
         to["node_id"], to["flags"] = config.node_id, self._flags
         to["our_heartbeat_id"] = cob_id.HEARTBEAT_BASE + config.controller_node_id
+        to["output_id"], to["signature_id"] = config.output_id, config.signature_id
+        to["signature_syncs"] = config.signature_syncs
+        to["heartbeat_wait_us"] = config.heartbeat_wait_us
         to["heartbeat_period_us"] = 1000 * config.controller_heartbeat_period_ms
         to["node_period_us"] = 1000 * config.node_heartbeat_period_ms
         to["node_timeout_us"] = 1000 * config.node_heartbeat_timeout_ms

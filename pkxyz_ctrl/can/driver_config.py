@@ -4,6 +4,8 @@ from typing import Annotated, Self
 
 from pydantic import BaseModel, BeforeValidator, ConfigDict, Field, PlainSerializer, model_validator
 
+from pkxyz_ctrl.can import cob_id
+
 ANY = "any"
 
 Unsigned32 = Annotated[int, Field(ge=0, le=0xFFFFFFFF)]
@@ -61,6 +63,10 @@ class DriverConfig(BaseModel):
     sense_pdo: Pdo = Field(default=2, description="number of the TPDO that carries the sense counts")
     drive_channels: Channels = Field(default=(1, 2, 3), description="sub-indices of 0x6411, comb by comb")
     sense_channels: Channels = Field(default=(1, 2, 3), description="sub-indices of 0x6401, comb by comb")
+    digital_outputs: bool = Field(default=False, description="triggers go to 0x6200:1 in RPDO 1, if the node has it")
+    signature_syncs: int = Field(
+        default=0, ge=0, le=240, description="between signatures in TPDO 3; 0: none is asked for"
+    )
 
     # One lost heartbeat is survived; the second time-out, 50 ms, bounds how long the combs keep their voltage after
     # the controller fell silent.
@@ -93,3 +99,20 @@ class DriverConfig(BaseModel):
                     f"{who}_heartbeat_period_ms = {period_ms}"
                 )
         return self
+
+    @property
+    def output_id(self) -> int:
+        """Identifier of RPDO 1 with the digital outputs; -1: there is none, or it carries the drive counts."""
+        return cob_id.OUTPUT_BASE + self.node_id if self.digital_outputs and self.drive_pdo != 1 else -1
+
+    @property
+    def signature_id(self) -> int:
+        """Identifier of TPDO 3 with the signature of the safety objects of a protected node; -1: none is asked for."""
+        is_free = self.protection and self.sense_pdo != cob_id.SIGNATURE_PDO
+        return cob_id.sense(self.node_id, cob_id.SIGNATURE_PDO) if self.signature_syncs and is_free else -1
+
+    @property
+    def heartbeat_wait_us(self) -> int:
+        """How long ours may be put off behind triggers: so long that one lost heartbeat is survived all the same."""
+        spare_ms = self.controller_heartbeat_timeout_ms - 2 * self.controller_heartbeat_period_ms
+        return 500 * max(0, spare_ms)

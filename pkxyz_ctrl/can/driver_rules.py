@@ -49,6 +49,7 @@ NODE_NOT_OPERATIONAL = 2
 NODE_REBOOTED = 4
 NODE_EMERGENCY = 8
 FOREIGN_FRAME = 16
+SAFETY_OBJECTS = 32
 
 # what ``receive`` returns, one bit each
 FRESH: Final = 1  # this tick's sense values are here
@@ -77,6 +78,12 @@ DRIVER = np.dtype(
         ("node_id", "i4"),
         ("flags", "i4"),  # of the frames that we send
         ("our_heartbeat_id", "i4"),
+        ("output_id", "i4"),  # of RPDO 1; -1: no digital outputs are asked for
+        ("signature_id", "i4"),  # of the TPDO with the node's signature of its safety objects; -1: none is asked for
+        ("signature_syncs", "i4"),  # between two of them
+        ("short_frame_us", "i8"),  # what a frame of one byte takes at most
+        ("period_us", "i8"),  # of the loop
+        ("heartbeat_wait_us", "i8"),  # how long ours may be put off
         ("heartbeat_period_us", "i8"),  # of ours
         ("node_period_us", "i8"),  # of the node's
         ("node_timeout_us", "i8"),
@@ -107,6 +114,11 @@ DRIVER_MEMORY = np.dtype(
         ("sync_overflow", "i4"),  # SYNCs count from 1 to this; 0: they don't
         ("foreign_id", "i4"),  # -1: none
         ("foreign_length", "i4"),
+        ("has_outputs", "i4"),  # 1: the node has the digital outputs that are asked for
+        ("output", "i4"),  # bits that the node was sent last
+        ("output_owed", "i4"),  # bits that rose and had to wait
+        ("signature", "i4"),  # of what was read back at the start; -1: the node does not tell it at work
+        ("signature_age", "i4"),  # SYNCs since it was told last
     ],
     align=True,
 )
@@ -142,7 +154,8 @@ def start(memory_array: Records) -> None:
     memory = memory_array[0]
     sense_input.reset(memory["sense"])
     memory["failure"] = memory["node_events"] = memory["sync_count"] = memory["drive_counter"] = 0
-    memory["node_state"] = memory["foreign_id"] = -1
+    memory["node_state"] = memory["foreign_id"] = memory["signature"] = -1
+    memory["has_outputs"] = memory["output"] = memory["output_owed"] = memory["signature_age"] = 0
     fall_silent(memory)
 
 
@@ -184,7 +197,7 @@ def release(config_array: Records, memory_array: Records, t_us: int) -> None:
             heartbeat(config_array, memory_array, t_us)
         return
     fall_silent(memory)
-    memory["state"] = RELEASING
+    memory["state"], memory["output"], memory["output_owed"] = RELEASING, 0, 0
     put_nmt(config, memory, _PRE_OPERATIONAL)
 
 
@@ -194,6 +207,10 @@ def sync(config_array: Records, memory_array: Records, t_us: int) -> None:
     config, memory = config_array[0], memory_array[0]
     watch(memory, t_us)
     sense_input.on_sync(config["sense"], memory["sense"])
+    if memory["signature"] >= 0:
+        memory["signature_age"] += 1
+        if memory["signature_age"] > 2 * config["signature_syncs"] + 2 and memory["state"] == RUNNING:
+            memory["node_events"] |= SAFETY_OBJECTS
     overflow = memory["sync_overflow"]
     if overflow == 0:
         put(config, memory, _SYNC, 0, 0)
@@ -282,6 +299,11 @@ def receive(
     elif can_id == _EMCY + node_id:
         if length == 8:
             told = _on_emergency(memory, word, t_us)
+    elif can_id == config["signature_id"]:
+        if length == 2 and word & 0xFFFF == memory["signature"]:
+            memory["signature_age"] = 0
+        elif memory["state"] == RUNNING and memory["signature"] >= 0:
+            memory["node_events"] |= SAFETY_OBJECTS
     elif _is_for_us_to_send(config, can_id):
         told = _on_foreign(config, memory, can_id, length, word)
     return told | (FRESH if sense[0]["fresh"] != 0 else 0)
@@ -289,7 +311,7 @@ def receive(
 
 @njit(cache=True, error_model="numpy")
 def _is_for_us_to_send(config: np.void, can_id: int) -> bool:
-    if can_id == _NMT or can_id == config["drive"][0]["cob_id"]:
+    if can_id == _NMT or can_id == config["drive"][0]["cob_id"] or can_id == config["output_id"]:
         return True
     return can_id == _SYNC or can_id == _SDO_OUT + config["node_id"] or can_id == config["our_heartbeat_id"]
 

@@ -11,8 +11,8 @@ from numpy.typing import NDArray
 
 from pkxyz_ctrl.can import cob_id
 
-ROWS_MOST: Final = 35
-STEPS_MOST: Final = 64
+ROWS_MOST: Final = 45
+STEPS_MOST: Final = 85
 
 # what a row is about; from COB_ID to COUNT one process PDO, in this order
 IDENTITY, TOLD, COB_ID, KIND, ENTRY, COUNT, OTHER = range(7)
@@ -21,7 +21,10 @@ IDENTIFY, ASK, READ_BACK, WRITE, COMPLETE, ON, OFF, CLEAR = range(8)
 # what was found: nothing yet, a value, or that there is no such object
 UNKNOWN, VALUE, ABSENT = range(3)
 
-ANY, MAY_DIFFER = 1, 2  # flags of a row: not compared; what is there is taken where it can't be written
+# flags of a row: not compared; what is there is taken where it can't be written; of the digital outputs; of the
+# read-back at work; read once more at the end
+ANY, MAY_DIFFER, OUTPUTS, READ_BACK_AT_WORK, AT_LAST = 1, 2, 4, 8, 16
+_GROUPS: Final = OUTPUTS | READ_BACK_AT_WORK  # which a node may lack, and is not driven by
 
 # lines of a report that stand in for an object
 SHOWN_HEARTBEAT_LOST, SHOWN_LEAVING, SHOWN_DRIVE_TIMEOUT = 1, 2, 4
@@ -42,7 +45,10 @@ ROW = np.dtype(
 START = np.dtype(
     [
         ("rows", ROW, (ROWS_MOST,)),  # first identity, revision and serial number, then what has to hold
-        ("count", "i4"),  # of them
+        ("order", "u1", (ROWS_MOST,)),  # of those that are signed, by index and sub-index
+        ("signed", "i4"),  # how many these are
+        ("signature_row", "i4"),  # which says the node's own signature; -1: none
+        ("count", "i4"),  # of the rows
         ("protection", "i4"),
         ("proven", "u4", (4,)),  # vendor, product, revision and serial number that a report is about
         ("shown", "i4"),  # bits of what it shows; 0: there is none
@@ -129,17 +135,21 @@ def plan(start: np.void, memory: np.void) -> int:
         return refused
     rows, count = start["rows"], start["count"]
     for place in range(count):
-        if rows[place]["part"] == COB_ID:
+        if rows[place]["part"] == COB_ID and _is_wanted(start, memory, place):
             _map(start, memory, place)
     for place in range(count):
         if rows[place]["part"] == OTHER and not stands(start, memory, place) and not _is_absent(start, memory, place):
             _add(memory, place, WRITE)
     for place in range(count):
-        if rows[place]["part"] == COB_ID and not _is_as_wanted(start, memory, place):
+        is_off = rows[place]["part"] == COB_ID and not _is_as_wanted(start, memory, place)
+        if is_off and _is_wanted(start, memory, place):
             _add(memory, place, ON)
     for place in range(count):
         if rows[place]["part"] >= COB_ID and not _is_absent(start, memory, place):
             _add(memory, place, ASK if rows[place]["flags"] & MAY_DIFFER else READ_BACK)
+    for place in range(count):
+        if rows[place]["flags"] & AT_LAST and memory["known"][place] != ABSENT:
+            _add(memory, place, ASK)
     return -1
 
 
@@ -207,12 +217,69 @@ def _is_absent(start: np.void, memory: np.void, place: int) -> bool:
 
 
 @njit(cache=True, error_model="numpy")
+def has_group(start: np.void, memory: np.void, group: int) -> bool:
+    """Whether all rows of a group, OUTPUTS or READ_BACK_AT_WORK, are there and stand, as was read last; False where
+    there are none.
+    """
+    asked = 0
+    for place in range(start["count"]):
+        if start["rows"][place]["flags"] & group:
+            asked = 1
+            is_there = memory["known"][place] == VALUE
+            if not is_there or (start["rows"][place]["part"] >= COB_ID and not stands(start, memory, place)):
+                return False
+    return asked != 0
+
+
+@njit(cache=True, error_model="numpy")
+def _is_wanted(start: np.void, memory: np.void, place: int) -> bool:
+    """Whether a PDO is to be mapped: that of a group only on a node that has all of it."""
+    group = start["rows"][place]["flags"] & _GROUPS
+    for other in range(start["count"]):
+        if start["rows"][other]["flags"] & group and memory["known"][other] == ABSENT:
+            return False
+    return True
+
+
+@njit(cache=True, error_model="numpy")
+def signature(start: np.void, memory: np.void) -> int:
+    """CRC-16 (polynomial 0x1021, from 0xFFFF) over what the node was found to hold of all that keeps the combs safe:
+    index, sub-index and value, little endian, in their order.
+    """
+    crc = 0xFFFF
+    for n in range(start["signed"]):
+        place = start["order"][n]
+        if memory["known"][place] == VALUE:
+            row = start["rows"][place]
+            crc = _crc16(crc, int(row["index"]) | int(row["subindex"]) << 16, 3)
+            crc = _crc16(crc, int(memory["found"][place]), int(row["size"]))
+    return crc
+
+
+@njit(cache=True, error_model="numpy")
+def is_signed(start: np.void, memory: np.void) -> bool:
+    """Whether the node can tell its signature at work, and signs what we do."""
+    if not has_group(start, memory, READ_BACK_AT_WORK):
+        return False
+    return bool(memory["found"][start["signature_row"]] == signature(start, memory))
+
+
+@njit(cache=True, error_model="numpy")
+def _crc16(crc: int, value: int, size: int) -> int:
+    for byte in range(size):
+        crc ^= (value >> 8 * byte & 0xFF) << 8
+        for _ in range(8):
+            crc = (crc << 1 ^ 0x1021) & 0xFFFF if crc & 0x8000 else crc << 1
+    return crc
+
+
+@njit(cache=True, error_model="numpy")
 def lacks(start: np.void, memory: np.void) -> int:
     """Of what is lacking and has nothing to stand in for it, the first by index; -1 if there is none."""
     refused, lowest = -1, 0x10000
     for place in range(start["count"]):
         row = start["rows"][place]
-        is_lacking = row["part"] >= COB_ID and memory["known"][place] == ABSENT
+        is_lacking = row["part"] >= COB_ID and row["flags"] & _GROUPS == 0 and memory["known"][place] == ABSENT
         if is_lacking and row["index"] < lowest and not _is_dispensable(start, memory, row["index"]):
             refused, lowest = place, row["index"]
     return refused

@@ -274,7 +274,7 @@ def _on_answer(config: np.void, memory: np.void, word: int, t_us: int) -> None:
     kind, value, is_write = sdo.kind_of(word), sdo.value_of(word), act >= WRITE
     if kind == _ABORTED and value == _TIMED_OUT:
         return  # the server has lost a transfer, too: our own time-out repeats it
-    may_refuse = act == ASK or (act == WRITE and row["flags"] & start_plan.MAY_DIFFER != 0)
+    may_refuse = act == ASK or (is_write and row["flags"] & start_plan.MAY_DIFFER != 0)
     if may_refuse and (kind == _ABORTED or (kind == _OTHER and not is_write)):
         if kind == _ABORTED and value in (_NO_OBJECT, _NO_SUBINDEX):
             _note_absent(start, place)
@@ -351,6 +351,8 @@ def _end_dialogue(config: np.void, memory: np.void, t_us: int) -> None:
         return
     if memory["sync_overflow"] != overflow:
         memory["sync_overflow"], memory["sync_count"] = overflow, 0
+    memory["has_outputs"] = 1 if start_plan.has_group(plan, start, start_plan.OUTPUTS) else 0
+    memory["signature"] = start_plan.signature(plan, start) if start_plan.is_signed(plan, start) else -1
     _start(config, memory, t_us)
 
 

@@ -4,13 +4,13 @@ What is asked and written is compiled, in ``start_plan`` and ``start_sequence``;
 """
 
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
 
 from . import cob_id, start_plan
-from .cob_id import NmtState
+from .cob_id import state_name
 from .driver_config import DriverConfig
 from .sdo import SdoStep, abort_text
 from .start_plan import ABSENT, ASK, COB_ID, COUNT, ENTRY, IDENTIFY, IDENTITY, KIND, OTHER, READ_BACK, TOLD, VALUE
@@ -32,6 +32,9 @@ _NO_HEARTBEAT = "the amplifier must produce and consume heartbeats"
 _READ_BACK = "the amplifier did not keep what was written; power it off and on, then compare it with its EDS"
 _REPORT = "try it by `pkxyz check-amplifier --allow-voltage --out DIR`, and give its report to `pkxyz run --report`"
 
+_OUTPUT_ENTRY = 0x6200_0108
+_SIGNATURE, _SIGNATURE_ENTRY = (0x2020, 1), 0x2020_0110
+_HAS_OUTPUTS = 1 << 17  # of the device type (CiA 401): whether it also has digital outputs is seen by itself
 _STOPPED = 2  # 0x1029: also a state in which the outputs take their error value
 
 HEARTBEAT_LOST, LEAVING, DRIVE_TIMEOUT = "heartbeat lost", "leaving operational", "drive time-out"
@@ -55,7 +58,7 @@ _NOTES = {
 class Setting:
     """What one object has to hold, or has to say; None: anything. ``size`` in bytes; ``part``: of ``start_plan``, what
     it is about; ``alike``: bits in which it may differ; ``may_differ``: where it can't be written, what is there is
-    taken.
+    taken; ``group``: OUTPUTS or READ_BACK_AT_WORK where it is for something that a node may lack.
     """
 
     index: int
@@ -67,6 +70,7 @@ class Setting:
     part: int = OTHER
     alike: int = 0
     may_differ: bool = False
+    group: int = 0
 
     @property
     def key(self) -> Key:
@@ -76,6 +80,7 @@ class Setting:
     def row(self) -> tuple[int, int, int, int, int, int, int]:
         """As ``start_plan.ROW`` has it."""
         flags = start_plan.ANY * (self.value is None) | start_plan.MAY_DIFFER * self.may_differ
+        flags |= self.group | (start_plan.AT_LAST if self.key == _SIGNATURE else 0)
         return self.value or 0, self.alike, self.index, self.subindex, self.size, self.part, flags
 
     def step(self, act: int) -> SdoStep:
@@ -136,6 +141,9 @@ def start_record(config: DriverConfig, rows: tuple[Setting, ...]) -> NDArray[np.
     record, proven = np.zeros(1, start_plan.START), config.proven
     to = record[0]
     to["rows"][: len(rows)], to["count"] = _records(rows), len(rows)
+    signed = sorted((s.key, place) for place, s in enumerate(rows) if s.part >= COB_ID and not s.group)
+    to["order"][: len(signed)], to["signed"] = [place for _, place in signed], len(signed)
+    to["signature_row"] = next((place for place, s in enumerate(rows) if s.key == _SIGNATURE), -1)
     to["protection"], to["retries"] = config.protection, config.retries
     if proven is not None:
         to["proven"] = proven.identity
@@ -176,9 +184,23 @@ def lost(config: DriverConfig, rows: tuple[Setting, ...], record: np.void, memor
         told.append("the report in the bus config: it is of another module, and does not count")
     refused = start_plan.lacks(record, memory)
     known = zip(rows, memory["known"], strict=False)
-    lacking = {setting.index: setting for setting, known in reversed(list(known)) if known == ABSENT}
+    lacking = {s.index: s for s, known in reversed(list(known)) if known == ABSENT and not s.group}
     spared = [s for index, s in sorted(lacking.items()) if refused < 0 or index < rows[refused].index]
+    told += _groups_lost(config, record, memory) if memory["is_planned"] else []
     return (*told, *(text for setting in spared if (text := _without(setting, config))))
+
+
+def _groups_lost(config: DriverConfig, record: np.void, memory: np.void) -> list[str]:
+    """What a node can't do that nothing depends on."""
+    told = []
+    if config.digital_outputs and not start_plan.has_group(record, memory, start_plan.OUTPUTS):
+        told.append("no digital outputs (0x6200:1) in RPDO 1: triggers and in-position are recorded, and not put out")
+    if config.signature_syncs and not start_plan.is_signed(record, memory):
+        told.append(
+            "no signature of its safety objects (0x2020) in TPDO 3: a change of them at work is not seen; frames in "
+            "our name are"
+        )
+    return told
 
 
 def refusal(rows: tuple[Setting, ...], place: int) -> str:
@@ -227,7 +249,7 @@ def _without(setting: Setting, config: DriverConfig) -> str:
 
 def _identity(config: DriverConfig) -> tuple[Setting, ...]:
     return (
-        Setting(0x1000, 0, 4, config.device_type, "device type", _SAME_DEVICE, IDENTITY),
+        Setting(0x1000, 0, 4, config.device_type, "device type", _SAME_DEVICE, IDENTITY, alike=_HAS_OUTPUTS),
         Setting(0x1018, 1, 4, config.vendor_id, "vendor", _SAME_DEVICE, IDENTITY),
         Setting(0x1018, 2, 4, config.product_code, "product code", _SAME_DEVICE, IDENTITY),
         Setting(0x1018, 3, 4, None, "revision", _SAME_DEVICE, TOLD),
@@ -295,14 +317,6 @@ def _step_words(config: DriverConfig, rows: tuple[Setting, ...], memory: np.void
     return f"{step.name} is 0x{reply:0{digits}X}, expected 0x{step.value or 0:0{digits}X}; {step.remedy}"
 
 
-def state_name(node_state: int) -> str:
-    """``pre-operational``: what a heartbeat's number means."""
-    try:
-        return NmtState(node_state).name.lower().replace("_", "-")
-    except ValueError:
-        return f"unknown state 0x{node_state:02X}"
-
-
 def mapping(
     value_index: int, protection_index: int, protection: bool, channels: tuple[int, int, int] = (1, 2, 3)
 ) -> tuple[int, ...]:
@@ -318,16 +332,36 @@ def _pdos(config: DriverConfig) -> tuple[Setting, ...]:
     sense_entries = mapping(0x6401, 0x2001, guarded, config.sense_channels)
     drive = _pdo(0x1400 + config.drive_pdo - 1, cob_id.drive(node, config.drive_pdo), drive_entries, "drive PDO")
     sense_id = cob_id.COB_ID_NO_RTR | cob_id.sense(node, config.sense_pdo)
-    return (*drive, *_pdo(0x1800 + config.sense_pdo - 1, sense_id, sense_entries, "sense PDO"))
+    sense = _pdo(0x1800 + config.sense_pdo - 1, sense_id, sense_entries, "sense PDO")
+    outputs = _outputs(config) if config.output_id >= 0 else ()
+    return (*drive, *sense, *outputs, *(_signature(config) if config.signature_id >= 0 else ()))
 
 
-def _pdo(communication: int, pdo_cob_id: int, entries: tuple[int, ...], what: str) -> tuple[Setting, ...]:
+def _outputs(config: DriverConfig) -> tuple[Setting, ...]:
+    """Digital outputs and their PDO: what a node has not of it, it goes without."""
+    pdo = _pdo(0x1400, config.output_id, (_OUTPUT_ENTRY,), "PDO of the digital outputs")
+    outputs = Setting(0x6200, 1, 1, None, "digital outputs 1 to 8", "", TOLD, group=start_plan.OUTPUTS)
+    return (outputs, *(replace(setting, may_differ=True, group=start_plan.OUTPUTS) for setting in pdo))
+
+
+def _signature(config: DriverConfig) -> tuple[Setting, ...]:
+    """The node's signature of its safety objects, and its PDO, every so many SYNCs."""
+    pdo_cob_id = cob_id.COB_ID_NO_RTR | config.signature_id
+    communication = 0x1800 + cob_id.SIGNATURE_PDO - 1
+    pdo = _pdo(communication, pdo_cob_id, (_SIGNATURE_ENTRY,), "PDO of the signature", config.signature_syncs)
+    own = Setting(0x2020, 1, 2, None, "signature of the safety objects", "", TOLD, group=start_plan.READ_BACK_AT_WORK)
+    return (own, *(replace(setting, may_differ=True, group=start_plan.READ_BACK_AT_WORK) for setting in pdo))
+
+
+def _pdo(
+    communication: int, pdo_cob_id: int, entries: tuple[int, ...], what: str, every: int = cob_id.SYNCHRONOUS_EVERY_SYNC
+) -> tuple[Setting, ...]:
     """Parameters of one process PDO, in the order of ``start_plan``'s parts."""
-    mapped, every = communication + 0x200, cob_id.SYNCHRONOUS_EVERY_SYNC
+    mapped = communication + 0x200
     mapping_of = f"mapping of the {what}"
     return (
         Setting(communication, 1, 4, pdo_cob_id, f"COB-ID of the {what}", _NO_401, COB_ID, cob_id.COB_ID_NO_RTR),
-        Setting(communication, 2, 1, every, f"{what} on every SYNC", _NO_401, KIND),
+        Setting(communication, 2, 1, every, f"{what} on every SYNC" if every == 1 else f"{what}, type", _NO_401, KIND),
         *(
             Setting(mapped, place, 4, entry, mapping_of, _NO_401 if place <= 3 else _NO_PROTECTION, ENTRY)
             for place, entry in enumerate(entries, 1)

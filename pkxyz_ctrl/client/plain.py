@@ -71,6 +71,7 @@ class Stage:
     jog = _waited(AsyncStage.jog)
     follow = _waited(AsyncStage.follow)
     preview = _waited(AsyncStage.preview)
+    trigger_at = _waited(AsyncStage.trigger_at)
     pause = _waited(AsyncStage.pause)
     resume = _waited(AsyncStage.resume)
     abort = _waited(AsyncStage.abort)

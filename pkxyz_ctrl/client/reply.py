@@ -53,6 +53,8 @@ class Status:
     voltage_v: NDArray[np.float64]
     """(3,), of the combs"""
     headroom_v: float
+    outputs: tuple[str, ...]
+    """of the node's digital outputs those that are 1: line, pixel, frame, position, in position"""
     progress: float
     """0 to 1 of a path"""
     law: str
@@ -77,6 +79,7 @@ class Status:
             values[name] = np.array([np.nan if v is None else v for v in values[name] or [None] * 3], np.float64)
         low_high = [[np.nan if v is None else v for v in pair] for pair in values["range_m"] or [[None] * 2] * 3]
         values["range_m"] = np.array(low_high, np.float64)
+        values["outputs"] = tuple(values["outputs"] or ())
         plain: dict[str, Any] = {"homed": False, "driven": False, "in_position": False, "missed_ticks": 0}
         plain |= {"quiet": False, "in_sample_axes": False}
         plain |= dict.fromkeys(("t_s", "headroom_v", "progress", "bus_load"), 0.0)

@@ -15,6 +15,12 @@ PATH_ROW = "path_row"
 """Field of telemetry: where on the path the set-point is, in its rows; NaN off it."""
 
 
+def limits_of(v: float | None, a: float | None, j: float | None) -> dict[str, float]:
+    """Of velocity, acceleration and jerk those that are given, as the server is told them."""
+    limits = {"velocity_m_per_s": v, "acceleration_m_per_s2": a, "jerk_m_per_s3": j}
+    return {key: value for key, value in limits.items() if value is not None}
+
+
 def path_of(
     scenario: str | None, segments: Sequence[Mapping[str, Any]] | None, table_csv: str | None, limits: dict[str, float]
 ) -> dict[str, Any]:

@@ -12,7 +12,7 @@ from pkxyz_ctrl.client import place
 from pkxyz_ctrl.client.connection import FINAL, Connection
 from pkxyz_ctrl.client.protocol import Block
 from pkxyz_ctrl.client.reply import Command, NoStageError, StageError, Status
-from pkxyz_ctrl.client.scan import PATH_ROW, Frames, PathPreview, ScanFrame, path_of
+from pkxyz_ctrl.client.scan import PATH_ROW, Frames, PathPreview, ScanFrame, limits_of, path_of
 from pkxyz_ctrl.client.settings import Metres, Point, StageSettings, who
 from pkxyz_ctrl.client.trigger import Trigger, beginning, column_of
 
@@ -80,7 +80,7 @@ class AsyncStage:
         ``wait``: until the stage is in position, else until the move has begun. Raises ``RefusedError`` for what the
         combs can't hold, before anything moves.
         """
-        limits = _limits(velocity_m_per_s, acceleration_m_per_s2, jerk_m_per_s3)
+        limits = limits_of(velocity_m_per_s, acceleration_m_per_s2, jerk_m_per_s3)
         return await self._done("move", wait=wait, x_m=x, y_m=y, z_m=z, relative=False, **limits)
 
     async def move_by(
@@ -95,7 +95,7 @@ class AsyncStage:
         wait: bool = True,
     ) -> Command:
         """Go by a way, in m, from the present target."""
-        limits = _limits(velocity_m_per_s, acceleration_m_per_s2, jerk_m_per_s3)
+        limits = limits_of(velocity_m_per_s, acceleration_m_per_s2, jerk_m_per_s3)
         return await self._done("move", wait=wait, x_m=x, y_m=y, z_m=z, relative=True, **limits)
 
     async def ended(self, command: Command) -> Command:
@@ -125,13 +125,15 @@ class AsyncStage:
         velocity_m_per_s: float = 0.5e-3,
         acceleration_m_per_s2: float = 0.5,
         jerk_m_per_s3: float = 300.0,
+        pixels: int = 0,
         wait: bool = True,
     ) -> Command:
         """Follow the path of a shipped scenario, of segments as in a scenario file, or of a table (the text of a CSV
-        file, whose limits are the three below). The stage goes to its first point before.
+        file, whose limits are the three below). The stage goes to its first point before. Lines and frames of a raster
+        trigger the node's digital outputs, and ``pixels`` of each line.
         """
-        limits = _limits(velocity_m_per_s, acceleration_m_per_s2, jerk_m_per_s3)
-        return await self._done("path", wait=wait, **path_of(scenario, segments, table_csv, limits))
+        limits = limits_of(velocity_m_per_s, acceleration_m_per_s2, jerk_m_per_s3)
+        return await self._done("path", wait=wait, pixels=pixels, **path_of(scenario, segments, table_csv, limits))
 
     async def preview(
         self,
@@ -146,8 +148,17 @@ class AsyncStage:
         """What ``follow`` would do: how long it takes, and where it leads. Nothing moves, and it needs no control.
         Raises ``RefusedError`` for what the combs can't follow.
         """
-        limits = _limits(velocity_m_per_s, acceleration_m_per_s2, jerk_m_per_s3)
+        limits = limits_of(velocity_m_per_s, acceleration_m_per_s2, jerk_m_per_s3)
         return PathPreview.of(await self._connection.preview(path_of(scenario, segments, table_csv, limits)))
+
+    async def trigger_at(
+        self, axis: Axis, start_m: Metres, pitch_m: float, count: int, direction: Literal[-1, 0, 1] = 0
+    ) -> Command:
+        """From now on pulse a digital output of the node, for one period, where the stage passes one of ``count``
+        positions along one of its own axes, to larger (1) or smaller (-1) coordinates or both; of 0: no longer.
+        """
+        where: dict[str, Any] = {"axis": axis, "start_m": start_m, "pitch_m": pitch_m}
+        return await self._done("trigger", count=count, direction=direction, **where)
 
     async def pause(self) -> Command:
         """Stop on the path, without leaving it."""
@@ -189,7 +200,7 @@ class AsyncStage:
 
     async def limits(self, *, velocity_m_per_s: float, acceleration_m_per_s2: float, jerk_m_per_s3: float) -> Command:
         """Of moves that name none, for each axis."""
-        return await self._set("limits", **_limits(velocity_m_per_s, acceleration_m_per_s2, jerk_m_per_s3))
+        return await self._set("limits", **limits_of(velocity_m_per_s, acceleration_m_per_s2, jerk_m_per_s3))
 
     async def set_sample(
         self,
@@ -314,8 +325,8 @@ class AsyncStage:
         fields: Sequence[str] = ("reference_m", "estimate_m"),
         pixels: int = 128,
     ) -> AsyncIterator[ScanFrame]:
-        """Follow a scan and give each of its frames as soon as its last line is over. Raises ``StageError`` for a path
-        without lines, or where rows were lost.
+        """Follow a scan, whose pixels trigger the node's digital outputs, and give each of its frames as soon as its
+        last line is over. Raises ``StageError`` for a path without lines, or where rows were lost.
         """
         path = path_of(scenario, segments, None, {})
         shown = await self._connection.preview(path)
@@ -326,7 +337,7 @@ class AsyncStage:
         command: Command | None = None
         async for block in self.telemetry(PATH_ROW, *fields):
             if command is None:  # now that we listen
-                command = await self._done("path", wait=False, **path)
+                command = await self._done("path", wait=False, pixels=pixels, **path)
                 continue
             if block.lost:
                 raise StageError("rows were lost, as this program was too slow: ask for fewer fields")
@@ -388,8 +399,3 @@ def connect_async(
         url, token = found["url"], token or found["token"]
     url, _, behind = url.partition("#")
     return AsyncStage(url, token or behind, control=control)
-
-
-def _limits(v: float | None, a: float | None, j: float | None) -> dict[str, float]:
-    limits = {"velocity_m_per_s": v, "acceleration_m_per_s2": a, "jerk_m_per_s3": j}
-    return {key: value for key, value in limits.items() if value is not None}

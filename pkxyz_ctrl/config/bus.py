@@ -1,5 +1,6 @@
 """How the controller talks to the amplifier: rate, bus, scales."""
 
+import math
 from typing import Annotated, Self
 
 from pydantic import Field, model_validator
@@ -32,6 +33,15 @@ class CanConfig(FrozenModel):
     heartbeat_deadline_us: Annotated[int, Field(gt=0)]
     """After the start of a tick: until when a drive frame and our heartbeat behind it end before the next SYNC."""
     driver: DriverConfig
+
+    @property
+    def short_frame_us(self) -> int:
+        """What a frame of one byte takes at most, with all stuff bits that there can be (ISO 11898-1:2015, 10.4)."""
+        if self.data_bitrate_bit_per_s is None:
+            bits, fast_s = 65, 0.0
+        else:
+            bits, fast_s = 33, 44 / self.data_bitrate_bit_per_s
+        return math.ceil((bits / self.nominal_bitrate_bit_per_s + fast_s) * 1e6)
 
     @model_validator(mode="after")
     def _rates_match(self) -> Self:

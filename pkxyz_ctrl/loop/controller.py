@@ -19,7 +19,7 @@ from pkxyz_ctrl.can.startup import Setting
 from pkxyz_ctrl.compiled.direct_call import direct
 from pkxyz_ctrl.config.bus import BusConfig, CanConfig
 from pkxyz_ctrl.core.demand import PREDICTIVE
-from pkxyz_ctrl.loop import exchange
+from pkxyz_ctrl.loop import exchange, outputs
 from pkxyz_ctrl.loop.exchange import BLOCKED, EXCHANGE, EXCHANGE_MEMORY, NOT_RESTARTED, RESTARTED
 from pkxyz_ctrl.loop.period import period_of
 from pkxyz_ctrl.loop.reference import REFERENCE, standing_still
@@ -49,7 +49,8 @@ class Controller:
     before follows a fault decision; ``port_complaint`` says, as ``; ...``, what stands in the way of frames.
     ``faults`` collects a sentence for each fault decision. ``record`` (1,) of ``exchange.EXCHANGE`` is all that it goes
     by, ``exchange`` (1,) of ``EXCHANGE_MEMORY`` all that it remembers; ``memory`` (1,) of ``cycle.MEMORY`` is the
-    cycle's part of that, ``row`` the bytes of its latest record. ``settings``: what the start-up goes by, in place of
+    cycle's part of that, ``outputs`` (1,) of ``outputs.OUTPUTS`` what the digital outputs go by, ``row`` the bytes of
+    its latest record. ``settings``: what the start-up goes by, in place of
     ``startup.table``.
     """
 
@@ -68,10 +69,12 @@ class Controller:
         self.can: CanConfig = bus.can
         self.record, self.exchange = np.zeros(1, EXCHANGE), np.zeros(1, EXCHANGE_MEMORY)
         self.law, self.memory = part(self.record, "law"), part(self.exchange, "cycle")
+        self.outputs = part(self.exchange, "outputs")
         self.law[0] = law[0]
         self.driver = AmplifierDriver(
-            bus.can.driver, gate.count_slew_max, settings, part(self.record, "driver"), part(self.exchange, "driver")
-        )
+            bus.can.driver, gate.count_slew_max, settings, part(self.record, "driver"), part(self.exchange, "driver"),
+            period_us=bus.period_us, short_frame_us=bus.can.short_frame_us,
+        )  # fmt: skip
         self.gate = TransmitGate(gate, part(self.record, "gate"), part(self.exchange, "gate"))
         exchange.switch_on(self.exchange)
         self.faults: list[str] = []
@@ -101,10 +104,13 @@ class Controller:
             direct(exchange.hand_over, self.exchange, 0),
             direct(exchange.take_over, self.exchange, 0),
         )
+        decide = direct(outputs.decide, self.law, self.memory, self.outputs, self._reference)
 
         def planning(config: Records, memory: Records, reference: Records, overrun: int) -> Any:
             was = hand_over(memory, overrun)
-            cycle(part(config, "law"), part(memory, "cycle"), reference)
+            law, inner = part(config, "law"), part(memory, "cycle")
+            cycle(law, inner, reference)
+            decide(law, inner, part(memory, "outputs"), reference)
             return take_over(memory, was)
 
         return planning

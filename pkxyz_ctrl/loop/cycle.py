@@ -45,8 +45,9 @@ INPUT = np.dtype(
         ("node_events", "i4"),
         ("overrun", "i4"),
         ("sense_count", "i4", (3,)),
-        ("trips", "i8"),  # Trip bits raised outside: a frame that the gate blocked, an operator's stop
         ("quiet", "i4"),  # 1: an operator asks for quiet holds, until it is 0 again
+        ("trips", "i8"),  # Trip bits raised outside: a frame that the gate blocked, an operator's stop
+        ("output_acting", "i4"),  # bits that the node's digital outputs were sent, as of this SYNC
     ],
     align=True,
 )
@@ -91,8 +92,8 @@ MEMORY = np.dtype(
         ("feed", "i4"),  # feed_hold.SLOWING, STEADY, STARTING
         ("feed_age", "i4"),
         ("landing_from", "f8", (9,)),  # row at which the way down began, where this tick's force begins to act
-        ("landing_age", "i4"),  # ticks of it that have passed
         ("landed_by", "i8"),  # Trip bits for which the stage is led down; 0: it was asked for
+        ("landing_age", "i4"),  # ticks of the way down that have passed
         ("held", "i4"),  # 1: somebody asked to hold, and the automatic start leaves it at that
         ("tick", tick.MEMORY),  # last, as in it what only some laws have
     ],
@@ -330,7 +331,7 @@ def _write_row(law: np.void, memory: np.void, trips: int, saturated: int) -> Non
     row["node_events"], row["overrun"], row["saturated"] = seen["node_events"], seen["overrun"], saturated
     row["active_set_steps"] = state["active_set_steps"]
     row["solver_iterations"] = state["solver_iterations"]
-    row["quiet"] = seen["quiet"]
+    row["quiet"], row["output_acting"] = seen["quiet"], seen["output_acting"]
     adapts = law["tick"]["adaptation"]["on"] != 0
     row["warning"] = state["adaptation"]["cause"] if adapts else 0
     row["warning_share"] = state["adaptation"]["change"] if adapts else 0.0

@@ -26,6 +26,7 @@ from pkxyz_ctrl.can.driver_rules import (
 from pkxyz_ctrl.can.other_traffic import TRAFFIC, forget, note
 from pkxyz_ctrl.can.sense_input import take
 from pkxyz_ctrl.loop import cycle as cycling
+from pkxyz_ctrl.loop import outputs
 from pkxyz_ctrl.safety import gate_rules
 from pkxyz_ctrl.safety.gate_rules import GATE, GATE_MEMORY, check
 from pkxyz_ctrl.safety.modes import NODE_EXPECTED, Event, Mode, next_mode
@@ -48,6 +49,7 @@ EXCHANGE_MEMORY = np.dtype(
         ("restart_due", "i4"),  # 1: the fault is cleared, driver and node start anew
         ("is_restarting", "i4"),  # 1: that start is not done yet
         ("missed_ticks", "i4"),  # skipped, late on the wire, or without the sample that the node owed
+        ("outputs", outputs.OUTPUTS, (1,)),
         ("cycle", cycling.MEMORY, (1,)),  # last, as in it what only some laws have
     ],
     align=True,
@@ -62,6 +64,7 @@ NOT_RESTARTED: Final = 1 << 10
 
 _CLEAR, _GATE_BLOCKED = int(Event.CLEAR), int(Trip.GATE_BLOCKED)
 _FOUND, _READY, _LOST = int(Event.NODE_FOUND), int(Event.NODE_READY), int(Event.NODE_LOST)
+_SIGNATURE_TICKS: Final = 4  # in which it may come: when it is due, and a tick or two behind
 _BOOT, _IDLE, _FAULT = int(Mode.BOOT), int(Mode.IDLE), int(Mode.FAULT)
 
 
@@ -173,6 +176,7 @@ def period(config_array: Records, memory_array: Records, reference: Records, ove
     memory = memory_array[0]
     was = hand_over(memory_array, overrun)
     cycling.cycle(config_array[0]["law"], memory["cycle"], reference)
+    outputs.decide(config_array[0]["law"], memory["cycle"], memory["outputs"], reference)
     return take_over(memory_array, was)
 
 
@@ -195,6 +199,7 @@ def hand_over(memory_array: Records, overrun: int) -> int:
         memory["blocked"] = 0
     seen["event"], seen["sense_status"] = memory["event"], status
     seen["node_events"], seen["overrun"] = driver["node_events"], overrun
+    seen["output_acting"] = driver["output"]
     for i in range(3):
         seen["sense_count"][i] = memory["driver"][0]["sense"][0]["count"][i]
     return mode
@@ -214,8 +219,9 @@ def take_over(memory_array: Records, was: int) -> int:
 
 @njit(cache=True, error_model="numpy")
 def finish(config_array: Records, memory_array: Records, t_us: int, heartbeat_until_us: int) -> int:
-    """The voltages of this period, and our heartbeat behind them if it is due and still fits before the next SYNC. A
-    voltage that the gate blocks becomes 0 V under the same alive counter. Returns the number of frames.
+    """The voltages of this period; behind them, as far as there is room before the next SYNC, new digital outputs and
+    our heartbeat if it is due. A voltage that the gate blocks becomes 0 V under the same alive counter. Returns the
+    number of frames.
     """
     config, memory = config_array[0], memory_array[0]
     driver, count = memory["driver"][0], memory["cycle"][0]["tick"]["count"]
@@ -227,11 +233,61 @@ def finish(config_array: Records, memory_array: Records, t_us: int, heartbeat_un
         drive(config["driver"], memory["driver"], 0, 0, 0)
         if judge_one(config, memory, driver["out"][1], t_us) != 0:
             driver["outgoing"] = 1
-    if driver["heartbeat_next_us"] <= t_us <= heartbeat_until_us:
-        first = driver["outgoing"]
+    first, sent = driver["outgoing"], 0
+    if memory["cycle"][0]["mode"] >= _IDLE and memory["cycle"][0]["mode"] != _FAULT and told & BLOCKED == 0:
+        room = _short_frames(config["driver"][0], driver, memory["begun_us"], t_us, heartbeat_until_us)
+        bits = memory["outputs"][0]["bits"]
+        sent = _put_outputs(config["driver"], memory["driver"], bits, t_us, room)
+    if _is_signature_near(config["driver"][0], driver):
+        sent += 1
+    last_us = heartbeat_until_us - sent * config["driver"][0]["short_frame_us"]
+    if driver["heartbeat_next_us"] <= t_us <= last_us:
         driver_rules.heartbeat(config["driver"], memory["driver"], t_us)
-        told |= judge(config, memory, first, t_us)
+    told |= judge(config, memory, first, t_us)
     return told & BLOCKED | driver["outgoing"]
+
+
+@njit(cache=True, error_model="numpy")
+def _short_frames(config: np.void, memory: np.void, begun_us: int, t_us: int, until_us: int) -> int:
+    """How many frames of one byte still fit behind a drive frame that is sent at ``t_us``, of which the first had to be
+    sent by ``until_us``; the node's heartbeat and signature, where they are due in the period that began at
+    ``begun_us``, left out.
+    """
+    if _is_signature_near(config, memory):
+        until_us -= config["short_frame_us"]
+    if t_us > until_us:
+        return 0
+    room: int = 1 + (until_us - t_us) // config["short_frame_us"]
+    ahead_us = memory["node_heartbeat_us"] + config["node_period_us"] - begun_us
+    return room - 1 if -config["period_us"] < ahead_us <= 2 * config["period_us"] else room
+
+
+@njit(cache=True, error_model="numpy")
+def _is_signature_near(config: np.void, memory: np.void) -> bool:
+    """Whether the node may send its signature in this period, or would have to: one that is lost is not waited for."""
+    every, age = config["signature_syncs"], memory["signature_age"]
+    return bool(memory["signature"] >= 0 and age >= every - 1 and (age + 1) % every < _SIGNATURE_TICKS)
+
+
+@njit(cache=True, error_model="numpy")
+def _put_outputs(config_array: Records, memory_array: Records, bits: int, t_us: int, room: int) -> int:
+    """RPDO 1 with what the digital outputs are to be from the next SYNC on, where that is something new and there is
+    ``room`` for it. Our heartbeat, if it is due, waits for it as long as it may. A bit that rose and found no room goes
+    out in the next tick, however short it was. Returns how many frames there are: 0 or 1.
+    """
+    config, memory = config_array[0], memory_array[0]
+    if memory["has_outputs"] == 0 or memory["state"] != RUNNING:
+        return 0
+    bits |= memory["output_owed"]
+    if bits == memory["output"]:
+        return 0
+    is_heartbeat_first = t_us - memory["heartbeat_next_us"] >= config["heartbeat_wait_us"]
+    if room < (2 if is_heartbeat_first else 1):
+        memory["output_owed"] |= bits & ~memory["output"]
+        return 0
+    driver_rules.put(config, memory, config["output_id"], 1, bits)
+    memory["output"], memory["output_owed"] = bits, 0
+    return 1
 
 
 @njit(cache=True, error_model="numpy")

@@ -9,6 +9,7 @@ REFERENCE = np.dtype(
         ("motion", "f8", (9,)),  # position m, velocity m/s, acceleration m/s2 of x, y, z, a learnt shift included
         ("added_m", "f8", (3,)),  # excitation: added to what is measured while tracking
         ("asked_m", "f8", (3,)),  # the position without the learnt shift
+        ("output", "i8"),  # bits of the node's digital outputs there, of ``triggers``
     ],
     align=True,
 )
@@ -40,6 +41,7 @@ def write_rows(rows: NDArray[np.void], motion: NDArray[np.float64], first_tick: 
     rows["motion"] = motion
     rows["added_m"] = 0.0
     rows["asked_m"] = motion[:, 0:3]
+    rows["output"] = 0
 
 
 def standing_still() -> NDArray[np.void]:

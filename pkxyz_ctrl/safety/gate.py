@@ -28,7 +28,8 @@ class GateConfig:
     per drive frame. ``spacing_min_us`` is the shortest time between two drive frames; None: half a period, so that
     jitter passes and a second frame in the same tick does not. ``fd``: the bus can carry FD frames. Time-outs that are
     written to the node may be at most ``heartbeat_timeout_max_ms``. The drive frame is that of RPDO ``drive_pdo``, and
-    carries channels ``drive_channels`` of 0x6411. Raises ValueError if a value is out of range.
+    carries channels ``drive_channels`` of 0x6411. ``digital_outputs``: RPDO 1 may carry 0x6200:1. Raises ValueError if
+    a value is out of range.
     """
 
     count_max: int
@@ -42,6 +43,7 @@ class GateConfig:
     heartbeat_timeout_max_ms: int = 1000
     drive_pdo: int = 2
     drive_channels: tuple[int, int, int] = (1, 2, 3)
+    digital_outputs: bool = False
 
     def __post_init__(self) -> None:
         ranges = {
@@ -72,6 +74,7 @@ class GateConfig:
         to["spacing_us"] = self.period_us // 2 if self.spacing_min_us is None else self.spacing_min_us
         to["drive_id"] = 0x100 + 0x100 * self.drive_pdo + self.node_id  # predefined connection set
         to["drive_length"] = 8 if self.protection else 6
+        to["output_id"] = 0x200 + self.node_id if self.digital_outputs else -1
         to["sdo_id"] = 0x600 + self.node_id
         to["heartbeat_id"] = 0x700 + self.controller_node_id
         to["crc_start"] = crc_start(int(to["drive_id"]))
@@ -80,7 +83,7 @@ class GateConfig:
             writes[name] = getattr(self, name)
         writes["timeout_max_ms"] = self.heartbeat_timeout_max_ms
         writes["drive_index"] = 0x1400 + self.drive_pdo - 1
-        writes["drive_id"] = to["drive_id"]
+        writes["drive_id"], writes["output_id"] = to["drive_id"], to["output_id"]
         writes["drive_channel"] = self.drive_channels
         record.setflags(write=False)
         return record
@@ -153,6 +156,7 @@ _FIXED: Final = {
     Reason.NMT: "not an NMT command",
     Reason.DRIVE_UNKNOWN: "what the combs hold is unknown (start, NMT command or pause): "
     "a frame with 0 V must come first",
+    Reason.OUTPUT_SECOND: "a second frame with digital outputs in one tick: no SYNC went out since the one before",
     Reason.DRIVE_SECOND: "a second drive PDO in one tick: no SYNC went out since the one before",
     Reason.LATCHED: "the gate is latched",
 }
@@ -185,6 +189,10 @@ def _words(reason: int, config: np.void, memory: np.void, length: int, word: int
             return f"drive PDO has alive counter {counter} instead of {memory['counter_next']}"
         case Reason.DRIVE_CRC:
             return f"drive PDO has a wrong CRC, 0x{word >> 56 & 0xFF:02X}"
+        case Reason.OUTPUT_LENGTH:
+            return f"the digital outputs' PDO has {length} bytes instead of 1"
+        case Reason.OUTPUT_BITS:
+            return f"digital outputs 0x{word & 0xFF:02X} beyond 0x{gate_rules.OUTPUT_BITS:02X}"
         case Reason.SDO_LENGTH:
             return f"SDO request has {length} bytes instead of 8"
     return sdo_rules.write_words(sdo_rules.write_refusal(config["writes"], word), word)

@@ -31,6 +31,7 @@ class FrameKind(IntFlag):
     NMT_STOP = 1 << 7
     NMT_PRE_OPERATIONAL = 1 << 8
     NMT_RESET = 1 << 9
+    OUTPUTS = 1 << 10
 
 
 # Whatever else is wrong, these keep the instrument informed and take it to 0 V. All that passes after a blocked frame.
@@ -38,17 +39,18 @@ ALWAYS: Final = (
     FrameKind.SYNC | FrameKind.HEARTBEAT | FrameKind.DRIVE_ZERO | FrameKind.NMT_STOP | FrameKind.NMT_PRE_OPERATIONAL
 )
 _CONFIGURE: Final = FrameKind.SDO_READ | FrameKind.SDO_WRITE | FrameKind.NMT_START | FrameKind.NMT_RESET
+_AT_WORK: Final = FrameKind.SDO_READ | FrameKind.DRIVE | FrameKind.OUTPUTS
 
 # Under voltage the node is not reset: its combs would drop to 0 V behind the back of the mode table.
 PERMITTED: Final[dict[Mode, FrameKind]] = {
     Mode.BOOT: ALWAYS | _CONFIGURE,
     Mode.PRE_OPERATIONAL: ALWAYS | _CONFIGURE,
-    Mode.IDLE: ALWAYS | FrameKind.SDO_READ | FrameKind.NMT_RESET,
-    Mode.HOMING: ALWAYS | FrameKind.SDO_READ,
-    Mode.ENABLED: ALWAYS | FrameKind.SDO_READ | FrameKind.DRIVE,
-    Mode.TRACKING: ALWAYS | FrameKind.SDO_READ | FrameKind.DRIVE,
+    Mode.IDLE: ALWAYS | FrameKind.SDO_READ | FrameKind.NMT_RESET | FrameKind.OUTPUTS,
+    Mode.HOMING: ALWAYS | FrameKind.SDO_READ | FrameKind.OUTPUTS,
+    Mode.ENABLED: ALWAYS | _AT_WORK,
+    Mode.TRACKING: ALWAYS | _AT_WORK,
     Mode.FAULT: ALWAYS | FrameKind.SDO_READ | FrameKind.NMT_RESET,
-    Mode.LANDING: ALWAYS | FrameKind.SDO_READ | FrameKind.DRIVE,
+    Mode.LANDING: ALWAYS | _AT_WORK,
 }
 
 
@@ -75,6 +77,9 @@ class Reason(IntEnum):
     LATCHED = 17
     SDO_LENGTH = 18
     SDO_WRITE = 19
+    OUTPUT_LENGTH = 20
+    OUTPUT_BITS = 21
+    OUTPUT_SECOND = 22
     NOT_NOW = 1 << 16
 
 
@@ -86,6 +91,7 @@ GATE = np.dtype(
         ("count_slew_max", "i4"),
         ("drive_id", "i4"),
         ("drive_length", "i4"),
+        ("output_id", "i4"),  # of the digital outputs' PDO; -1: there is none
         ("sdo_id", "i4"),
         ("heartbeat_id", "i4"),
         ("node_id", "i4"),
@@ -104,6 +110,7 @@ GATE_MEMORY = np.dtype(
         ("counter_next", "i4"),
         ("syncs", "i4"),  # that passed since; two are as good as more
         ("known", "i4"),  # 1: the combs hold it
+        ("output_due", "i4"),  # 1: a SYNC has passed since the last frame with digital outputs
         ("latched", "i4"),  # reason of the first frame that was blocked since the last clear; 0: none
         ("blocked_frames", "i4"),
     ],
@@ -112,15 +119,17 @@ GATE_MEMORY = np.dtype(
 
 SYNC_ID: Final = 0x080
 NMT_ID: Final = 0x000
+OUTPUT_BITS: Final = 0x1F
+"""That a frame with digital outputs may set: line, pixel, frame, position, in position."""
 _LONG_AGO_US: Final = -(1 << 62)
 _MODES: Final = len(Mode)
 _OPERATIONAL: Final = 0x05
 _PROTECTED_LENGTH: Final = 8
-_SYNC, _HEARTBEAT, _DRIVE, _DRIVE_ZERO, _READ, _WRITE, _START, _STOP, _PRE_OPERATIONAL, _RESET = (
+_SYNC, _HEARTBEAT, _DRIVE, _DRIVE_ZERO, _READ, _WRITE, _START, _STOP, _PRE_OPERATIONAL, _RESET, _OUTPUTS = (
     int(FrameKind[name])
     for name in (
         "SYNC", "HEARTBEAT", "DRIVE", "DRIVE_ZERO", "SDO_READ", "SDO_WRITE", "NMT_START", "NMT_STOP",
-        "NMT_PRE_OPERATIONAL", "NMT_RESET",
+        "NMT_PRE_OPERATIONAL", "NMT_RESET", "OUTPUTS",
     )
 )  # fmt: skip
 _ALWAYS: Final = int(ALWAYS)
@@ -133,6 +142,7 @@ _LENGTH, _REPEATED, _TOO_SOON, _RANGE, _UNKNOWN, _SECOND, _STEP, _COUNTER, _BAD_
     for name in ("LENGTH", "REPEATED", "TOO_SOON", "RANGE", "UNKNOWN", "SECOND", "STEP", "COUNTER", "CRC")
 )
 _LATCHED, _SDO_LENGTH, _SDO_WRITE = int(Reason.LATCHED), int(Reason.SDO_LENGTH), int(Reason.SDO_WRITE)
+_OUTPUT_LENGTH, _OUTPUT_BITS, _OUTPUT_SECOND = (int(Reason[f"OUTPUT_{name}"]) for name in ("LENGTH", "BITS", "SECOND"))
 
 
 def _permitted_by_mode() -> NDArray[np.int32]:
@@ -179,6 +189,7 @@ def forget(memory_array: Records) -> None:
         memory["count"][i] = 0
     memory["counter"] = -1
     memory["counter_next"] = memory["syncs"] = memory["known"] = memory["latched"] = memory["blocked_frames"] = 0
+    memory["output_due"] = 0
 
 
 @njit(cache=True, error_model="numpy")
@@ -218,7 +229,10 @@ def _judge(
         if not (length == 0 or (length == 1 and 1 <= word & 0xFF <= 240)):
             return _BAD_SYNC
         memory["syncs"] = 1 if memory["syncs"] == 0 else 2
+        memory["output_due"] = 1
         return 0
+    if can_id == config["output_id"]:
+        return judge_outputs(memory, length, word, permitted)
     if can_id == config["heartbeat_id"]:
         if length != 1 or word & 0xFF != _OPERATIONAL:
             return _BAD_HEARTBEAT
@@ -278,6 +292,21 @@ def judge_drive(config: np.void, memory: np.void, length: int, word: int, permit
     memory["known"] = 1 if known else 0
     memory["time_us"] = t_us
     memory["syncs"] = 0
+    return 0
+
+
+@njit(cache=True, error_model="numpy")
+def judge_outputs(memory: np.void, length: int, word: int, permitted: int) -> int:
+    """The reason for or against a frame with digital outputs: one between two SYNCs, and no bit but the known ones."""
+    if length != 1:
+        return _OUTPUT_LENGTH
+    if permitted & _OUTPUTS == 0:
+        return _LATCHED if memory["latched"] != 0 else _NOT_NOW | _OUTPUTS
+    if word & 0xFF & ~OUTPUT_BITS != 0:
+        return _OUTPUT_BITS
+    if memory["output_due"] == 0:
+        return _OUTPUT_SECOND
+    memory["output_due"] = 0
     return 0
 
 

@@ -43,6 +43,7 @@ class NodeEvent(IntFlag):
     REBOOTED = 4
     EMERGENCY = 8
     FOREIGN_FRAME = 16
+    SAFETY_OBJECTS = 32
 
 
 # A count of 0 trips at once (a limit that was never filled in is a fault), a negative one switches that monitor off.
@@ -160,6 +161,7 @@ _SOLVER = int(Trip.SOLVER)
 _NOT_FINITE = int(Trip.NOT_FINITE)
 _FOREIGN_FRAME = int(Trip.FOREIGN_FRAME)
 _FOREIGN_EVENT = int(NodeEvent.FOREIGN_FRAME)
+_SAFETY_OBJECTS, _SAFETY_EVENT = int(Trip.SAFETY_OBJECTS), int(NodeEvent.SAFETY_OBJECTS)
 # NodeEvent's first four bits are Trip's four bits from HEARTBEAT_LOST on, in the same order.
 _NODE_EVENTS = int(NodeEvent.HEARTBEAT_LOST | NodeEvent.NOT_OPERATIONAL | NodeEvent.REBOOTED | NodeEvent.EMERGENCY)
 _NODE_SHIFT = int(Trip.HEARTBEAT_LOST).bit_length() - 1
@@ -376,6 +378,8 @@ def check(limits: np.void, memory: np.void, obs: np.void) -> int:
     trips |= (int(obs["node_events"]) & _NODE_EVENTS) << _NODE_SHIFT
     if obs["node_events"] & _FOREIGN_EVENT != 0:
         trips |= _FOREIGN_FRAME
+    if obs["node_events"] & _SAFETY_EVENT != 0:
+        trips |= _SAFETY_OBJECTS
     leak = limits["overrun_leak_ticks"]
     memory["overrun_level"] = _bucket(memory["overrun_level"], obs["overrun"], leak)
     trips |= _filled(memory["overrun_level"], limits["overrun_count"], leak, _OVERRUN)

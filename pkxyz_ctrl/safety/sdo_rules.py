@@ -19,11 +19,13 @@ _COB_ID_OFF: Final = 1 << 31
 _COB_ID_MASK: Final = 0x3FFFFFFF  # without "off" (bit 31) and "no remote frame" (bit 30)
 _PDO_STEP: Final = 0x100
 _FIRST_TPDO_ID, _LAST_TPDO_ID = 0x180, 0x480
+_OUTPUT_INDEX, _OUTPUT_MAPPING, _OUTPUT_FIELD = 0x1400, 0x1600, 0x6200_0108
 
 WRITES = np.dtype(
     [
         ("drive_index", "i4"),  # communication parameter of the drive PDO
         ("drive_id", "i4"),
+        ("output_id", "i4"),  # of RPDO 1 with the digital outputs; -1: there is none
         ("drive_channel", "i4", (3,)),  # sub-indices of 0x6411
         ("node_id", "i4"),
         ("controller_node_id", "i4"),
@@ -86,10 +88,10 @@ WRITE_RULES: Final = (
     WriteRule(0x1017, 0x1017, 0, 0, 2, "the node's heartbeat", "1 ms or more, never off", Value.BETWEEN, 1),
     WriteRule(0x1019, 0x1019, 0, 0, 1, "overflow of the SYNC counter", "240", _EITHER, 240, 240),
     WriteRule(0x1029, 0x1029, 1, 1, 1, "behaviour on communication error", "0 or 2, never 'carry on'", _EITHER, 0, 2),
-    WriteRule(0x1400, 0x15FF, 1, 1, 4, "identifier of a receive PDO", "drive PDO: its own; or off", Value.DRIVE_OR_OFF),
-    WriteRule(0x1400, 0x15FF, 2, 2, 1, "receive PDO: transmission type", "drive PDO: 1, every SYNC", Value.EVERY_SYNC),
+    WriteRule(0x1400, 0x15FF, 1, 1, 4, "identifier of a receive PDO", "of ours: its own; or off", Value.DRIVE_OR_OFF),
+    WriteRule(0x1400, 0x15FF, 2, 2, 1, "receive PDO: transmission type", "1, every SYNC, of ours", Value.EVERY_SYNC),
     WriteRule(0x1600, 0x17FF, 0, 0, 1, "receive mapping: number of entries", "0 to 5", Value.BETWEEN, 0, 5),
-    WriteRule(0x1600, 0x17FF, 1, 64, 4, "receive mapping: entry", "0x6411 of a comb, 0x2000, none", Value.DRIVE_FIELD),
+    WriteRule(0x1600, 0x17FF, 1, 64, 4, "receive mapping: entry", "our own fields, or none", Value.DRIVE_FIELD),
     WriteRule(0x1800, 0x19FF, 1, 1, 4, "identifier of a transmit PDO", "the node's own four; or off", Value.OWN_OR_OFF),
     WriteRule(0x1800, 0x19FF, 2, 2, 1, "transmit PDO: transmission type", "any", _ANY),
     WriteRule(0x1800, 0x19FF, 3, 3, 2, "transmit PDO: inhibit time", "any", _ANY),
@@ -185,14 +187,17 @@ def _accepts(limits: np.void, rule: np.void, index: int, subindex: int, value: i
         return 1 <= value <= limits["timeout_max_ms"]
     if kind == _STEP:
         return 1 <= value <= limits["count_slew_max"]
-    is_drive = index == limits["drive_index"]
+    is_drive, is_output = index == limits["drive_index"], limits["output_id"] >= 0 and index == _OUTPUT_INDEX
     if kind == _DRIVE_OR_OFF:
-        return value & _COB_ID_OFF != 0 or (is_drive and value & _COB_ID_MASK == limits["drive_id"])
+        own = limits["output_id"] if is_output else limits["drive_id"]
+        return value & _COB_ID_OFF != 0 or ((is_drive or is_output) and value & _COB_ID_MASK == own)
     if kind == _EVERY_SYNC:
-        return is_drive and value == 1
+        return (is_drive or is_output) and value == 1
     if kind == _OWN_OR_OFF:
         return value & _COB_ID_OFF != 0 or _is_own(value & _COB_ID_MASK, limits["node_id"])
     if kind == _DRIVE_FIELD:
+        if limits["output_id"] >= 0 and index == _OUTPUT_MAPPING:  # whose frames may never carry a voltage
+            return value == 0 or value == _OUTPUT_FIELD
         return _is_drive_field(limits, value)
     return value == rule["low"] and _is_channel(limits, subindex)
 

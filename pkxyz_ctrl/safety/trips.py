@@ -39,6 +39,7 @@ class Trip(IntFlag):
     COMB_FORCE_2 = 1 << 28
     COMB_FORCE_3 = 1 << 29
     FOREIGN_FRAME = 1 << 30
+    SAFETY_OBJECTS = 1 << 31
 
 
 LANDS: Final = Trip.SATURATION | Trip.OVERRUN | Trip.SOLVER | Trip.OPERATOR
@@ -66,6 +67,7 @@ STOPS: Final[dict[str, str]] = {
     "COMB_MISFIT": "a comb or its sensor doesn't obey",
     "COMB_FORCE": "a comb doesn't give the force of its voltage",
     "FOREIGN_FRAME": "somebody else may drive the combs",
+    "SAFETY_OBJECTS": "the node may not go to 0 V by itself any longer",
 }
 """Why the stage is led down, or not, by the name of a trip without the number of a comb or the axis."""
 
@@ -196,6 +198,10 @@ EXPLANATIONS: Final[dict[Trip, tuple[str, str]]] = {
     Trip.FOREIGN_FRAME: (
         "somebody else on the bus sends what only this controller may send",
         "look for a second controller, a master or a tool that is connected, and take it off the bus",
+    ),
+    Trip.SAFETY_OBJECTS: (
+        "the amplifier's safety objects are not those that were read back at the start, or it no longer tells them",
+        "look for a tool or a master that writes to it; then clear: they are written and read back anew",
     ),
 }
 

@@ -19,6 +19,7 @@ from pkxyz_ctrl.trajectory.motion import Array, Motion, TrajectoryError
 from pkxyz_ctrl.trajectory.periodic import Circle, Lissajous, Rosette, Sine
 from pkxyz_ctrl.trajectory.pieces import Pieces, still
 from pkxyz_ctrl.trajectory.raster import Raster
+from pkxyz_ctrl.trajectory.scan_bits import scan_bits
 from pkxyz_ctrl.trajectory.segments import Hold, Move, Plan
 from pkxyz_ctrl.trajectory.spiral import Spiral
 from pkxyz_ctrl.trajectory.steps import Staircase, Steps
@@ -73,8 +74,10 @@ class TimedSegment:
 class Trajectory:
     """Segments one after another from the rest pose; immutable. Each segment ends on a whole microsecond."""
 
-    def __init__(self, segments: Sequence[AnySegment]) -> None:
-        """Raises ``TrajectoryError``, naming the segment, where one can't be planned."""
+    def __init__(self, segments: Sequence[AnySegment], pixels: int | None = None) -> None:
+        """``pixels`` of each line, for triggers; None: it has none. Raises ``TrajectoryError``, naming the segment,
+        where one can't be planned.
+        """
         if not segments:
             raise TrajectoryError("reference: has no segments; give at least one [[reference]]")
         position = np.zeros(3)
@@ -115,6 +118,9 @@ class Trajectory:
             )
             start_us += length_us
         self.segments = tuple(timed)
+        self._pixels = pixels
+        self._lines_a_frame = tuple(s.lines if isinstance(s, Raster) else 1 for s in segments)
+        self._line_rows: dict[int, NDArray[np.int64]] = {}
         self.duration_us = start_us
         self.end_m = position
         self._motions = (*motions, still(position, 1.0))
@@ -136,6 +142,24 @@ class Trajectory:
             if end > begin:
                 out[begin:end] = self._motions[n].sample((t_us[begin:end] - self._start_us[n]) * 1e-6)
         return out
+
+    def line_rows(self, period_us: int) -> NDArray[np.int64]:
+        """Of each line (n, 3): its first row, the row behind its last, and the number of its frame."""
+        if period_us not in self._line_rows:
+            found, frame = [], 0
+            for timed, lines in zip(self.segments, self._lines_a_frame, strict=True):
+                for n, (begin_us, end_us) in enumerate(timed.lines_us):
+                    found.append((-(-begin_us // period_us), -(-end_us // period_us), frame + n // lines))
+                frame = found[-1][2] + 1 if timed.lines_us else frame
+            self._line_rows[period_us] = np.array(found, np.int64).reshape(-1, 3)
+        return self._line_rows[period_us]
+
+    def outputs(self, first_tick: int, count: int, period_us: int) -> NDArray[np.int64]:
+        """Trigger bits (count,) of its rows, of ``config.triggers``."""
+        if self._pixels is None:
+            return np.zeros(count, np.int64)
+        rows = first_tick + np.arange(count, dtype=np.int64)
+        return scan_bits(self.line_rows(period_us), self._pixels, rows)
 
 
 def _require_bounded(where: str, plan: Plan, start_s: float, before: int) -> int:

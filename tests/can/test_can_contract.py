@@ -62,7 +62,7 @@ def test_the_eds_names_every_object_it_has_and_no_other(dictionary):
         section = f"{index:04X}"
         subs = [name for name in eds.sections() if name.lower().startswith(section.lower() + "sub")]
         assert len(subs) == int(eds.get(section, "SubNumber", fallback="0")), section
-        if subs and index not in (0x1003, 0x1601, 0x1A01):  # there sub 0 counts what is in use
+        if subs and index not in (0x1003, 0x1600, 0x1601, 0x1A01, 0x1A02):  # there sub 0 counts what is in use
             assert dictionary[index][0].default == max(int(name[7:], 16) for name in subs), section
 
 
@@ -71,6 +71,9 @@ def test_cob_ids_follow_the_predefined_connection_set(node_id):
     od = canopen.import_od(str(EDS), node_id)
     assert od[0x1401][1].default == cob_id.DRIVE_BASE + node_id
     assert od[0x1801][1].default == cob_id.SENSE_BASE + node_id | cob_id.COB_ID_NO_RTR
+    assert od[0x1400][1].default == cob_id.OUTPUT_BASE + node_id
+    off = cob_id.COB_ID_INVALID | cob_id.COB_ID_NO_RTR
+    assert od[0x1802][1].default == cob_id.sense(node_id, cob_id.SIGNATURE_PDO) | off, "nobody has to know it"
     assert od[0x1014].default == cob_id.EMCY_BASE + node_id
     assert [od[0x1200][1].default, od[0x1200][2].default] == [0x600 + node_id, 0x580 + node_id]
     assert od[0x1005].default == cob_id.SYNC
@@ -86,19 +89,24 @@ def test_default_state_is_safe(dictionary):
 
 @pytest.mark.parametrize("protection", [True, False])
 def test_the_start_up_writes_only_what_the_eds_offers(dictionary, protection):
-    config = DriverConfig(protection=protection)
+    config = DriverConfig(protection=protection, digital_outputs=True, signature_syncs=240)
     for step in identity_steps(config) + configuration_steps(config):
         variable = dictionary.get_variable(step.index, step.subindex)
         assert variable is not None, step.name
         assert len(variable) == 8 * step.size, step.name
         assert variable.writable or not step.write, step.name
         if not step.write and step.index in (0x1000, 0x1018):
-            assert step.value == variable.default, step.name
+            assert (step.value ^ variable.default) & ~step.alike == 0, step.name
 
 
 def test_the_start_up_mapping_is_the_default_mapping(dictionary):
-    for index, entries in ((0x1601, mapping(0x6411, 0x2000, True)), (0x1A01, mapping(0x6401, 0x2001, True))):
-        assert tuple(dictionary[index][place].default for place in range(1, 6)) == entries
+    for index, entries in (
+        (0x1601, mapping(0x6411, 0x2000, True)),
+        (0x1A01, mapping(0x6401, 0x2001, True)),
+        (0x1600, (0x62000108,)),
+        (0x1A02, (0x20200110,)),
+    ):
+        assert tuple(dictionary[index][place].default for place in range(1, 1 + len(entries))) == entries
         assert dictionary[index][0].default == len(entries)
         for entry in entries:
             assert dictionary.get_variable(entry >> 16, entry >> 8 & 0xFF).pdo_mappable

@@ -1,5 +1,8 @@
 """What the start-up writes and what a node may lack, from what was found: each condition of the plan met alone."""
 
+import struct
+from binascii import crc_hqx
+
 import numpy as np
 import pytest
 
@@ -21,6 +24,9 @@ HELD: dict[tuple[int, int], int | None] = {(0x1018, 3): 0x10000, (0x1018, 4): 1}
     setting.key: setting.value for setting in table(DriverConfig()) if setting.value is not None
 }
 """What a node holds of which nothing has to be written."""
+
+
+ALL: dict[str, object] = {"digital_outputs": True, "signature_syncs": 240}
 
 
 def report(*lines: str, serial: int = 1) -> ProvenModule:
@@ -79,7 +85,10 @@ def test_what_is_not_there_is_neither_written_nor_read() -> None:
 
 
 def test_identity_is_compared_in_every_bit_and_what_is_surveyed_in_none() -> None:
-    assert [(step.optional, step.alike) for step in identity_steps(DriverConfig())] == 3 * [(False, 0)]
+    """But whether a module also has digital outputs, bit 17 of its device type."""
+    assert [(step.optional, step.alike) for step in identity_steps(DriverConfig())] == [
+        (False, 1 << 17), (False, 0), (False, 0),
+    ]  # fmt: skip
     assert {(step.optional, step.alike) for step in survey(DriverConfig())} == {(True, 0)}
 
 
@@ -148,7 +157,79 @@ def test_what_has_no_room_among_the_steps_is_left_out_and_does_no_harm() -> None
     for row in range(start_plan.STEPS_MOST + 2):
         start_plan._add(memory[0], row % start_plan.ROWS_MOST, start_plan.ASK)
     assert memory["steps"][0] == start_plan.STEPS_MOST
-    steps = planned({}).steps
+    steps = planned({}, **ALL).steps
     assert len(steps) == start_plan.STEPS_MOST
-    assert len(table(DriverConfig())) == start_plan.ROWS_MOST
-    assert (steps[-1].index, steps[-1].write) == (0x1019, False), "the last is the last read-back, not a write"
+    assert len(table(DriverConfig(**ALL))) == start_plan.ROWS_MOST
+    assert (steps[-2].index, steps[-2].write) == (0x1019, False), "the last but one is the last read-back, not a write"
+    assert (steps[-1].index, steps[-1].write) == (0x2020, False), "then what the node signs of it"
+
+
+# -- what a node may do beside its combs -------------------------------------------------------------------------------
+
+OUTPUTS_LOST = "no digital outputs (0x6200:1) in RPDO 1"
+SIGNATURE_LOST = "no signature of its safety objects (0x2020) in TPDO 3"
+
+
+def whole(**config: object) -> dict[tuple[int, int], int | None]:
+    """What a node holds of which nothing has to be written, with outputs 0 and the right signature."""
+    held = HELD | {s.key: s.value for s in table(DriverConfig(**config)) if s.value is not None} | {(0x6200, 1): 0}
+    return held | {(0x2020, 1): signed(held)}
+
+
+def signed(held: dict[tuple[int, int], int | None]) -> int:
+    """CRC-16-CCITT from 0xFFFF by Python's own function, over what keeps the combs safe, in its order."""
+    keys = [s for s in table(DriverConfig()) if s.part >= start_plan.COB_ID and held.get(s.key) is not None]
+    data = b"".join(
+        struct.pack("<HB", *s.key) + (held[s.key] or 0).to_bytes(s.size, "little")
+        for s in sorted(keys, key=lambda s: s.key)
+    )
+    return crc_hqx(data, 0xFFFF)
+
+
+def test_outputs_and_signature_that_stand_are_left_alone() -> None:
+    assert written(whole(**ALL), **ALL) == []
+    assert planned(whole(**ALL), **ALL).lost == ()
+
+
+@pytest.mark.parametrize("lacking", [(0x6200, 1), (0x1400, 1), (0x1600, 0)])
+def test_a_node_without_outputs_is_told_and_not_refused(lacking: tuple[int, int]) -> None:
+    plan = planned(whole(**ALL) | {lacking: None, (0x1600, 1): 5}, **ALL)
+    assert plan.refusal == ""
+    assert [words[: len(OUTPUTS_LOST)] for words in plan.lost] == [OUTPUTS_LOST]
+    assert not [step for step in plan.steps if step.write], "its RPDO 1 may be for something else"
+
+
+@pytest.mark.parametrize("lacking", [(0x2020, 1), (0x1802, 1), (0x1A02, 0)])
+def test_a_node_without_signature_is_told_and_not_refused(lacking: tuple[int, int]) -> None:
+    plan = planned(whole(**ALL) | {lacking: None}, **ALL)
+    assert (plan.refusal, [words[: len(SIGNATURE_LOST)] for words in plan.lost]) == ("", [SIGNATURE_LOST])
+
+
+def test_another_signature_is_not_relied_on() -> None:
+    held = whole(**ALL)
+    plan = planned(held | {(0x2020, 1): held[0x2020, 1] ^ 1}, **ALL)
+    assert [words[: len(SIGNATURE_LOST)] for words in plan.lost] == [SIGNATURE_LOST]
+
+
+def test_of_whatever_is_signed_each_byte_counts() -> None:
+    for setting in table(DriverConfig()):
+        if setting.part >= start_plan.COB_ID:
+            for byte in range(setting.size):
+                held = whole(**ALL)
+                changed = held | {setting.key: (held[setting.key] or 0) ^ 1 << 8 * byte}
+                assert signed(changed) != held[0x2020, 1]
+
+
+def test_outputs_are_mapped_as_cia_301_has_it() -> None:
+    off, on = (0x1400, 1, 0x8000020A), (0x1400, 1, 0x20A)
+    entry = [(0x1600, 0, 0), (0x1600, 1, 0x62000108), (0x1600, 0, 1)]
+    assert written(whole(**ALL) | {(0x1600, 0): 8}, **ALL) == [off, *entry, on]
+    assert written(whole(**ALL) | {(0x1400, 2): 254}, **ALL) == [(0x1400, 2, 1)]
+
+
+def test_where_rpdo_1_or_tpdo_3_carries_the_combs_there_is_no_room() -> None:
+    for config in ({"drive_pdo": 1}, {"sense_pdo": 3}, {"protection": False}):
+        both = DriverConfig(**ALL, **config)
+        indices = {setting.index for setting in table(both)}
+        assert (0x6200 in indices) == ("drive_pdo" not in config)
+        assert (0x2020 in indices) == ("drive_pdo" in config)

@@ -3,11 +3,11 @@
 import numpy as np
 import pytest
 from loop_rig import rows_of
+from pkxyz_ctrl.loop.triggers import FRAME, LINE, PIXEL, POSITION, POSITION_TRIGGER, position_bit, scan_bits
 
 from hil.operate.sample_axes import PLAIN, Turn
 from hil.runs.scenario import load_scenario
 from hil.server.paths import StagePath, _OfSample
-from pkxyz_ctrl.loop.triggers import FRAME, LINE, PIXEL, POSITION, POSITION_TRIGGER, position_bit, scan_bits
 from pkxyz_ctrl.safety.modes import Mode
 
 

@@ -38,7 +38,7 @@ def test_every_object_reads_as_the_eds_says() -> None:
         if variable.data_type in datatypes.NUMBER_TYPES:
             assert len(raw) * 8 == len(variable)
         value = variable.decode_raw(raw)
-        if variable.index == 0x6401 and variable.subindex:
+        if variable.index in (0x2020, 0x6401) and variable.subindex:
             continue  # a live value: see test_inputs_can_be_read_before_the_start
         default = variable.default or ("" if variable.data_type == datatypes.VISIBLE_STRING else 0)
         assert value == default, f"{variable.index:04X} sub {variable.subindex}"
@@ -68,11 +68,18 @@ NEW_VALUES = {
     (0x1017, 0): 40,
     (0x1019, 0): 10,
     (0x1029, 1): 2,
+    (0x1400, 1): 0x80000000 + 0x20A,
+    (0x1400, 2): 255,
     (0x1401, 1): 0x80000000 + 0x30A,
     (0x1401, 2): 255,
     (0x1801, 1): 0xC0000000 + 0x28A,
     (0x1801, 2): 4,
     (0x1801, 5): 17,
+    (0x1802, 1): 0xC0000000 + 0x48A,
+    (0x1802, 2): 100,
+    (0x6200, 1): 9,
+    (0x6206, 1): 1,
+    (0x6207, 1): 2,
     **{(0x6411, i): 0 for i in (1, 2, 3)},
     **{(0x6443, i): 0 for i in (1, 2, 3)},
     **{(0x6444, i): 1000 + i for i in (1, 2, 3)},
@@ -86,15 +93,18 @@ NEW_VALUES = {
 PDO_OFF_VALUES = {
     (0x1801, 3): 20,
     (0x1801, 6): 3,
-    **{(mapping, 0): 0 for mapping in (0x1601, 0x1A01)},
+    (0x1802, 3): 20,
+    **{(mapping, 0): 0 for mapping in (0x1600, 0x1601, 0x1A01, 0x1A02)},
+    **{(0x1600, i): 0x62000108 for i in range(1, 9)},
+    **{(0x1A02, i): 0x20200110 for i in range(1, 9)},
     **{(0x1601, i): 0x64110110 for i in range(1, 9)},
     **{(0x1A01, i): 0x64010310 for i in range(1, 9)},
 }
 
 
 FIXED = {
-    0x1005, 0x1014, 0x1015, 0x1016, 0x1019, 0x1029, 0x1401, 0x1601, 0x1801, 0x1A01, 0x2010, 0x2011, 0x2012,
-    0x6443, 0x6444,
+    0x1005, 0x1014, 0x1015, 0x1016, 0x1019, 0x1029, 0x1400, 0x1401, 0x1600, 0x1601, 0x1801, 0x1802, 0x1A01, 0x1A02,
+    0x2010, 0x2011, 0x2012, 0x6443, 0x6444,
 }  # fmt: skip
 
 

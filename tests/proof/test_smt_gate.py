@@ -39,7 +39,7 @@ class Unknowns:
 def unknowns() -> Unknowns:
     ranges = {
         "was_a": (0, 32767), "was_b": (0, 32767), "was_c": (0, 32767), "known": (0, 1),
-        "last": (-1, 255), "next": (0, 255), "syncs": (0, 2), "row": (0, 1023),
+        "last": (-1, 255), "next": (0, 255), "syncs": (0, 2), "row": (0, 2047),
         "maximum": (0, 32767), "slew": (1, 32767), "spacing": (0, 1_000_000),
         "now": (0, 1 << 60), "before": (-(1 << 62), 1 << 60),
     }  # fmt: skip

@@ -49,6 +49,7 @@ TRIPS = [
     "COMB_FORCE_2",
     "COMB_FORCE_3",
     "FOREIGN_FRAME",
+    "SAFETY_OBJECTS",
 ]
 
 
@@ -64,7 +65,7 @@ def test_bits_of_what_was_wrong_with_a_frame_and_a_node() -> None:
     assert {name: bit.value for name, bit in SenseStatus.__members__.items()} == {
         n: 1 << k for k, n in enumerate(sense)
     }
-    node = ["HEARTBEAT_LOST", "NOT_OPERATIONAL", "REBOOTED", "EMERGENCY", "FOREIGN_FRAME"]
+    node = ["HEARTBEAT_LOST", "NOT_OPERATIONAL", "REBOOTED", "EMERGENCY", "FOREIGN_FRAME", "SAFETY_OBJECTS"]
     assert {name: bit.value for name, bit in NodeEvent.__members__.items()} == {n: 1 << k for k, n in enumerate(node)}
 
 
@@ -188,22 +189,22 @@ def test_gate_config_defaults_are_those_of_the_wire() -> None:
     assert dataclasses.asdict(config) == {
         "count_max": 30000, "count_slew_max": 500, "period_us": 200, "node_id": 10, "controller_node_id": 127,
         "protection": True, "fd": True, "spacing_min_us": None, "heartbeat_timeout_max_ms": 1000,
-        "drive_pdo": 2, "drive_channels": (1, 2, 3),
+        "drive_pdo": 2, "drive_channels": (1, 2, 3), "digital_outputs": False,
     }  # fmt: skip
 
 
-KINDS = "SYNC HEARTBEAT DRIVE_ZERO DRIVE SDO_READ SDO_WRITE NMT_START NMT_STOP NMT_PRE_OPERATIONAL NMT_RESET"
+KINDS = "SYNC HEARTBEAT DRIVE_ZERO DRIVE SDO_READ SDO_WRITE NMT_START NMT_STOP NMT_PRE_OPERATIONAL NMT_RESET OUTPUTS"
 ALWAYS_KINDS = {"SYNC", "HEARTBEAT", "DRIVE_ZERO", "NMT_STOP", "NMT_PRE_OPERATIONAL"}
 CONFIGURING = {"SDO_READ", "SDO_WRITE", "NMT_START", "NMT_RESET"}
 MODE_KINDS = {
     Mode.BOOT: CONFIGURING,
     Mode.PRE_OPERATIONAL: CONFIGURING,
-    Mode.IDLE: {"SDO_READ", "NMT_RESET"},
-    Mode.HOMING: {"SDO_READ"},
-    Mode.ENABLED: {"SDO_READ", "DRIVE"},
-    Mode.TRACKING: {"SDO_READ", "DRIVE"},
+    Mode.IDLE: {"SDO_READ", "NMT_RESET", "OUTPUTS"},
+    Mode.HOMING: {"SDO_READ", "OUTPUTS"},
+    Mode.ENABLED: {"SDO_READ", "DRIVE", "OUTPUTS"},
+    Mode.TRACKING: {"SDO_READ", "DRIVE", "OUTPUTS"},
     Mode.FAULT: {"SDO_READ", "NMT_RESET"},
-    Mode.LANDING: {"SDO_READ", "DRIVE"},
+    Mode.LANDING: {"SDO_READ", "DRIVE", "OUTPUTS"},
 }
 
 

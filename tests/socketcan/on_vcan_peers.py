@@ -52,8 +52,7 @@ import hil.commands.dbc
 import hil.commands.new  # noqa: F401
 from hil.conformance.simulated import simulated_plant
 from hil.runs.scenario import load_scenario
-from pkxyz_ctrl.can.cob_id import NmtState
-from pkxyz_ctrl.can.startup import state_name
+from pkxyz_ctrl.can.cob_id import NmtState, state_name
 from pkxyz_ctrl.config.bus import BusConfig
 from pkxyz_ctrl.config.files import CONFIG_DIR, load
 from pkxyz_ctrl.io.can_port import to_frame, to_message
