@@ -113,6 +113,12 @@ def kept(path: str) -> str:
     return table(found["header"], found["rows"])
 
 
+def board() -> str:
+    """What each law takes on the emulated board, as ``tests/firmware/measure.py`` last found it."""
+    made = runpy.run_path(str(ROOT / "docs" / "tables" / "board.py"))
+    return table(made["HEADER"], made["rows"](json.loads(made["KEPT"].read_text(encoding="utf-8"))))
+
+
 def noises() -> str:
     """Each noise of the plant lab alone, as ``docs/figures/plant_noise.py`` last measured it."""
     found = json.loads((ROOT / "docs" / "figures" / "plant_noise.json").read_text(encoding="utf-8"))
@@ -195,6 +201,7 @@ BUILT = {
     "sampled": partial(kept, "tables/montecarlo.json"),
     "noises": noises,
     "explored": explored,
+    "board": board,
     "frames": partial(drawn, "bus_timing.py", "frame_table"),
     "budget": partial(drawn, "bus_timing.py", "budget_table"),
     "splitting": partial(drawn, "mechanics.py", "splitting_table"),

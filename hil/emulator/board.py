@@ -6,6 +6,7 @@ import signal
 import socket
 import subprocess
 from collections.abc import Iterator
+from functools import partial
 from pathlib import Path
 from types import TracebackType
 from typing import Any, Final, NamedTuple, Self
@@ -26,6 +27,8 @@ _FOLLOWS, _CLEARING, _IS_CLEARING = 1, 2, 4
 _TIME_BITS: Final = 48
 _SILENT_MOST_S: Final = 60.0
 _PARENT_DEATH: Final = 1  # linux/prctl.h: PR_SET_PDEATHSIG
+
+_libc = ctypes.CDLL(None)
 
 INSTRUCTIONS_A_COUNT = 40
 """The board's counter runs at 25 MHz, and with ``-icount shift=0`` an instruction takes a nanosecond."""
@@ -52,9 +55,6 @@ class Board:
         """Raises ``ConfigError`` without an emulator, ``BoardGoneError`` where it does not start."""
         self._said = folder / "said"
         with socket.create_server(("127.0.0.1", 0)) as listener, self._said.open("wb") as said:
-            listener.setsockopt(
-                socket.IPPROTO_TCP, socket.TCP_NODELAY, 1
-            )  # of what it accepts, too: bytes go one by one
             port, number = listener.getsockname()[1], listener.fileno()
             self._process = subprocess.Popen(
                 [
@@ -63,7 +63,7 @@ class Board:
                     "-icount", "shift=0", "-semihosting-config", "enable=on,target=native", "-kernel", str(image),
                 ],
                 cwd=folder, pass_fds=(number,), stdin=subprocess.DEVNULL, stdout=said, stderr=said,
-                start_new_session=True, preexec_fn=_dies_with_its_parent,
+                start_new_session=True, preexec_fn=partial(_dies_with_its_parent, os.getpid()),
             )  # fmt: skip
         self.pid = self._process.pid
         self._notes = folder / "notes"
@@ -129,8 +129,8 @@ class Board:
         return BoardGoneError(f"{how}{': ' if said else ''}{said[-300:]}")
 
 
-def _dies_with_its_parent() -> None:
-    """The board waits for ever for a time that nobody tells it any more."""
-    ctypes.CDLL(None).prctl(_PARENT_DEATH, int(signal.SIGKILL), 0, 0, 0)
-    if os.getppid() == 1:
+def _dies_with_its_parent(parent: int) -> None:
+    """The board would wait for ever for a time that nobody tells it any more."""
+    _libc.prctl(_PARENT_DEATH, int(signal.SIGKILL), 0, 0, 0)
+    if os.getppid() != parent:
         os.kill(os.getpid(), signal.SIGKILL)
