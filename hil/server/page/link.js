@@ -17,12 +17,13 @@ export class Link {
     const address = location.origin.replace("http", "ws") + "/stage";
     this.socket = new WebSocket(address, ["pkxyz.1", PREFIX + this.token]);
     this.socket.binaryType = "arraybuffer";
-    this.socket.onopen = () => this.on.open?.();
+    let wasOpen = false;
+    this.socket.onopen = () => { wasOpen = true; this.on.open?.(); };
     this.socket.onmessage = ({ data }) => {
       if (data instanceof ArrayBuffer) return this.on.block(unpacked(data));
       for (const [kind, value] of Object.entries(JSON.parse(data))) this.on[kind]?.(value);
     };
-    this.socket.onclose = ({ code, reason }) => { this.on.gone(`${code} ${reason}`.trim()); setTimeout(() => this.open(), 1000); };
+    this.socket.onclose = ({ code, reason }) => { this.on.gone(`${code} ${reason}`.trim(), wasOpen); setTimeout(() => this.open(), 1000); };
   }
 
   say(message) {

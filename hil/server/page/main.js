@@ -48,7 +48,7 @@ const link = new Link({
     at("scan-words").textContent = `${value.duration_s.toFixed(2)} s; from (${um(value.low_m)}) to (${um(value.high_m)}) um; the combs can follow`;
   },
   body(value) { plane.body = value; },
-  gone(why) { if (mine) log("connection", why, "aborted"); mine = held = false; history.clear(); endJog(); showControl(); at("words").textContent = "no connection to the server"; document.querySelector(".state").dataset.activity = "gone"; },
+  gone(why, wasOpen) { if (wasOpen) log("connection", why, "aborted"); mine = held = false; history.clear(); endJog(); showControl(); at("words").textContent = "no connection to the server"; document.querySelector(".state").dataset.activity = "gone"; },
 });
 
 function bodyOf() { link.say({ do: "body" }); }
@@ -125,7 +125,9 @@ function showControl() {
 function ask(message, command, python) {
   at("as-command").textContent = `$ ${command}`;
   at("as-python").textContent = python;
-  return message && link.say(message);
+  const tag = message && link.say(message);
+  if (message && tag === null) log(message.do, "there is no connection to the server: ask again", "refused");
+  return tag;
 }
 
 const setting = new Setting(ask);
