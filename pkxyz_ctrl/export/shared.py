@@ -24,7 +24,7 @@ AHEAD_ROWS: Final = 32
 """... and so many of the next one behind them: what a law looks ahead."""
 LATENESS_MOST_US: Final = 2000
 EVENTS: Final = 64
-_WORDS: Final = 256
+_WORDS: Final = 512
 _CHANNEL: Final = 128
 
 

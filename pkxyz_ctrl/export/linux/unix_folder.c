@@ -17,6 +17,12 @@ static int refuse(char *why, int size, const char *folder, const char *words)
     return -1;
 }
 
+static int refuse_above(char *why, int size, const char *above, const char *folder, const char *words)
+{
+    snprintf(why, (size_t)size, "%s, above %s, %s", above, folder, words);
+    return -1;
+}
+
 static void parent_of(const char *path, char *parent)
 {
     const char *slash = strrchr(path, '/');
@@ -67,7 +73,7 @@ static int require_safe_way(const char *folder, char *why, int size)
     struct stat found;
     for (parent_of(folder, above);; parent_of(above, above)) {
         if (lstat(above, &found) == 0 && S_ISLNK(found.st_mode) && found.st_uid != 0 && found.st_uid != getuid())
-            return refuse(why, size, above, "is another user's link; give a path of your own");
+            return refuse_above(why, size, above, folder, "is another user's link; give a path of your own");
         if (strcmp(above, "/") == 0)
             break;
     }
@@ -80,9 +86,9 @@ static int require_safe_way(const char *folder, char *why, int size)
         if (stat(above, &found) != 0)
             return refuse(why, size, above, strerror(errno));
         if (found.st_uid != 0 && found.st_uid != getuid())
-            return refuse(why, size, above, "belongs to another user; give a path of your own");
+            return refuse_above(why, size, above, folder, "belongs to another user; give a path of your own");
         if (found.st_mode & OTHERS_WRITE && !(found.st_mode & S_ISVTX))
-            return refuse(why, size, above, "can be written to by other users; give a path elsewhere");
+            return refuse_above(why, size, above, folder, "can be written to by other users; give a path elsewhere");
         if (!(found.st_mode & OTHERS_ENTER))
             return 0;
     }
