@@ -106,10 +106,11 @@ class UnixBus(can.BusABC):
         """
         if msg.is_fd and not self._fd:
             raise can.CanOperationError(f"{self.channel_info}: opened without fd, cannot send an FD frame")
-        datagram = _pack(msg)
         if self._waiting:
             self._hand_over()
-        for peer in self._others():
+        others = self._others()
+        datagram = _pack(msg)  # stamped when it is on the bus
+        for peer in others:
             waiting = self._waiting.get(peer)
             if waiting is None and self._reaches(peer, datagram):
                 continue
