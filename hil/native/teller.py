@@ -24,6 +24,7 @@ class Teller(Controller):
     def __init__(self, setup: Setup) -> None:
         self._port: np.void | None = None
         super().__init__(setup.law, setup.bus, wall_gate(setup.gate), _nowhere, port_complaint=lambda: self.complaint)
+        self.outputs[0] = setup.new_outputs()[0]
         for name, *_ in TRUTH_FIELDS:
             self.memory["row"][name] = np.nan  # nobody here knows it
 
