@@ -48,9 +48,10 @@ def object_code() -> bytes:
     return kept(f"{TARGET}.o", _MADE_OF, lambda: lower(kernels(), TARGETS[TARGET]).code)
 
 
-def built(config: Records, reference: Records, can: CanConfig, controller: str, place: Path) -> Path:
+def built(config: Records, reference: Records, outputs: Records, can: CanConfig, controller: str, place: Path) -> Path:
     """An image in ``place``, made there unless one of the same content is. ``config`` (1,) of ``EXCHANGE``,
-    ``reference`` (n,) of ``REFERENCE``; ``controller``: its name, for people. Raises ``ConfigError``.
+    ``reference`` (n,) of ``REFERENCE``, ``outputs`` (1,) of ``OUTPUTS``; ``controller``: its name, for people.
+    Raises ``ConfigError``.
     """
     exported = Exported(config, reference, np.zeros(0, CALL), "", controller, "")
     try:
@@ -60,6 +61,7 @@ def built(config: Records, reference: Records, can: CanConfig, controller: str, 
     except ExportError as error:
         raise ConfigError(str(error)) from None
     texts = exporting.sources(exported) | {"bus.h": _bus_h(can)}
+    texts["outputs.c"] = exporting.constant("pkxyz_outputs_words", outputs)
     digest = hashlib.sha256(code)
     for name, text in sorted(texts.items()):
         digest.update(f"{name}\n{text}".encode())

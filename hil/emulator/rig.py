@@ -141,7 +141,7 @@ def image_of(setup: Setup, place: Path) -> Path:
     handout = Handout(setup.trajectory, setup.bus.period_us, setup.excitation)
     reference = handout.rows(new_memory(Mode.IDLE), setup.ticks)
     controller = ToldController(setup.law.copy(), setup.bus, setup.gate)
-    return built(controller.record, reference, setup.bus.can, setup.controller.name, place)
+    return built(controller.record, reference, setup.new_outputs(), setup.bus.can, setup.controller.name, place)
 
 
 class Emulation:

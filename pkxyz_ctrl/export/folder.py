@@ -159,7 +159,7 @@ def sources(exported: Exported, *, has_loop: bool = False) -> dict[str, str]:
     return {
         "pkxyz.h": (loop_header if has_loop else header)(int(exported.law["period_us"][0]), exported.stored),
         "config.c": _config_c(exported),
-        "reference.c": _constant("pkxyz_path_words", exported.reference),
+        "reference.c": constant("pkxyz_path_words", exported.reference),
     }
 
 
@@ -169,14 +169,14 @@ def _filled(file: str, values: dict[str, str]) -> bytes:
 
 def _config_c(exported: Exported) -> str:
     """What this law has of the settings, and room for what it has of the memory."""
-    return _constant("pkxyz_config_words", exported.config, count=exported.stored.settings // 8) + (
+    return constant("pkxyz_config_words", exported.config, count=exported.stored.settings // 8) + (
         "\n/* room for what this law needs of pkxyz_exchange_memory */\n"
         "uint64_t pkxyz_memory_words[PKXYZ_MEMORY_BYTES / 8];\n"
     )
 
 
-def _constant(name: str, records: Records, *, count: int | None = None) -> str:
-    """The words of records and how many there are; or the first ``count`` words of one."""
+def constant(name: str, records: Records, *, count: int | None = None) -> str:
+    """C that defines the words of records and how many there are; or the first ``count`` words of one."""
     kind, words = struct_name(records.dtype), words_of(records)[:count]
     length = f"const int32_t {name}_count = {len(records)};\n" if count is None else ""
     return (
@@ -198,7 +198,7 @@ def _self_test_c(test: SelfTest) -> str:
         f"const uint64_t pkxyz_nan = 0x{CANONICAL_NAN:016x};\n"
     )
     return (
-        f"{_constant('pkxyz_call_words', test.calls)}\n{_constant('pkxyz_tried_words', test.tried)}\n"
+        f"{constant('pkxyz_call_words', test.calls)}\n{constant('pkxyz_tried_words', test.tried)}\n"
         f"uint64_t pkxyz_doubtful_words[PKXYZ_MEMORY_BYTES / 8];\n{constants}{flags}"
         f"const uint64_t pkxyz_digests[{len(test.digests)}] = {{\n{digests}}};\n"
     )

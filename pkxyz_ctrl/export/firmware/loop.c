@@ -11,7 +11,7 @@
 enum { POLL_US = 1000, UNPOLLED_MOST_US = 20000 }; /* of a start-up in which frame after frame comes */
 enum { SOMETHING_TO_SAY = 0x700, FRESH = 1 };      /* told by calls: refused, restarted, not restarted; a sample is in */
 
-extern const uint64_t pkxyz_config_words[], pkxyz_path_words[];
+extern const uint64_t pkxyz_config_words[], pkxyz_path_words[], pkxyz_outputs_words[];
 extern uint64_t pkxyz_memory_words[];
 extern const int32_t pkxyz_path_words_count;
 
@@ -171,6 +171,7 @@ int main(void)
     notes_open();
     stopwatch_open();
     require(pkxyz_switch_on(memory));
+    memory->outputs[0] = *(const pkxyz_outputs *)(const void *)pkxyz_outputs_words; /* as they were asked for */
     wait_until(0); /* for the time that it is */
     if (!come_up()) {
         wait_until(now.us); /* for the last notes to be taken */
