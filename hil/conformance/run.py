@@ -2,11 +2,13 @@
 
 from collections.abc import Callable, Iterator
 
-from hil.conformance import network, objects, outputs, process
+from hil.conformance import digital, network, objects, outputs, process
 from hil.conformance.talker import Talker
 from hil.conformance.verdict import Check, CheckResult, Verdict, judge
 
-CHECKS: tuple[Check, ...] = (objects.ANSWERS, *objects.CHECKS, *network.CHECKS, *process.CHECKS, *outputs.CHECKS)
+CHECKS: tuple[Check, ...] = (
+    objects.ANSWERS, *objects.CHECKS, *network.CHECKS, *process.CHECKS, *outputs.CHECKS, *digital.CHECKS,
+)  # fmt: skip
 
 
 def conformance(talker: Talker, checks: tuple[Check, ...] = CHECKS) -> Iterator[CheckResult]:

@@ -135,6 +135,23 @@ def test_heartbeats_say_operational(run):
         assert len(beats) == pytest.approx(recording.ticks * 200e-6 / 20e-3, abs=2)
 
 
+def test_trigger_bits_and_the_signature(run):
+    """Five bits by their names, in one byte; the signature of a protected node is one and the same, every 240 SYNCs."""
+    database, found, _, recording = run
+    outputs = database.get_message_by_name("RPDO1_outputs")
+    assert outputs.length == 1
+    for n, name in enumerate(("line", "pixel", "frame", "position", "in_position")):
+        told = outputs.decode(bytes([1 << n]))
+        assert [signal for signal, bit in told.items() if bit] == [f"Trigger_{name}"]
+    if "TPDO3_signature" not in {message.name for message in database.messages}:
+        assert database.get_message_by_name("RPDO2_drive").length == 6
+        return
+    signed = [n for n, tick in enumerate(found) if "TPDO3_signature" in tick]
+    assert len(signed) == recording.ticks // 240
+    assert {gap // 240 for gap in np.diff(signed)} <= {0, 1}
+    assert len({found[n]["TPDO3_signature"]["Signature"] for n in signed}) == 1
+
+
 def test_the_shipped_file_is_that_of_the_default_bus(tmp_path):
     assert pkxyz("dbc", cwd=tmp_path).stdout == SHIPPED.read_text(encoding="utf-8")
 

@@ -99,6 +99,7 @@ KINDS = {
         "sense PDO: alive counter", "sense PDO: CRC", "SYNC: SYNC counter", "drive PDO: too long",
         "outputs, with voltage: drive by SDO", "outputs, with voltage: scaling",
         "outputs, with voltage: drive PDO missing", "outputs, with voltage: drive time-out",
+        "signature: of what is read",
     },
 }  # fmt: skip
 

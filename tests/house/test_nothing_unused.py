@@ -22,7 +22,6 @@ NAMED_NOWHERE = {
     "_send_periodic_internal": "python-can", "capture_signals": "uvicorn", "format_commands": "click",
     "add_callback": "bluesky", "hints": "bluesky", "describe_configuration": "bluesky", "check_value": "bluesky",
     "locate": "bluesky",
-    "position_bit": "triggers on the wire", "scan_bits": "triggers on the wire",
 }  # fmt: skip
 """Who wants it all the same."""
 BY_NAME = {"pkxyz_ctrl.instrument.scpi": "a table of verbs looks them up"}

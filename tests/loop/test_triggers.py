@@ -3,11 +3,12 @@
 import numpy as np
 import pytest
 from loop_rig import rows_of
-from pkxyz_ctrl.loop.triggers import FRAME, LINE, PIXEL, POSITION, POSITION_TRIGGER, position_bit, scan_bits
 
 from hil.operate.sample_axes import PLAIN, Turn
 from hil.runs.scenario import load_scenario
 from hil.server.paths import StagePath, _OfSample
+from pkxyz_ctrl.config.triggers import FRAME, LINE, PIXEL, POSITION
+from pkxyz_ctrl.loop.outputs import POSITION_TRIGGER, position_bit
 from pkxyz_ctrl.safety.modes import Mode
 
 
@@ -82,13 +83,13 @@ def test_standing_noise_fires_nothing():
 
 def test_lines_pixels_and_frames_are_those_of_the_path():
     scenario = load_scenario("frames")
-    trajectory = _OfSample(scenario.config.reference, Turn(PLAIN))
+    trajectory = _OfSample(scenario.config.reference, Turn(PLAIN), 16)
     first = -(-trajectory.begin_us // 200)
     path = StagePath(trajectory, 200, first, trajectory.duration_us // 200 - first, "frames")
     lines = np.array(path.lines, np.int64)
     assert len(lines) == 80
     assert lines[:, 2].tolist() == [n // 10 for n in range(80)]
-    bits = np.array([scan_bits(lines, 16, float(row)) for row in range(path.rows)])
+    bits = path.outputs(0, path.rows)
     speed = np.array([path.sample(row, 1)[0, 3] for row in range(path.rows)])
     on_line = (bits & LINE) != 0
     assert on_line.sum() == (lines[:, 1] - lines[:, 0]).sum()

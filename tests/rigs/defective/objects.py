@@ -163,3 +163,19 @@ class Silent(AmplifierNode):
 
     def _on_sdo(self, data: bytes, t_us: int) -> None:
         pass
+
+
+class SignsSomethingElse(_OtherObjects):
+    """signature: of what is read"""
+
+    def read(self, index: int, subindex: int) -> bytes:
+        told = super().read(index, subindex)
+        return bytes((told[0] ^ 1, told[1])) if (index, subindex) == (0x2020, 1) else told
+
+
+class OutputsAreDeaf(AmplifierNode):
+    """digital outputs: RPDO 1"""
+
+    def power_on(self) -> None:
+        self.digital.receive = lambda data, t_us: None
+        super().power_on()
