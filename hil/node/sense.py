@@ -57,6 +57,8 @@ class SenseTransmitter:
         self._event = Alarm(clock, self._on_event)
         self._running = False
         self._each = False  # SYNC is one to sample at
+        self._sent: tuple[int, int, int] | None = None  # last counts that were
+        self._waits_for: bytes | None = None  # a SYNC with this, before anything is sampled
         self.sync_us = 0
         self.cycle_us = 0  # between the last two SYNCs
         self.due_us: int | None = None  # of the frame in the turn-around
@@ -94,7 +96,7 @@ class SenseTransmitter:
         """The node has become operational."""
         self._running = True
         self._to_go = self._every
-        self._sent: tuple[int, int, int] | None = None
+        self._sent = None
         self._waits_for = self._start_data
         self._each = self._every == 1 and self._start_data is None
         if self._event_us:

@@ -4,31 +4,46 @@ import argparse
 import json
 import sys
 import time
-from array import array
-from collections import deque
-from collections.abc import Callable
 from concurrent.futures import ProcessPoolExecutor, as_completed
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
-sys.path[:0] = [str(Path(__file__).parents[2]), str(Path(__file__).parents[1] / "rigs"), str(Path(__file__).parent)]
+_TESTS = Path(__file__).parents[1]
+sys.path[:0] = [str(_TESTS.parent), str(_TESTS / "rigs"), str(Path(__file__).parent / "composition")]
 
 import numpy as np  # noqa: E402
 from configurations import CONFIGURATIONS, Configuration  # noqa: E402
 from fates import Option, ViolationError  # noqa: E402
-from scipy.sparse import csr_matrix  # noqa: E402
-from scipy.sparse.csgraph import breadth_first_order, connected_components  # noqa: E402
+from product import FULL, IN_FLIGHT, MISSING, OPTIONS_MOST, VIOLATED, WORLD  # noqa: E402
+from search import (  # noqa: E402
+    FLIGHTS,
+    NUMBER,
+    STATES,
+    TRANSITIONS,
+    Store,
+    add,
+    expand,
+    fill,
+    first_start_without_end,
+    first_without_a_way_back,
+)
 from story import as_text, from_text, tell  # noqa: E402
-from world import World, learnt  # noqa: E402
+from world import Composition, World, option_of, violation_of  # noqa: E402
 
-IN_CI = ("two", "slow drive time-out", "one", "whole dialogue", "well")
-RUNNING, STARTING, ENDED = 1, 2, 4
+from pkxyz_ctrl.can.codec import Counts  # noqa: E402
+from pkxyz_ctrl.can.driver_rules import DriverState  # noqa: E402
+from pkxyz_ctrl.compiled.direct_call import direct  # noqa: E402
+from pkxyz_ctrl.safety.modes import Mode  # noqa: E402
+
+EXPLORED = Path(__file__).with_name("explored.json")
+IN_CI = tuple(name for name, found in json.loads(EXPLORED.read_text("utf-8")).items() if found["complete"])
+"""What was explored to the fixed point once, and left its figures: ``--figures tests/proof/explored.json``."""
 
 
 @dataclass
 class Explored:
-    """What there is: ``edges`` from state to state by number, ``origin`` the first way to each."""
+    """What there is."""
 
     states: int = 0
     transitions: int = 0
@@ -38,119 +53,144 @@ class Explored:
     violation: str = ""
     story: list[Option] = field(default_factory=list)
     longest_apart: int = 0
-    origin: list[tuple[int, tuple[Option, ...]]] = field(default_factory=list)
-    heads: "array[int]" = field(default_factory=lambda: array("I"))
-    tails: "array[int]" = field(default_factory=lambda: array("I"))
-    marks: bytearray = field(default_factory=bytearray)
+    asked: int = 0  # so often was a side asked what it does in a state
+    of_sides: tuple[int, int] = (0, 0)  # states of controller and node, each by itself
+    met: set[tuple[Mode, DriverState, Counts]] = field(default_factory=set)
+
+
+class Search:
+    """The states found so far, and where the search is."""
+
+    def __init__(self, configuration: Configuration) -> None:
+        self.composition = Composition(configuration)
+        self._world, self._kept = np.zeros(1, WORLD), np.zeros(WORLD.itemsize // 8, np.int64)
+        self._words = self._world.view(np.int64)
+        self._may, self._then = (np.zeros(OPTIONS_MOST, np.int32) for _ in range(2))
+        self.cursor = np.zeros(5, np.int64)
+        n = 1 << 14
+        self.store = Store(
+            states=np.zeros((n, 2), np.int64), slots=np.full(2 * n, -1, np.int32),
+            flights=np.zeros((n, IN_FLIGHT), np.int64), flight_slots=np.full(2 * n, -1, np.int32),
+            origin=np.zeros(n, np.int32), option=np.zeros(n, np.int32), marks=np.zeros(n, np.uint8),
+            begins=np.zeros(n + 1, np.int64), tails=np.zeros(4 * n, np.uint32),
+        )  # fmt: skip
+        self._mine = self._world, self._words, self._kept, self._may, self._then
+        self._expand = direct(expand, *self._mine, self.composition.rows, self.store, self.cursor)
+
+    def begin(self) -> None:
+        """The first state is found. Raises `ViolationError`."""
+        world = World(self.composition)
+        world.settle()
+        self._words[:] = world.words
+        rows = self.composition.rows
+        add(self._world[0], self._words, rows, self.store, self.cursor, -1, 0, len(world.choices()))
+
+    def go_on(self) -> int:
+        """Expand states until something else is to be done: `MISSING`, `FULL`, `VIOLATED`, or 0 for the end."""
+        return self._expand(*self._mine, self.composition.rows, self.store, self.cursor)
+
+    def grow(self) -> None:
+        """Room for twice as many of what there is no more room for."""
+        store, count = self.store, self.cursor
+        longer: dict[str, Any] = {}
+        if count[STATES] == len(store.states):
+            names = ("states", "origin", "option", "marks", "begins")
+            longer = {name: _twice(getattr(store, name)) for name in names}
+            longer["slots"] = np.full(2 * len(store.slots), -1, np.int32)
+            fill(longer["states"], longer["slots"], count[STATES])
+        if count[FLIGHTS] == len(store.flights):
+            longer |= {
+                "flights": _twice(store.flights),
+                "flight_slots": np.full(2 * len(store.flight_slots), -1, np.int32),
+            }
+            fill(longer["flights"], longer["flight_slots"], count[FLIGHTS])
+        if not longer:
+            longer = {"tails": _twice(store.tails)}
+        self.store = store._replace(**longer)
+
+    def violation(self) -> tuple[str, list[Option]]:
+        """What is wrong where the search stands, and the way there."""
+        number, option = int(self.cursor[NUMBER]), int(self._may[self.cursor[1]])
+        way = [*self.way_to(number), option_of(self.composition, option)]
+        return violation_of(self.composition, self._world), way
 
     def way_to(self, number: int) -> list[Option]:
-        """The shortest way to a state from the beginning."""
-        ways: list[tuple[Option, ...]] = []
-        while number >= 0:
-            number, way = self.origin[number]
-            ways.append(way)
-        return [option for way in reversed(ways) for option in way]
+        """The choices of the shortest way from the beginning."""
+        way: list[Option] = []
+        while self.store.origin[number] >= 0:
+            way.append(option_of(self.composition, int(self.store.option[number])))
+            number = int(self.store.origin[number])
+        return way[::-1]
+
+    def met(self) -> set[tuple[Mode, DriverState, Counts]]:
+        """Modes, states of the driver and counts of the combs that were there together."""
+        rows, words = self.composition.rows, self.store.states[: self.cursor[STATES], 0]
+        pairs = np.unique(words & ((1 << 42) - 1))
+        of_controller, of_node = rows.controllers[pairs & 0x3FFFFF], rows.nodes[pairs >> 22]
+        found = of_controller["mode"], of_controller["driver"], of_node["counts"]
+        counts = self.composition.known.counts.things
+        return {
+            (Mode(mode), DriverState(driver), counts[combs])
+            for mode, driver, combs in zip(*(column.tolist() for column in found), strict=True)
+        }
 
 
-def settle(world: World) -> tuple[list[Option], tuple[Option, ...]]:
-    """Go on until something has to be decided; returns what may happen there, and what happened on the way."""
-    way: list[Option] = []
-    while True:
-        options = world.options()
-        if len(options) != 1 or (way and world.is_landmark()):
-            return options, tuple(way)
-        way.append(options[0])
-        world.take(options[0])
+def _twice(held: np.ndarray[Any, Any]) -> np.ndarray[Any, Any]:
+    return np.concatenate((held, np.zeros_like(held)))
 
 
-def explore(
-    configuration: Configuration,
-    limit_s: float = 1e9,
-    show: bool = False,
-    look: Callable[[World], object] = lambda world: None,
-) -> Explored:
-    """All states from the first on, the nearest first, until none is new, an invariant fails or the time is over.
-
-    ``look`` is called in each of them.
-    """
-    world = World(configuration, learnt(configuration))
-    found = Explored()
-    begin_s = time.monotonic()
-    numbers: dict[bytes, int] = {}
-    frontier: deque[tuple[int, tuple[Any, ...], list[Option]]] = deque()
-
-    def add(options: list[Option], origin: int, way: tuple[Option, ...]) -> int:
-        state = world.take_state()
-        key = world.key(state)
-        number = numbers.get(key)
-        if number is None:
-            number = numbers[key] = len(numbers)
-            look(world)
-            found.origin.append((origin, way))
-            found.marks.append(RUNNING * world.is_running | STARTING * world.is_starting | ENDED * (not options))
-            if options:
-                frontier.append((number, state, options))
-        return number
-
-    options, way = settle(world)
-    add(options, -1, way)
-    while frontier:
-        if time.monotonic() - begin_s > limit_s:
-            break
-        number, state, options = frontier.popleft()
-        for option in options:
-            world.put_state(state)
-            try:
-                world.take(option)
-                onward, way = settle(world)
-            except ViolationError as violation:
-                found.violation = str(violation)
-                found.story = [*found.way_to(number), option]
+def explore(configuration: Configuration, limit_s: float = 1e9, show: bool = False) -> Explored:
+    """All states from the first on, the nearest first, until none is new, an invariant fails or the time is over."""
+    found, begin_s = Explored(), time.monotonic()
+    search = Search(configuration)
+    told_s, told = 0.0, MISSING
+    try:
+        search.begin()
+        while told != 0 and time.monotonic() - begin_s < limit_s:
+            told = search.go_on()
+            if told == MISSING:
+                search.composition.resolve()
+            elif told == FULL:
+                search.grow()
+            elif told == VIOLATED:
+                found.violation, found.story = search.violation()
                 break
-            found.heads.append(number)
-            found.tails.append(add(onward, number, (option, *way)))
-        if show and number % 20000 == 0:
-            print(
-                f"{number} expanded, {len(numbers)} states, {len(frontier)} wait, {time.monotonic() - begin_s:.0f} s",
-                flush=True,
-            )
-        if found.violation:
-            break
-    found.states, found.transitions = len(numbers), len(found.heads)
-    found.seconds = time.monotonic() - begin_s
-    found.is_complete = not frontier and not found.violation
-    found.longest, found.longest_apart = world.longest, world.longest_apart
+            if show and time.monotonic() - told_s > 10:
+                told_s = time.monotonic()
+                print(_progress(search, told_s - begin_s), flush=True)
+    except ViolationError as violation:
+        found.violation = str(violation)
+    composition, cursor = search.composition, search.cursor
+    found.states, found.transitions = int(cursor[STATES]), int(cursor[TRANSITIONS])
+    found.asked = composition.asked
+    found.of_sides = composition.controller.kept.count, composition.node.kept.count
+    found.longest, found.longest_apart = (int(composition.rows.rules[name][0]) for name in ("longest", "longest_apart"))
+    found.is_complete = told == 0
+    found.met = search.met()
     if found.is_complete:
-        _look_at_the_whole(found)
+        _look_at_the_whole(search, found)
+    found.seconds = time.monotonic() - begin_s
     return found
 
 
-def _look_at_the_whole(found: Explored) -> None:
-    """What is not true of a state but of all ways from it: a way back from everywhere, and no start-up for ever."""
-    marks = np.frombuffer(found.marks, np.uint8)
-    heads, tails = (np.frombuffer(ends, np.uint32).astype(np.int64) for ends in (found.heads, found.tails))
-    size = found.states
-    starting = marks & STARTING > 0
-    inside = starting[heads] & starting[tails]
-    graph = csr_matrix((np.ones(inside.sum(), np.int8), (heads[inside], tails[inside])), shape=(size, size))
-    _, part = connected_components(graph, connection="strong")
-    again = np.flatnonzero((np.bincount(part)[part] > 1) & starting)
-    stays = heads[inside & (heads == tails)]
-    endless = np.r_[again, stays]
-    if len(endless):
-        found.violation = "a start-up can go on for ever from here"
-        found.story = found.way_to(int(endless[0]))
-        return
-    good = np.flatnonzero(marks & (RUNNING | ENDED))
-    backwards = csr_matrix(
-        (np.ones(len(heads) + len(good), np.int8), (np.r_[tails, np.full(len(good), size)], np.r_[heads, good])),
-        shape=(size + 1, size + 1),
+def _progress(search: Search, seconds: float) -> str:
+    composition, cursor = search.composition, search.cursor
+    return (
+        f"{cursor[NUMBER]} of {cursor[STATES]} states left in every way, {composition.asked} questions to "
+        f"{composition.controller.kept.count} + {composition.node.kept.count} states of the sides, {seconds:.0f} s"
     )
-    reached = breadth_first_order(backwards, size, return_predecessors=False)
-    lost = np.setdiff1d(np.arange(size), reached)
-    if len(lost):
-        found.violation = "from here no way leads back to a closed loop without power off"
-        found.story = found.way_to(int(lost[0]))
+
+
+def _look_at_the_whole(search: Search, found: Explored) -> None:
+    """What is not true of a state but of all ways from it: a way back from everywhere, and no start-up for ever."""
+    endless = first_start_without_end(search.store, found.states)
+    lost = first_without_a_way_back(search.store, found.states)
+    if endless >= 0:
+        found.violation = "a start-up can go on for ever from here"
+        found.story = search.way_to(endless)
+    elif lost >= 0:
+        found.violation = "from here no way leads back to a closed loop without power off or another fault"
+        found.story = search.way_to(lost)
 
 
 def report(name: str, seconds: float, show: bool = False) -> tuple[str, dict[str, Any]]:
@@ -159,6 +199,7 @@ def report(name: str, seconds: float, show: bool = False) -> tuple[str, dict[str
     found = explore(configuration, seconds, show=show)
     words = (
         f"{name}: {found.states} states, {found.transitions} transitions, {found.seconds:.0f} s, "
+        f"{found.asked} questions to {found.of_sides[0]} + {found.of_sides[1]} states of the sides, "
         f"{'fixed point' if found.is_complete else 'NOT COMPLETE'}, 0 V {found.longest} ticks after a decision, "
         f"gate and combs apart for {found.longest_apart}"
     )
@@ -197,7 +238,8 @@ def main() -> int:
         json.loads(arguments.figures.read_text()) if arguments.figures and arguments.figures.exists() else {}
     )
     with ProcessPoolExecutor(arguments.workers) as pool:
-        waiting = {pool.submit(report, name, arguments.seconds, arguments.show): name for name in arguments.name}
+        most_first = sorted(arguments.name, key=lambda name: -CONFIGURATIONS[name].faults)
+        waiting = {pool.submit(report, name, arguments.seconds, arguments.show): name for name in most_first}
         for done in as_completed(waiting):
             words, figures[waiting[done]] = done.result()
             print(words, flush=True)

@@ -59,7 +59,7 @@ CONFIGURATIONS: Final = {
     for c in (
         Configuration("well", 0, kinds=frozenset()),
         Configuration("one", 1),
-        Configuration("two", 2, kinds=ANY),
+        Configuration("two", 2),
         Configuration("three", 3, kinds=ANY),
         Configuration("three losses", 3, kinds=frozenset({"lose"})),
         Configuration("a cut and a loss", 2, kinds=frozenset({"lose", "cut"})),

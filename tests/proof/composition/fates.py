@@ -1,7 +1,7 @@
 """What may happen where the code does not decide, to a frame or by whoever operates; and what never may, to combs."""
 
 from collections.abc import Callable
-from typing import Any, NamedTuple
+from typing import Any
 
 from any_law import sense_counts_at_rest
 from configurations import HARD, LEVELS, MAXIMUM, SOFT, STEP, TOO_FAR
@@ -14,27 +14,6 @@ from pkxyz_ctrl.loop.controller import Controller
 from pkxyz_ctrl.safety.modes import Event, Mode
 
 Option = tuple[Any, ...]
-
-
-class Held(NamedTuple):
-    frame: Frame
-    ticks_left: int
-
-
-def fates_of(frame: Frame, kinds: frozenset[str], cut: frozenset[int]) -> list[Option]:
-    """What may become of a frame, by faults of these kinds."""
-    if frame.can_id in cut:
-        return [("vanish",)]
-    options: list[Option] = [("deliver",)]
-    if "late" in kinds:
-        options.append(("late",))
-    if "repeat" in kinds:
-        options.append(("repeat",))
-    if "damage" in kinds:
-        options += [("damage", place) for place in range(len(damaged(frame)))]
-    if "lose" in kinds:
-        options.append(("lose",))
-    return options
 
 
 def damaged(frame: Frame) -> list[Frame]:

@@ -2,12 +2,12 @@
 
 import json
 
-from configurations import DRIVE, LEVELS, NAMES, NODE_BEAT, OUR_BEAT, PERIOD_US, SENSE, SYNC, Configuration
+from configurations import DRIVE, LEVELS, NAMES, NODE_BEAT, OUR_BEAT, SENSE, SYNC, Configuration
 from fates import Option, ViolationError
-from world import World, learnt
+from sides import Relative
+from world import Composition, World, choice_of, option_of
 
-from pkxyz_ctrl.can.frame import Frame
-from pkxyz_ctrl.safety.modes import Event, Mode
+from pkxyz_ctrl.safety.modes import Event
 
 _PARTS = {SENSE: "sense", DRIVE: "drive", SYNC: "sync", NODE_BEAT: "heartbeat", OUR_BEAT: "heartbeat"}
 _KINDS = {"lose": "drop", "late": "delay", "repeat": "duplicate", "damage": "corrupt"}
@@ -17,39 +17,40 @@ _LOCKSTEP_PERIOD_S = 200e-6
 
 def tell(configuration: Configuration, way: list[Option]) -> str:
     """The story: what was asked, what went wrong, and what became of the combs. It is replayed to be told."""
-    world, lines, faults = World(configuration, learnt(configuration)), [], []
-    first_us: int | None = None
-    violation = ""
-    for option in [*way, *[()] * FOLLOWED]:
-        if not option:  # behind the last choice, what follows by itself
-            options = world.options()
-            if len(options) != 1 or violation:
-                break
-            option = options[0]
-        if world.phase == "before" and first_us is None:
-            first_us = world.tick_us
-        frame = world.wire[0] if world.wire else world.held[option[1]].frame if option[0] == "release" else None
-        was, combs = world.controller.mode, world.plant.counts
-        tick = 0 if first_us is None else (world.clock.now_us - first_us) // PERIOD_US
+    composition = Composition(configuration)
+    world, lines, faults = World(composition), [], []
+    violation, left, has_moved, follows = "", list(way), False, FOLLOWED
+    while not violation and follows:
+        choices = world.choices()
+        if left and (len(choices) != 1 or (has_moved and world.is_landmark)):
+            choice, has_moved = choice_of(composition, left.pop(0)), False
+        elif len(choices) == 1:
+            choice, has_moved = choices[0], True
+            follows -= not left  # behind the last choice, what follows by itself
+        else:
+            break
+        frame, option = world.frame(choice), option_of(composition, choice)
+        was, combs, tick = world.mode, world.combs, max(world["ticks"] - 1, 0)
+        is_at_work = world["ticks"] > 0
         try:
-            world.take(option)
+            world.take(choice)
         except ViolationError as found:
             violation = str(found)
         said = _said(option, frame)
-        if world.controller.mode != was:
-            said.append(f"mode {Mode(was).name} -> {Mode(world.controller.mode).name}")
-        if world.plant.counts != combs:
-            said.append(f"combs {combs} -> {world.plant.counts}")
+        if world.mode != was:
+            said.append(f"mode {was.name} -> {world.mode.name}")
+        if world.combs != combs:
+            said.append(f"combs {combs} -> {world.combs}")
         if said:
             lines.append(f"tick {tick:3}: " + "; ".join(said))
-        if frame is not None and option[0] in _KINDS and first_us is not None:
+        if frame is not None and option[0] in _KINDS and is_at_work:
             faults.append(_fault(option[0], frame, tick))
-    lines.append(f"VIOLATION: {violation}" if violation else f"ends in {Mode(world.controller.mode).name}")
+    lines.append(f"VIOLATION: {violation}" if violation else f"ends in {world.mode.name}")
     return "\n".join([*lines, *faults])
 
 
-def _said(option: Option, frame: Frame | None) -> list[str]:
-    name = "" if frame is None else f"{NAMES[frame.can_id]} [{frame.data.hex(' ')}]"
+def _said(option: Option, frame: Relative | None) -> list[str]:
+    name = "" if frame is None else f"{NAMES[frame.can_id]} [{_held(frame)}]"
     match option[0]:
         case "tick":
             asked = [] if option[1] is Event.NONE else [f"asked: {option[1].name}"]
@@ -74,7 +75,13 @@ def _said(option: Option, frame: Frame | None) -> list[str]:
     return []
 
 
-def _fault(kind: str, frame: Frame, tick: int) -> str:
+def _held(frame: Relative) -> str:
+    """What stands in it, a counter as the difference to its sender's."""
+    payload = frame.payload
+    return payload.hex(" ") if isinstance(payload, bytes) else ", ".join(map(str, payload))
+
+
+def _fault(kind: str, frame: Relative, tick: int) -> str:
     """The same fault for ``pkxyz sil --fault``, in the same tick of a bus at 5 kHz, where lockstep has it."""
     part = _PARTS.get(frame.can_id)
     if part is None:
