@@ -11,7 +11,7 @@ import typer
 from hil.commands.run import ReplaceEarlier
 from hil.commands.sil import show
 from hil.lanes.lane import Lane
-from hil.pictures.aside import Aside
+from hil.pictures.drawing_process import DrawingProcess
 from hil.screen.choices import require_simulated
 from hil.screen.first_run import say_if_compiling
 from hil.screen.progress import progress_bar
@@ -50,7 +50,7 @@ def emulate(
 
     find("scenarios", scenario)
     require_programs()
-    with Aside() as pictures:
+    with DrawingProcess() as pictures:
         say_if_compiling(quiet=as_json)
         from hil.faults.fault import parse
         from hil.runs.scenario import load_scenario
@@ -70,7 +70,7 @@ def emulate(
 
 
 def _ran(
-    loaded: "Scenario", out: Path | None, replace_earlier: bool, pictures: Aside, *, quiet: bool
+    loaded: "Scenario", out: Path | None, replace_earlier: bool, pictures: DrawingProcess, *, quiet: bool
 ) -> "tuple[Summary, Path, Emulation]":
     """The run into its folder, with its picture."""
     from hil.emulator.rig import Emulation
