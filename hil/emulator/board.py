@@ -72,7 +72,7 @@ class Board:
                 interface="slcan", channel=f"socket://127.0.0.1:{port}", sleep_after_open=0.0, timeout=0.1
             )
         except can.CanError as error:
-            raise self._gone() from error
+            raise self._ending() from error
 
     def __enter__(self) -> Self:
         return self
@@ -94,7 +94,7 @@ class Board:
         try:
             message = self._bus.recv(_SILENT_MOST_S)
         except can.CanError as error:
-            raise self._gone() from error
+            raise self._ending() from error
         if message is None:
             self.kill()
             raise BoardGoneError(f"said nothing for {_SILENT_MOST_S:.0f} s and was ended")
@@ -112,7 +112,7 @@ class Board:
             if frame is not None:
                 self._bus.send(to_message(frame))
         except can.CanError as error:
-            raise self._gone() from error
+            raise self._ending() from error
 
     def notes(self, count: int, held: int) -> Iterator[tuple[np.void, NDArray[np.uint8]]]:
         """Head and memory, of ``held`` bytes, of the ``count`` calls that are noted since the last answer."""

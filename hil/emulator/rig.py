@@ -107,12 +107,12 @@ class EmulatedRig(LockstepRig):
 
     def _answer(self, clock: Clock) -> None:
         told, what, until_us = self._told, self._request.what, self._request.us
-        told.given = None
+        told.handed = None
         if what == WAIT_UNTIL:
             clock.wait_until(until_us)
         else:
-            told.given = self.port.receive(until_us)
-        self.board.tell(clock.now_us, self.port.unsent(), told.asked, told.given)
+            told.handed = self.port.receive(until_us)
+        self.board.tell(clock.now_us, self.port.unsent(), told.asked, told.handed)
         told.asked = None
 
     def _outlive(self, how: str, tick: int) -> None:

@@ -24,13 +24,13 @@ HEAD: Final = np.dtype(
 class ToldController(Controller):
     """Frames go out where the calls are made, so this one sends none.
 
-    ``given``: the frame that was handed over last; ``is_up``: periods may begin; ``finished``: periods so far;
+    ``handed``: the frame that was handed over last; ``is_up``: periods may begin; ``finished``: periods so far;
     ``asked``: what ``clearing`` is to be, None while nobody has asked. ``sending``: for a controller that sends.
     """
 
     def __init__(self, law: Records, bus: BusConfig, gate: GateConfig, *sending: Any) -> None:
         super().__init__(law, bus, gate, lambda frame: None)
-        self.given: Frame | None = None
+        self.handed: Frame | None = None
         self.is_up, self.finished = False, 0
         self.asked: bool | None = None
         self.held = stored_in_exchange(self.law).memory
@@ -64,10 +64,10 @@ class ToldController(Controller):
             case Call.WAIT:
                 self._heard = None
             case Call.FRAME if self.is_up:
-                assert self.given is not None
-                self.receive(self.given, t_us)
+                assert self.handed is not None
+                self.receive(self.handed, t_us)
             case Call.FRAME:
-                self._heard = self.given
+                self._heard = self.handed
             case Call.BEGIN:
                 self.begin(t_us)
             case Call.PERIOD:

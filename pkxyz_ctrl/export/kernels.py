@@ -5,15 +5,18 @@ that setting once, when it is imported, hence the process. Its output and its ma
 the versions are pinned, and a test compares bits.
 """
 
+import hashlib
 import json
 import os
 import subprocess
 import sys
 import tempfile
+from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import NamedTuple
 
-from pkxyz_ctrl.export.kept import kept
+import llvmlite
+import numba
 
 
 class ExportError(ValueError):
@@ -32,6 +35,32 @@ def kernels() -> Kernels:
     text = kept("export.ll", ("entries.py", "emit.py"), lambda: _emitted().encode()).decode()
     first, _, ir = text.partition("\n")
     return Kernels(ir, json.loads(first))
+
+
+def kept(name: str, sources: Sequence[str], make: Callable[[], bytes]) -> bytes:
+    """What ``make`` gives, or gave before: it lies beside numba's kernels, in a folder of their digest. ``name`` is
+    ``stem.suffix``, ``sources`` are the modules of this room on which it depends besides.
+    """
+    file = _place(name, sources)
+    if file is not None and file.is_file():
+        return file.read_bytes()
+    made = make()
+    if file is not None:
+        beside = file.with_suffix(f".{os.getpid()}")
+        beside.write_bytes(made)
+        beside.replace(file)
+    return made
+
+
+def _place(name: str, sources: Sequence[str]) -> Path | None:
+    folder = os.environ.get("NUMBA_CACHE_DIR")
+    if folder is None or not Path(folder).is_dir():
+        return None
+    digest = hashlib.sha256(f"{numba.__version__} {llvmlite.__version__}".encode())
+    for source in sources:
+        digest.update(Path(__file__).with_name(source).read_bytes())
+    stem, _, suffix = name.rpartition(".")
+    return Path(folder) / f"{stem}-{digest.hexdigest()[:16]}.{suffix}"
 
 
 def _emitted() -> str:
