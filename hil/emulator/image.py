@@ -8,14 +8,13 @@ from pathlib import Path
 
 import numpy as np
 from numpy.typing import NDArray
-from pkxyz_ctrl.export.kept import kept
 
 from pkxyz_ctrl.config.bus import CanConfig
 from pkxyz_ctrl.config.files import ConfigError
 from pkxyz_ctrl.export import folder as exporting
 from pkxyz_ctrl.export.calls import CALL
 from pkxyz_ctrl.export.folder import Exported, require_exportable, require_room
-from pkxyz_ctrl.export.kernels import ExportError, kernels
+from pkxyz_ctrl.export.kernels import ExportError, kept, kernels
 from pkxyz_ctrl.export.lowering import lower
 from pkxyz_ctrl.export.targets import TARGETS
 

@@ -123,8 +123,8 @@ HOUSE: Mapping[str, Room] = MappingProxyType({
         "hil.pictures", "hil.pictures.wafer", "hil.screen", "hil.api",
     )),
     "hil.commands": Room((
-        "pkxyz_ctrl.*", "hil.recording", "hil.faults", "hil.lanes", "hil.emulator", "hil.conformance", "hil.runs",
-        "hil.studies", "hil.pictures", "hil.screen", "hil.bench.rigs", "hil.bench", "hil.commands.studies",
+        "pkxyz_ctrl.*", "hil.recording", "hil.faults", "hil.lanes", "hil.native", "hil.emulator", "hil.conformance",
+        "hil.runs", "hil.studies", "hil.pictures", "hil.screen", "hil.bench.rigs", "hil.bench", "hil.commands.studies",
     )),
     "hil.commands.operation": Room((
         "pkxyz_ctrl.*", "hil.lanes", "hil.conformance", "hil.operate", "hil.server", "hil.screen", "hil.commands",
