@@ -16,13 +16,13 @@ import numpy as np
 from numpy.typing import NDArray
 
 from hil.bench.figure import Figure
+from hil.native.program import compiled
 from hil.runs.at_rate import RanAtRate, run_into
 from hil.runs.run_folder import RunFolder
 from hil.runs.scenario import Scenario, load_scenario
 from hil.studies.latency import read_cyclictest, start_cyclictest
 from pkxyz_ctrl.can import cob_id
 from pkxyz_ctrl.config.files import write_toml
-from pkxyz_ctrl.export.program import compiled
 from pkxyz_ctrl.io.clocks import percentile_us
 
 TURNS, SECONDS = 3, 4.0

@@ -170,9 +170,9 @@ def plant(
 
 def native_loop(loaded: Any, can_config: "CanConfig") -> Path:
     """The program, compiled if it isn't yet. Raises ``ConfigError`` for what it does not take, and without compiler."""
+    from hil.native.program import compiled, kept
     from hil.native.settings import require_native
     from pkxyz_ctrl.export.kernels import ExportError
-    from pkxyz_ctrl.export.program import compiled, kept
 
     require_native(loaded.setup(), can_config)
     try:

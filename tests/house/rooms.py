@@ -109,9 +109,9 @@ HOUSE: Mapping[str, Room] = MappingProxyType({
     "hil.screen": Room(("pkxyz_ctrl.*", "hil.lanes", "hil.runs", "hil.studies.margins")),
     "hil.bench.rigs": Room(("sim.motion", "sim", "pkxyz_ctrl.*", "hil.lanes", "hil.runs")),
     "hil.bench": Room((
-        "pkxyz_ctrl.*", "hil.bus", "hil.plant", "hil.recording", "hil.lanes", "hil.runs", "hil.studies.spread",
-        "hil.studies.margins", "hil.studies.identify", "hil.studies.tune", "hil.studies.wafer", "hil.studies",
-        "hil.bench.rigs",
+        "pkxyz_ctrl.*", "hil.bus", "hil.plant", "hil.recording", "hil.lanes", "hil.native", "hil.runs",
+        "hil.studies.spread", "hil.studies.margins", "hil.studies.identify", "hil.studies.tune", "hil.studies.wafer",
+        "hil.studies", "hil.bench.rigs",
     )),
     "hil.api": Room((
         "pkxyz_ctrl.*", "hil.recording", "hil.lanes", "hil.runs", "hil.studies.spread", "hil.studies.margins",

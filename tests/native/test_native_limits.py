@@ -19,11 +19,11 @@ from hil.bus.unix_folder import UnsafeFolderError, open_folder
 from hil.lanes.ending import Ending
 from hil.native.mapped import BLOCKS, RING_BYTES, Mapped
 from hil.native.native_rig import NativeRig
+from hil.native.program import compiled
 from hil.native.ring_recorder import RingRecorder
 from hil.recording.recording import Recording
 from hil.runs.scenario import load_scenario
 from pkxyz_ctrl.config.files import ConfigError
-from pkxyz_ctrl.export.program import compiled
 from pkxyz_ctrl.export.shared import BLOCK_ROWS
 from pkxyz_ctrl.safety.modes import Mode
 

@@ -30,11 +30,11 @@ from two_processes import (
 
 from hil.bus.unix_bus import UnixBus
 from hil.lanes.wall_plant import TRUTH
+from hil.native.program import compiled
 from hil.recording.recording import Recording
 from hil.runs.replay import replay
 from hil.runs.seal import changed
 from pkxyz_ctrl.compiled.kernel_cache import choose_kernel_cache
-from pkxyz_ctrl.export.program import compiled
 from pkxyz_ctrl.safety.modes import Mode
 
 pytestmark = pytest.mark.at_rate

@@ -32,9 +32,9 @@ from on_vcan import (
 
 import hil.native.native_rig  # noqa: F401  in the guest an import takes a while
 from hil.lanes.wall_plant import TRUTH
+from hil.native.program import kept
 from hil.recording.recording import Recording
 from hil.runs.replay import replay
-from pkxyz_ctrl.export.program import kept
 from pkxyz_ctrl.safety.modes import Mode
 
 __all__ = ["bench", "plant"]

@@ -26,8 +26,8 @@ import matplotlib.font_manager  # noqa: F401  makes its list of fonts in the cac
 
 from hil.lanes import in_process as lanes
 from hil.lanes.lane import Lane
+from hil.native.program import compiled
 from hil.runs.scenario import load_scenario
-from pkxyz_ctrl.export.program import compiled
 
 ROOT = Path(__file__).parent.parent.parent
 SCRATCH = ROOT / ".uml"

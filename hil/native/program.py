@@ -77,6 +77,6 @@ def _place() -> Path | None:
     if folder is None or not Path(folder).is_dir():
         return None
     digest = hashlib.sha256(f"{numba.__version__} {llvmlite.__version__} {digest_of_kernels()} {compiler()}".encode())
-    for path in sorted([*Path(__file__).parent.glob("*.py"), *LOOP_SOURCES.iterdir()]):
+    for path in sorted([*LOOP_SOURCES.parent.glob("*.py"), Path(__file__), *LOOP_SOURCES.iterdir()]):
         digest.update(path.read_bytes())
     return Path(folder) / f"loop-{digest.hexdigest()[:16]}"
