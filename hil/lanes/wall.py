@@ -187,9 +187,9 @@ class WallRig:
 
     def go_real_time(self) -> str:
         """Ask the system for what a loop at rate needs; in a line what it gave."""
-        given = go_real_time()
+        words = go_real_time()
         settle_memory()
-        return given
+        return words
 
     def start(self, say: Callable[[str], object] = lambda words: None) -> None:
         """Start the amplifier; ``say`` is told which protections are lacking. Raises ``StartUpError`` and ``Ended``."""

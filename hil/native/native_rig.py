@@ -18,7 +18,7 @@ from hil.native.ring_recorder import RingRecorder
 from hil.native.settings import fill
 from hil.native.teller import Teller
 from pkxyz_ctrl.config.bus import CanConfig
-from pkxyz_ctrl.export.shared import Outcome, Phase
+from pkxyz_ctrl.export.shared import LoopEnd, Phase
 from pkxyz_ctrl.io.can_port import refused_bus
 from pkxyz_ctrl.learning import Learner
 from pkxyz_ctrl.loop.controller import StartUpError
@@ -86,7 +86,7 @@ class NativeRig:
     def start(self, say: Callable[[str], object]) -> None:
         """Until the amplifier is started; ``say`` is told which protections are lacking. Raises ``StartUpError``."""
         self._until(Phase.RUNNING)
-        if self._state["phase"] == Phase.ENDED and self._state["outcome"] == Outcome.NOT_STARTED:
+        if self._state["phase"] == Phase.ENDED and self._state["outcome"] == LoopEnd.NOT_STARTED:
             self._raise_outcome()
         self._remember()
         for lacking in self.controller.driver.lost:
@@ -147,20 +147,20 @@ class NativeRig:
 
     def _raise_outcome(self) -> None:
         self._remember()
-        port, outcome = self._state["port"][0], Outcome(int(self._state["outcome"]))
-        if outcome == Outcome.SIGNAL:
+        port, outcome = self._state["port"][0], LoopEnd(int(self._state["outcome"]))
+        if outcome == LoopEnd.SIGNAL:
             raise Ended(int(self._state["signal"]))
-        if outcome == Outcome.REFUSED:
+        if outcome == LoopEnd.REFUSED:
             raise refused_bus(self._can, self._setup.bus.name, text_of(self._state["refusal"]))
-        if outcome == Outcome.NOT_STARTED:
+        if outcome == LoopEnd.NOT_STARTED:
             raise StartUpError(self._why_not_started(int(port["sent"]), int(port["refused"])))
-        if outcome == Outcome.AMPLIFIER_GONE:
+        if outcome == LoopEnd.AMPLIFIER_GONE:
             raise AmplifierGoneError
-        if outcome == Outcome.PATH_LATE:
+        if outcome == LoopEnd.PATH_LATE:
             self.controller.faults.append(
                 "the path was not sampled in time, so the stage was led down; free the machine"
             )
-        if outcome == Outcome.KERNEL:
+        if outcome == LoopEnd.KERNEL:
             self.controller.faults.append(f"the controller's own code failed with {self._state['status']}: 0 V")
 
     def _why_not_started(self, sent: int, refused: int) -> str:

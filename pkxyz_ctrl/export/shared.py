@@ -45,7 +45,7 @@ class Phase(IntEnum):
     ENDED = 4
 
 
-class Outcome(IntEnum):
+class LoopEnd(IntEnum):
     """How it ended."""
 
     NONE = 0

@@ -29,7 +29,7 @@ from pkxyz_ctrl.export.shared import (
     PATH,
     SHARED,
     Interface,
-    Outcome,
+    LoopEnd,
     Phase,
     Told,
 )
@@ -45,7 +45,7 @@ _NUMBERS = (
     ("MODE", Mode), ("EVENT", Event), ("SENSE", SenseStatus), ("NODE", NodeEvent), ("TRIP", Trip), ("CALL", Call),
     ("REFUSED", Reason),
 )  # fmt: skip
-_NUMBERS_SHARED = (("INTERFACE", Interface), ("PHASE", Phase), ("OUTCOME", Outcome), ("TOLD", Told))
+_NUMBERS_SHARED = (("INTERFACE", Interface), ("PHASE", Phase), ("OUTCOME", LoopEnd), ("TOLD", Told))
 _C_TYPE = MappingProxyType(
     {"f8": "double", "i8": "int64_t", "i4": "int32_t", "i2": "int16_t", "i1": "int8_t", "u8": "uint64_t"}
     | {"u4": "uint32_t", "u2": "uint16_t", "u1": "uint8_t"}

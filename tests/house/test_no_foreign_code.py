@@ -13,6 +13,9 @@ ALLOWED = {
     ("hil/studies/latency.py", "subprocess"): "cyclictest: from PATH, or the path that was given on the command line",
     ("hil/bench/startup.py", "subprocess"): "this program, timed",
     ("hil/bench/operate.py", "subprocess"): "this program: what it serves, timed",
+    ("hil/bench/native.py", "subprocess"): "this program: the plant, beside which loops are timed",
+    ("hil/native/program.py", "subprocess"): "the C compiler, for sources of this package",
+    ("hil/native/native_rig.py", "subprocess"): "the program that it made of them",
     ("hil/server/serving.py", "subprocess"): "this program: the loop and the plant, in processes of their own",
     ("pkxyz_ctrl/export/kernels.py", "subprocess"): "this program, where numba leaves what it compiles unoptimised",
 }
