@@ -73,6 +73,7 @@ class NativeRig:
         inherited = (self._mapped.descriptor, self._recorder.pipe)
         self._process = subprocess.Popen(words, pass_fds=inherited, stdin=subprocess.DEVNULL)
         self._recorder.handed_over()
+        self._mapped.close()
         if self._until(Phase.ALONE) == Phase.ALONE:
             say(alone(company_s))
         self._until(Phase.STARTING)

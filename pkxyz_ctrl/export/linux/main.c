@@ -4,6 +4,7 @@
 #include <errno.h>
 #include <fcntl.h>
 #include <limits.h>
+#include <stdatomic.h>
 #include <stdio.h>
 #include <stdlib.h>
 #include <string.h>
@@ -94,7 +95,7 @@ int main(int argc, char **argv)
     state->signal = ending_signal();
     state->status = controller_status();
     state->outcome = outcome;
-    state->phase = PKXYZ_PHASE_ENDED;
+    atomic_store_explicit((_Atomic int32_t *)&state->phase, PKXYZ_PHASE_ENDED, memory_order_release);
     ring_end();
     if (argc == 2) { /* nobody else records it, or puts it into words */
         char folder[PATH_MAX];

@@ -9,7 +9,7 @@
 #include <sys/mman.h>
 #include <sys/prctl.h>
 
-enum { WORDS = 160 };
+enum { WORDS = 240 };
 
 /* One more of several things, with what stands between two of them. */
 static void add(char *list, const char *between, const char *format, ...)
