@@ -88,7 +88,8 @@ def test_what_holds_is_changed_and_nothing_else():
     sent = [0]
 
     def feed() -> None:
-        rig.session.take_rows(7, sent[0], path[sent[0] : sent[0] + 64])
+        rows = path[sent[0] : sent[0] + 64]
+        rig.session.take_rows(7, sent[0], rows, np.zeros(len(rows), np.int32))
         sent[0] += 64
 
     rig.play(script())

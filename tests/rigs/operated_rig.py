@@ -133,7 +133,8 @@ class Feeder:
 
     def _feed(self) -> None:
         if not self.stopped and self._at < len(self._rows) and self._session.wants_rows:
-            self._session.take_rows(self._number, self._at, self._rows[self._at : self._at + PATH_ROWS])
+            rows = self._rows[self._at : self._at + PATH_ROWS]
+            self._session.take_rows(self._number, self._at, rows, np.zeros(len(rows), np.int32))
             self._at += PATH_ROWS
 
 
