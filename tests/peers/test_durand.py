@@ -39,7 +39,7 @@ class Bench:
     def __init__(self, monkeypatch, bus_name, *, consumer="acts", duration_s=0.4, meanwhile=None, **changes):
         self.modules, self.rows, self.frames = [], None, []
 
-        def wired(can, clock, send, plant):
+        def wired(can, clock, send, plant, switch):
             module = DurandModule(can.driver.node_id, clock, send, plant, fd=can.driver.fd, consumer=consumer)
             self.modules.append(module)
             if meanwhile is not None:

@@ -152,7 +152,7 @@ class Kills:
         while self._children:
             self._reap()
 
-    def _wired(self, can, clock, send, plant):
+    def _wired(self, can, clock, send, plant, switch):
         self.amplifier = Amplifier(can, clock, send, plant)
         return self.amplifier.node
 
