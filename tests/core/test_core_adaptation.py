@@ -229,15 +229,21 @@ CIRCLES = Circle(kind="circle", radius_m=4e-6, frequency_hz=100.0, turns=800.0)
 AGES_AT_S = 4.5
 
 
-def warnings(plant, segments=(CIRCLES,), seed=1, **ageing):
-    """(time in s, warning, change in per cent) whenever the warning changes, and what it says in the end."""
+def aged(plant, segments=(CIRCLES,), seed=1, **ageing):
+    """Rows of a run on a plant that ages, and its faults."""
     setup, _ = setup_of(list(segments), "youla", plant, MIDDLE_M)
     if ageing:
         old = setup.plant.model_dump()
         old["ageing"] |= {"on": True, "start_s": AGES_AT_S, "time_constant_s": 0.1} | ageing
         setup = replace(setup, plant=PlantConfig.model_validate(old))
     rows, result = rows_of(replace(setup, seed=seed), "fast")
-    assert not result.faults
+    return rows, result.faults
+
+
+def warnings(plant, segments=(CIRCLES,), seed=1, **ageing):
+    """(time in s, warning, change in per cent) whenever the warning changes, and what it says in the end."""
+    rows, faults = aged(plant, segments, seed, **ageing)
+    assert not faults
     said = [(r["t_us"] * 1e-6, int(r["warning"])) for r in rows[1:][np.diff(rows["warning"]) != 0]]
     return said, 100.0 * rows["warning_share"][-600]
 
@@ -253,6 +259,43 @@ def test_a_change_of_two_per_cent_is_noticed_named_and_measured(ageing, named):
     assert AGES_AT_S < said[0][0] < AGES_AT_S + 3.0
     true = 100.0 * sum(next(iter(ageing.values())))
     assert 0.8 < change / true < 1.1
+
+
+def off_nm(rows, begin_s, end_s):
+    """RMS distance from the circle, in the plane."""
+    then = rows[(rows["t_us"] > begin_s * 1e6) & (rows["t_us"] < end_s * 1e6)]
+    return 1e9 * float(np.sqrt((((then["position_m"] - then["reference_m"])[:, :2]) ** 2).sum(axis=1).mean()))
+
+
+@pytest.mark.parametrize("ageing", [{"springs": (-0.02, 0, 0)}, {"combs": (0, 0, -0.02)}])
+def test_a_change_of_two_per_cent_is_followed(ageing):
+    """Within 3 s the circle is as good as before; in the first tenths of a second it was not."""
+    rows, faults = aged("mild", **ageing)
+    assert not faults
+    before, at_once, later = (
+        off_nm(rows, AGES_AT_S + begin, AGES_AT_S + end) for begin, end in ((-0.5, 0.0), (0.05, 0.25), (3.0, 3.5))
+    )
+    assert at_once > 1.2 * before
+    assert later < 1.2 * before
+
+
+@pytest.mark.parametrize(("what", "named"), [("springs", 5), ("combs", 3)])
+@pytest.mark.parametrize(("end", "time_constant_s", "most"), [(0.1, 3.0, 0.06), (0.6, 4.0, 0.09)])
+def test_a_drift_towards_danger_is_told_long_before_it_is_a_fault(what, named, end, time_constant_s, most):
+    """A chain's springs or a comb that lose 3 or 15 % a second: named early, and no fault even at 35 %."""
+    share = (0, 0, -end) if what == "combs" else (0, -end, 0)
+    rows, faults = aged("mild", time_constant_s=time_constant_s, **{what: share})
+    told, later = rows[np.argmax(rows["warning"] == named)], rows[np.argmax(rows["t_us"] > 8_000_000)]
+
+    def lost(row):
+        return end * (1.0 - np.exp(-(row["t_us"] * 1e-6 - AGES_AT_S) / time_constant_s))
+
+    assert told["warning"] == later["warning"] == named
+    assert 0.01 < lost(told) < most
+    assert not faults
+    assert lost(later) > 0.06
+    if end == 0.1:  # what is told is a second behind
+        assert 0.5 < -later["warning_share"] / lost(later) < 0.9
 
 
 @pytest.mark.parametrize("plant", ["nominal", "mild", "harsh"])
