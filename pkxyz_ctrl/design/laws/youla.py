@@ -35,6 +35,9 @@ _TURN = 0.1
 """Least part of D along what it was, so that it keeps its turns about zero where a bound is conceded."""
 _DEAR = 3.0
 """Price of a concession of 1 in |S|, in variances as they are without a filter."""
+_FAR = 0.5
+"""Where |S| of a changed plant has never been more of its bound, the next programme leaves it out; what then passes the
+bound is found by ``_refine``."""
 _CLOSE = 1.005
 """How far beyond its bound a peak between two points of the grid may reach."""
 _SETTLED = 2e-3
@@ -98,7 +101,7 @@ class InnovationLoop:
         self.poles = np.linalg.eigvals(self.a).astype(np.complex128)
         if not np.abs(self.poles).max() < 1.0:
             raise LawError("the state feedback alone has to be stable with every plant that its filter is to bear")
-        self.more_hz = np.empty(0)
+        self.more_hz, self.close_hz = np.empty(0), np.empty(0)
 
     def grid_hz(self, base_hz: Array) -> Array:
         """``base_hz``, points about the loop's own poles, and what ``refine`` has added."""
@@ -191,6 +194,12 @@ def youla_taps(
     )
 
 
+def hold_deviation_m(drawn: InnovationLoop, noise: Noise, taps: Array) -> float:
+    """Standard deviation of the position at hold in m, as drawn, for taps (n,) in N/m."""
+    q, g, c = _hold_variance(drawn, noise, len(taps))
+    return math.sqrt(float(taps @ q @ taps + 2.0 * g @ taps + c))
+
+
 def _hold_variance(drawn: InnovationLoop, noise: Noise, taps: int) -> tuple[Array, Array, float]:
     """Q, g and c of x^T Q x + 2 g^T x + c, m^2: variance of the position for taps x in N/m; a mean over frequency."""
     points = 4096
@@ -229,8 +238,12 @@ def _ask_changed(cones: "_Cones", loop: InnovationLoop, f: Array, q: Array) -> N
     last = one + turned @ q
     towards = np.conj(last) / np.abs(last)
     real, real_by_tap = np.real(towards * one), np.real(towards[:, None] * turned)
-    cones.add(loop.peak_s * real, loop.peak_s * real_by_tap, s, by_tap, may_be_conceded=True)
     cones.keep(real - _TURN * np.abs(last), real_by_tap)
+    near = np.abs(s + by_tap @ q) > _FAR * loop.peak_s * np.abs(last)
+    loop.close_hz = np.union1d(loop.close_hz, f[near])
+    near = np.isin(f, np.union1d(loop.close_hz, loop.more_hz)) | (not q.any())  # with the first taps everything moves
+    bound, bound_by_tap = loop.peak_s * real[near], loop.peak_s * real_by_tap[near]
+    cones.add(bound, bound_by_tap, s[near], by_tap[near], may_be_conceded=True)
 
 
 def _refine(loop: InnovationLoop, taps: Array, peak_s: float, base_hz: Array) -> tuple[float, float]:
