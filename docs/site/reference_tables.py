@@ -8,6 +8,7 @@ import re
 import runpy
 from functools import partial
 from pathlib import Path
+from typing import Any
 
 import canopen
 import cluster_plan
@@ -120,6 +121,31 @@ def board() -> str:
     return table(made["HEADER"], made["rows"](json.loads(made["KEPT"].read_text(encoding="utf-8"))))
 
 
+def alarms() -> str:
+    """What became of sampled devices under every law, as ``tests/studies/alarms/sampled.py`` has kept it."""
+    lines = (ROOT / "docs" / "tables" / "alarms.jsonl").read_text(encoding="utf-8").splitlines()
+    of_law: dict[str, list[dict[str, Any]]] = {}
+    for found in map(json.loads, lines):
+        of_law.setdefault(found["law"], []).append(found)
+    rows = []
+    for law, motions in of_law.items():
+        run = [m for m in motions if "refused" not in m]
+        devices = [m["devices"] for m in run]
+        stopped = sum(len(m["unstable"]) + len(m["beyond"]) for m in run)
+        false = sum(len(m["false"]) for m in run)
+        counts = len(run), f"{min(devices)} to {max(devices)}", sum(devices), stopped, false
+        rows.append([f"`{law}`", *map(str, counts)])
+    header = [
+        "law",
+        "motions",
+        "devices in each",
+        "runs",
+        "stopped: not stable, or out of reach",
+        "stopped for nothing",
+    ]
+    return table(header, rows)
+
+
 def noises() -> str:
     """Each noise of the plant lab alone, as ``docs/figures/plant_noise.py`` last measured it."""
     found = json.loads((ROOT / "docs" / "figures" / "plant_noise.json").read_text(encoding="utf-8"))
@@ -201,6 +227,7 @@ BUILT = {
     "segments": config_tables.segments,
     "matrix": matrix,
     "margins": partial(kept, "figures/margins.json"),
+    "alarms": alarms,
     "sampled": partial(kept, "tables/montecarlo.json"),
     "noises": noises,
     "explored": explored,

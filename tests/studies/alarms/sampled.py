@@ -1,14 +1,16 @@
 """Sampled devices in shipped scenarios, in moves and in circles, under the shipped laws: who is stopped, and why.
 
-python tests/studies/alarms/sampled.py RESULTS.jsonl [LAW ...] [--devices 500] [--motions raster,moves]
+python tests/studies/alarms/sampled.py [LAW ...] [--devices 500] [--motions raster,moves]
 
-A line for each law and motion, kept when it is done: called again, it goes on with what is missing.
+A line of docs/tables/alarms.jsonl for each law and motion, written anew after every 50 devices: called again, it goes
+on with what is missing.
 """
 
 import argparse
 import dataclasses
 import json
 import math
+import time
 from functools import cache
 from pathlib import Path
 from typing import Any
@@ -28,12 +30,18 @@ from pkxyz_ctrl.safety.modes import LOOP_CLOSED
 from pkxyz_ctrl.stage import Stage
 
 LAWS = (
-    "youla", "lqg", "lqg_wide", "robust", "irc", "irc_robust", "pi_notch", "pi_notch_robust", "hinf", "open_loop", "mpc"
+    "youla", "lqg", "lqg_wide", "robust", "irc", "irc_robust", "pi_notch", "pi_notch_robust", "hinf", "open_loop",
+    "robust_20k", "mpc",
 )  # fmt: skip
+BUSES = {"robust_20k": "local_20k"}
+"""Of laws that are not for fd_5k."""
 SCENARIOS = (
     "raster", "steps", "circle", "lissajous", "path", "spiral", "sweep", "frames", "raster_mild", "raster_lab",
     "circle_lab", "raster_harsh", "frames_lab", "frames_harsh",
 )  # fmt: skip
+KEPT = Path(__file__).parents[3] / "docs" / "tables" / "alarms.jsonl"
+PIECE = 50
+"""Devices after which what was found is kept."""
 BEFORE_TICKS = 50
 STOP_M = 25e-6
 """Of a slider, at either end of its stroke."""
@@ -44,7 +52,7 @@ MOTIONS = {"moves": corner_to_corner, "circles": circles}
 @cache
 def designed(motion: str, law: str) -> tuple[Study, Setup]:
     """The study that samples devices, and a setup with its law designed."""
-    scenario: Scenario = load_scenario("faults" if motion in MOTIONS else motion, controller=law)
+    scenario: Scenario = load_scenario("faults" if motion in MOTIONS else motion, controller=law, bus=BUSES.get(law))
     setup = scenario.setup()
     if motion in MOTIONS:
         way = MOTIONS[motion]()
@@ -84,51 +92,71 @@ def is_stable(motion: str, law: str, seed: int) -> bool:
     return all(math.isfinite(loop.peak_sensitivity(dataclasses.replace(case, strokes_m=p))) for p in points)
 
 
-def of_law(motion: str, law: str, devices: int) -> dict[str, Any]:
-    """How many were stopped, and why; which of them could not get there, and which have a stable loop and could: those
-    are false alarms.
+def judge(motion: str, law: str, seed: int) -> str | None:
+    """``None`` for a device that was not stopped; else whether it could not get there (``beyond``), has a loop that is
+    not stable (``unstable``), or was stopped for nothing (``false``).
     """
-    found: dict[str, Any] = {"law": law, "motion": motion, "devices": devices, "stopped": {}, "beyond": [], "false": []}
+    why = stopped(motion, law, seed)
+    if why is None:
+        return None
+    if why[1]:
+        return "beyond"
+    if is_stable(motion, law, seed):
+        print(f"  {law} in {motion}, device {seed}: {why[0]}", flush=True)
+        return "false"
+    return "unstable"
+
+
+def read(path: Path) -> dict[tuple[str, str], dict[str, Any]]:
+    """What is known, by motion and law."""
+    lines = path.read_text(encoding="utf-8").splitlines() if path.exists() else []
+    return {(d["motion"], d["law"]): d for d in map(json.loads, lines)}
+
+
+def write(path: Path, known: dict[tuple[str, str], dict[str, Any]]) -> None:
+    """Keep it, whole or not at all."""
+    fresh = path.with_suffix(".part")
+    fresh.write_text("".join(json.dumps(known[key]) + "\n" for key in sorted(known)), encoding="utf-8")
+    fresh.replace(path)
+
+
+def extend(found: dict[str, Any], devices: int) -> None:
+    """Try further devices of a law and motion, up to a number of them."""
+    motion, law = found["motion"], found["law"]
+    if "refused" in found:
+        return
     try:
         assert designed(motion, law)[1].law is not None  # some stages are too slow or too stiff for a law
     except ConfigError as error:
-        return found | {"refused": str(error)}
-    for seed in range(1, devices + 1):
-        why = stopped(motion, law, seed)
-        if why is None:
-            continue
-        found["stopped"][seed] = why[0]
-        if why[1]:
-            found["beyond"].append(seed)
-        elif is_stable(motion, law, seed):
-            found["false"].append(seed)
-    return found
+        found["refused"] = str(error)
+        return
+    for seed in range(found["devices"] + 1, devices + 1):
+        verdict = judge(motion, law, seed)
+        if verdict is not None:
+            found[verdict].append(seed)
+        found["devices"] = seed
 
 
 def main() -> None:
     """Go through what is missing in the file of results."""
     parser = argparse.ArgumentParser()
-    parser.add_argument("results", type=Path)
     parser.add_argument("laws", nargs="*", default=list(LAWS))
     parser.add_argument("--devices", type=int, default=500)
     parser.add_argument("--motions", default=",".join((*MOTIONS, *SCENARIOS)))
+    parser.add_argument("--results", type=Path, default=KEPT)
     asked = parser.parse_args()
-    text = asked.results.read_text(encoding="utf-8") if asked.results.exists() else ""
-    known = {(d["law"], d["motion"]) for d in map(json.loads, text.splitlines()) if d["devices"] >= asked.devices}
+    known = read(asked.results)
     for motion in asked.motions.split(","):
         for law in asked.laws:
-            if (law, motion) in known:
-                continue
-            found = of_law(motion, law, asked.devices)
-            with asked.results.open("a", encoding="utf-8") as file:
-                file.write(json.dumps(found) + "\n")
-            if "refused" in found:
-                print(f"{law} in {motion}: {found['refused']}", flush=True)
-                continue
-            print(
-                f"{law} in {motion}: {len(found['stopped'])} of {asked.devices} stopped, {len(found['beyond'])} beyond "
-                f"what they reach, false alarms: {len(found['false'])} {found['false'][:5]}", flush=True
-            )  # fmt: skip
+            fresh = {"motion": motion, "law": law, "devices": 0, "beyond": [], "unstable": [], "false": []}
+            found = known.setdefault((motion, law), fresh)
+            begin_s = time.process_time()
+            while found["devices"] < asked.devices and "refused" not in found:
+                extend(found, min(found["devices"] + PIECE, asked.devices))
+                write(asked.results, known)
+            counts = {k: len(v) for k, v in found.items() if isinstance(v, list)}
+            print(f"{law} in {motion}: {found['devices']} devices, {counts}, {time.process_time() - begin_s:.0f} s",
+                  found.get("refused", ""), flush=True)  # fmt: skip
 
 
 if __name__ == "__main__":
