@@ -122,7 +122,7 @@ class Board:
             head = data[at : at + HEAD.itemsize].view(HEAD)[0]
             yield head, data[at + HEAD.itemsize : at + size]
 
-    def _gone(self) -> BoardGoneError:
+    def _ending(self) -> BoardGoneError:
         code = self._process.wait(timeout=_SILENT_MOST_S)
         how = f"ended by signal {-code} ({signal.Signals(-code).name})" if code < 0 else f"ended with code {code}"
         said = " ".join(self._said.read_text(encoding="utf-8", errors="replace").split())
