@@ -54,6 +54,12 @@ _UNITS = MappingProxyType(
     {unit: unit for unit in ("m", "s", "us", "ms", "kg", "rad", "count", "ticks", "bit")}
     | {"n": "N", "n2": "N^2", "v": "V", "v2": "V^2", "f": "F", "volt": "V", "metre": "m", "farad": "F"}
 )
+_C_WORDS = frozenset({
+    "auto", "break", "case", "char", "class", "const", "continue", "default", "delete", "do", "double", "else", "enum",
+    "extern", "float", "for", "goto", "if", "inline", "int", "long", "new", "operator", "private", "public", "register",
+    "return", "short", "signed", "static", "struct", "switch", "this", "union", "unsigned", "void", "volatile", "while",
+})  # fmt: skip
+"""Which no field can be called there; it has a _ behind it then."""
 Dtype = np.dtype[Any]
 
 
@@ -163,8 +169,9 @@ def _struct(dtype: Dtype, names: dict[int, str]) -> str:
         c_type = names[id(base)] if base.fields else _C_TYPE[base.str[1:]]
         shape = "".join(f"[{length}]" for length in kind.shape)
         said = ", ".join(text for text in (unit_of(field), place.comments.get(field, "")) if text)
-        lines.append(f"    {c_type} {field}{shape};" + (f" /* {said} */" if said else ""))
-        asserts.append(f"PKXYZ_ASSERT(offsetof({name}, {field}) == {offset});")
+        c_field = f"{field}_" if field in _C_WORDS else field
+        lines.append(f"    {c_type} {c_field}{shape};" + (f" /* {said} */" if said else ""))
+        asserts.append(f"PKXYZ_ASSERT(offsetof({name}, {c_field}) == {offset});")
     asserts.append(f"PKXYZ_ASSERT(sizeof({name}) == {dtype.itemsize});")
     return "\n".join([*lines, f"}} {name};", *asserts, ""])
 
