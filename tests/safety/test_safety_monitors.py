@@ -186,6 +186,7 @@ def test_node_events_trip_at_once(event: NodeEvent) -> None:
         NodeEvent.REBOOTED: Trip.NODE_REBOOTED,
         NodeEvent.EMERGENCY: Trip.NODE_EMERGENCY,
         NodeEvent.FOREIGN_FRAME: Trip.FOREIGN_FRAME,
+        NodeEvent.SAFETY_OBJECTS: Trip.SAFETY_OBJECTS,
     }
     for mode in Mode:
         assert Bench(mode).tick({"node_events": event}) == (expected[event] if NODE_EXPECTED[mode] else 0)
