@@ -60,7 +60,16 @@ class Lockstep:
 
     def first_us(self, is_meant: Callable[[Callable[[], object]], bool]) -> int | None:
         """Time of the first event for which ``is_meant``; None if there is none."""
-        return min((t_us for t_us, _, fn in self._heap if is_meant(fn)), default=None)
+        heap, found, places = self._heap, None, [0]
+        while places:  # below a place nothing is earlier: of thousands of appointments only the next ones are looked at
+            place = places.pop()
+            if place >= len(heap) or (found is not None and heap[place][0] >= found):
+                continue
+            if is_meant(heap[place][2]):
+                found = heap[place][0]
+            else:
+                places += (2 * place + 1, 2 * place + 2)
+        return found
 
     def leap(self, t_us: int) -> None:
         """It is ``t_us``: what was due until then runs only now. For who has seen to it that nothing minds."""

@@ -50,6 +50,10 @@ class Disturbance:
         self._doomed.append((predicate, count))
         self._rearm()
 
+    def is_only(self, tap: FaultTap | None) -> bool:
+        """Whether nobody but ``tap`` may destroy or change a frame."""
+        return not (self._doomed or self._bit_error_rate) and self._tap in (None, tap)
+
     def judge(self, frame: Frame, sender: str, t_us: int) -> FrameFate | None:
         """What becomes of the frame; None: nothing happens to it."""
         for i, (predicate, count) in enumerate(self._doomed):

@@ -13,7 +13,7 @@ from typing import NamedTuple
 
 from hil.bus.arbitration import Entry, arbitration_key, dominance, unqueue
 from hil.bus.clock import Lockstep
-from hil.bus.disturbance import Disturbance
+from hil.bus.disturbance import Disturbance, FaultTap
 from hil.bus.endpoint import Endpoint, Kind, Listener
 from hil.bus.fault_confinement import ERROR_ACK, ERROR_PROTOCOL, FaultConfinement
 from hil.bus.frame_time import FrameFormatError, bits_ns, duration_ns_kernel, frame_duration_ns, to_end_ns
@@ -136,10 +136,12 @@ class Wire:
         now, then = self.statistics(), since or self._first
         return (now.busy_ns - then.busy_ns) / max(1, (now.t_us - then.t_us) * 1000)
 
-    @property
-    def is_calm(self) -> bool:
-        """Whether it is idle, with nothing queued, and the next frame meets no error."""
-        return self._is_calm and self._is_ordinary
+    def is_calm(self, tap: FaultTap | None = None) -> bool:
+        """Whether it is idle, with nothing queued, and the next frame meets no error but what ``tap`` makes of it."""
+        if self._end_us >= 0 or self._rivals or any(e._to_send for e in self.endpoints):
+            return False
+        all_of_us, free_ns = self._confinement, self._free_ns
+        return self.disturbance.is_only(tap) and not all_of_us.is_alone() and all_of_us.is_everybody_well(free_ns)
 
     @property
     def carried(self) -> tuple[int, int, int]:

@@ -26,10 +26,29 @@ class FaultyClock:
         """As the clock below has it."""
         return self._clock.now_us
 
-    @property
-    def quiet_until_us(self) -> int | None:
-        """When the first of them begins; None if none is left."""
-        return self._origin_us + self._faults[-1].at_us if self._faults else None
+    def quiet_until_us(self, t_us: int) -> int | None:
+        """Until when ticks from ``t_us`` on are no later than ``late_us`` says; None: for ever; ``t_us``: not even
+        this one is.
+        """
+        now_us, ends = t_us - self._origin_us, []
+        for fault in reversed(self._faults):  # the next to begin is the last
+            if fault.at_us > now_us:
+                ends.append(fault.at_us)
+                break
+            if fault.is_on(now_us):
+                if fault.kind != "late_tick" and id(fault) not in self._done:
+                    return t_us
+                ends += [] if fault.end_us is None else [fault.end_us]
+        return self._origin_us + min(ends) if ends else None
+
+    def late_us(self, t_us: int) -> int:
+        """How late the tick of ``t_us`` begins."""
+        now_us, late_us = t_us - self._origin_us, 0
+        for fault in reversed(self._faults):
+            if fault.at_us > now_us:
+                break
+            late_us += round(fault["late_us"]) if fault.kind == "late_tick" and fault.is_on(now_us) else 0
+        return late_us
 
     def _due(self) -> list[Fault]:
         """Those that are on; what is over is forgotten."""

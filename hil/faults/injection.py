@@ -32,6 +32,31 @@ def plant_of(plant: Plant, faults: Sequence[Fault], bus: BusConfig, seed: int) -
     return FaultyPlant(plant, its_own, bus, seed) if its_own else PlantOnBus(plant)
 
 
+class Clearing:
+    """Clears ``patience`` ticks after a fault decision, and again if that didn't help."""
+
+    def __init__(self, controller: Controller, patience: int, begin_anew: Callable[[int], object]) -> None:
+        self._controller, self._patience, self._begin_anew = controller, patience, begin_anew
+        self._waited = 0
+
+    def look(self, tick: int) -> None:
+        """A tick is recorded."""
+        if self._controller.mode == Mode.ENABLED:
+            self._begin_anew(tick)
+        self.skip(1)
+        if self._waited % self._patience == self._patience - 1:
+            self._controller.clear()
+
+    @property
+    def room(self) -> int:
+        """How many ticks in a mode that it waits in may pass without a look."""
+        return (self._patience - 2 - self._waited) % self._patience
+
+    def skip(self, ticks: int) -> None:
+        """So many have passed, all in the present mode."""
+        self._waited = self._waited + ticks if self._controller.mode in (Mode.FAULT, Mode.BOOT) else 0
+
+
 class Injection:
     """The faults of bus, node and controller of one run, and whoever clears ``clear_s`` after a fault decision."""
 
@@ -44,59 +69,50 @@ class Injection:
         self._period_us = period_us
         self._clock = clock
         self._plant = plant
+        self.clearing: Clearing | None = None
+        """who clears in this run, if somebody does"""
         self._controller = controller
         self.afterwards: list[Afterwards] = []
         self.watched: list[tuple[float, float, float]] | None = None
         """If it is a list: the comb voltages at the end of each tick, true even while the node does not sample."""
-        self._wire = WireFaults(faults, clock, wire, node, controller.can.driver, seed + 1)
-        self._origin_us = 0
+        self.wire_faults = WireFaults(faults, clock, wire, node, controller.can.driver, seed + 1)
+        self.origin_us = 0
+        """when the first tick begins, from which faults count"""
 
     def before_power_on(self) -> None:
         """What is wrong before the node is switched on."""
-        self._wire.before_power_on()
+        self.wire_faults.before_power_on()
 
     def arm(self) -> FaultyClock:
         """The next instant of the loop is its first tick: make all appointments. Returns the loop's clock."""
-        self._origin_us = self._clock.now_us + self._period_us
-        self._wire.arm(self._origin_us)
-        self._faulty = FaultyClock(self._clock, self.faults, self._origin_us, self._period_us)
+        self.origin_us = self._clock.now_us + self._period_us
+        self.wire_faults.arm(self.origin_us)
+        self._faulty = FaultyClock(self._clock, self.faults, self.origin_us, self._period_us)
         return self._faulty
 
-    @property
-    def quiet_until_us(self) -> int | None:
-        """Until when the controller's own time has no fault; None: for ever."""
-        return self._faulty.quiet_until_us
+    def quiet_until_us(self, t_us: int) -> int | None:
+        """``FaultyClock.quiet_until_us``."""
+        return self._faulty.quiet_until_us(t_us)
 
-    def clearing(self, record: Callable[[int], object], begin_anew: Callable[[int], object]) -> Callable[[int], object]:
-        """``record`` and, so many ticks after a fault decision, a clear; a look at the combs, if one is wanted.
-        ``begin_anew`` is told the tick after which the trajectory starts over.
+    def late_us(self, t_us: int) -> int:
+        """``FaultyClock.late_us``."""
+        return self._faulty.late_us(t_us)
+
+    def taking(self, record: Callable[[int], object], begin_anew: Callable[[int], object]) -> Callable[[int], object]:
+        """``record``; behind it a look at the combs, if they are watched, and so many ticks after a fault decision a
+        clear. ``begin_anew`` is told the tick after which the trajectory starts over.
         """
-        patience, controller, watched = self._clear_ticks, self._controller, self.watched
-        if watched is not None:
-            record = self._watching(record, watched)
-        if patience is None:
-            return record
-        waited = 0
+        watched, patience = self.watched, self._clear_ticks
+        clearing = self.clearing = None if patience is None else Clearing(self._controller, patience, begin_anew)
 
-        def record_and_clear(tick: int) -> None:
-            nonlocal waited
+        def take(tick: int) -> None:
             record(tick)
-            if controller.mode == Mode.ENABLED:
-                begin_anew(tick)
-            waited = waited + 1 if controller.mode in (Mode.FAULT, Mode.BOOT) else 0
-            if waited % patience == patience - 1:
-                controller.clear()
+            if watched is not None:
+                watched.append(self._look())
+            if clearing is not None:
+                clearing.look(tick)
 
-        return record_and_clear
-
-    def _watching(
-        self, record: Callable[[int], object], watched: list[tuple[float, float, float]]
-    ) -> Callable[[int], object]:
-        def record_and_look(tick: int) -> None:
-            record(tick)
-            watched.append(self._look())
-
-        return record_and_look
+        return record if watched is None and clearing is None else take
 
     def _look(self) -> tuple[float, float, float]:
         """Voltages at the combs now."""
@@ -106,7 +122,7 @@ class Injection:
 
     def outlive(self, ticks: int) -> None:
         """The controller is gone: time goes on to the end of the run, and the combs are watched."""
-        clock, end_us = self._clock, self._origin_us + ticks * self._period_us
+        clock, end_us = self._clock, self.origin_us + ticks * self._period_us
         while clock.now_us < end_us:
             clock.run_until(min(end_us, clock.now_us + _LOOK_US))
-            self.afterwards.append(Afterwards(clock.now_us - self._origin_us, self._look()))
+            self.afterwards.append(Afterwards(clock.now_us - self.origin_us, self._look()))

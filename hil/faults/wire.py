@@ -1,28 +1,42 @@
 """Faults of the bus and of the node, on the simulated wire: what becomes of a frame, and who else is there."""
 
-import random
 import struct
 from collections.abc import Callable, Sequence
+from typing import Final
+
+import numpy as np
 
 from hil.bus.clock import Lockstep
 from hil.bus.disturbance import CORRUPTED, DROPPED, FrameFate
 from hil.bus.endpoint import Endpoint
 from hil.bus.wire import Wire
+from hil.faults.channels import below, dice_of
 from hil.faults.fault import Fault
 from hil.faults.forged import Forger
+from hil.faults.frame_rules import RULE, meets
 from hil.node.amplifier import AmplifierNode
 from pkxyz_ctrl.can.driver_config import DriverConfig
 from pkxyz_ctrl.can.frame import Frame
+from pkxyz_ctrl.compiled.direct_call import direct
 
-Rule = Callable[[Frame, str, int], FrameFate | None]
+Act = Callable[[Frame], FrameFate]
 
+SENDERS: Final = ("controller", "amplifier")
+"""Names on the wire, by the number that a rule knows them by."""
+_DICE_SOURCE = (1 << 16) + 1  # of the seed's streams: none of the plant's own
 _SYNC_ID = 0x080
+_EVERY_ID = 0, (1 << 29) - 1
+_HEARTBEAT_IDS = 0x701, 0x77F
 _IDENTITY = (0x1018, 2)
 _DOWNLOAD = struct.Struct("<BHBI")  # SDO, expedited
 
 
 class WireFaults:
-    """The faults of bus and node on one wire. ``arm`` makes the appointments; until then nothing is touched."""
+    """The faults of bus and node on one wire. ``arm`` makes the appointments; until then nothing is touched.
+
+    ``count`` of ``rules`` (n,) of ``RULE`` are on, in the order in which they began, and ``dice`` (1,) of ``DICE`` is
+    what they roll.
+    """
 
     def __init__(
         self, faults: Sequence[Fault], clock: Lockstep, wire: Wire, node: AmplifierNode, driver: DriverConfig, seed: int
@@ -32,8 +46,13 @@ class WireFaults:
         self._wire = wire
         self._node = node
         self._driver = driver
-        self._random = random.Random(seed)
-        self._rules: dict[int, Rule] = {}  # those that are on, by the identity of the fault
+        self.rules = np.zeros(len(self._faults), RULE)
+        self.dice = dice_of(seed, _DICE_SOURCE)
+        self.count = 0
+        self._ruling: list[tuple[Fault, Act]] = []  # the faults of ``rules``, and what each does
+        self._meets = direct(meets, self.rules, self.dice, 0, 0, 0)
+        self._below = direct(below, self.dice["words"][0], 0)
+        self._rebooting: set[int] = set()  # by the identity of the fault
         self._guests: dict[int, Endpoint] = {}
         self._forgers: dict[int, Forger] = {}
         self._product_code = node.od[_IDENTITY]
@@ -65,7 +84,7 @@ class WireFaults:
             case "reset":
                 self._node.power_on()
             case "reboot_loop":
-                self._rules[id(fault)] = lambda frame, sender, t_us: None  # its presence says that it is on
+                self._rebooting.add(id(fault))
                 self._reboot(fault)
             case "wrong_identity":
                 self._install_identity(round(fault["product_code"]))
@@ -82,8 +101,7 @@ class WireFaults:
             case "babbling":
                 self._babble(fault)
             case _:
-                self._rules[id(fault)] = self._rule_of(fault)
-                self._wire.disturbance.set_tap(self._judge)
+                self._rule([*self._ruling, (fault, self._act_of(fault))])
 
     def _end(self, fault: Fault) -> None:
         match fault.kind:
@@ -92,21 +110,21 @@ class WireFaults:
             case "wrong_identity":
                 self._install_identity(self._product_code)
                 self._node.power_on()
-        self._rules.pop(id(fault), None)
+        self._rebooting.discard(id(fault))
+        if any(other is fault for other, _ in self._ruling):
+            self._rule([(other, act) for other, act in self._ruling if other is not fault])
         forger = self._forgers.pop(id(fault), None)
         if forger is not None:
             forger.leave()
         guest = self._guests.pop(id(fault), None)
         if guest is not None:
             guest.detach()
-        if not any(f.family == "bus" or f.kind == "silent" for f in self._faults if id(f) in self._rules):
-            self._wire.disturbance.set_tap(None)
 
     def _install_identity(self, product_code: object) -> None:
         self._node.od.install(*_IDENTITY, product_code)  # type: ignore[arg-type]
 
     def _reboot(self, fault: Fault) -> None:
-        if id(fault) in self._rules:
+        if id(fault) in self._rebooting:
             self._node.power_on()
             self._clock.call_at(self._clock.now_us + round(fault["interval_s"] * 1e6), lambda: self._reboot(fault))
 
@@ -127,43 +145,51 @@ class WireFaults:
 
     # -- what becomes of a frame ------------------------------------------------------------------------------------
 
-    def _judge(self, frame: Frame, sender: str, t_us: int) -> FrameFate | None:
-        for rule in self._rules.values():
-            outcome = rule(frame, sender, t_us)
-            if outcome is not None:
-                return outcome
-        return None
+    def _rule(self, ruling: list[tuple[Fault, Act]]) -> None:
+        """From now on these are on."""
+        self._ruling, self.count = ruling, len(ruling)
+        for place, (fault, _) in enumerate(ruling):
+            rule = self.rules[place]
+            rule["low_id"], rule["high_id"] = self._concerns(fault)
+            rule["sender"] = SENDERS.index("amplifier") if fault.kind == "silent" else -1
+            rule["is_certain"] = fault.kind in ("silent", "reorder", "delay")
+            rule["is_loss"] = fault.kind in ("drop", "silent")
+            rule["share"] = 1.0 if rule["is_certain"] else fault["probability"]
+        self._wire.disturbance.set_tap(self.judge if ruling else None)
 
-    def _rule_of(self, fault: Fault) -> Rule:
-        if fault.kind == "silent":
-            return lambda frame, sender, t_us: DROPPED if sender == "amplifier" else None
-        concerns = self._concerns(fault)
-        if fault.kind == "reorder":
-            return _Swapping(concerns)
-        dice = self._random
-        acts: dict[str, Callable[[Frame], FrameFate]] = {
-            "drop": lambda frame: DROPPED,
-            "duplicate": lambda frame: FrameFate(deliveries=((0, frame), (0, frame))),
-            "corrupt": lambda frame: FrameFate(deliveries=((0, self._with_a_bit_flipped(frame)),)),
-            "delay": lambda frame: FrameFate(deliveries=((round(fault["delay_us"]), frame),)),
-            "error_frames": lambda frame: CORRUPTED,
-        }
-        act = acts[fault.kind]
-        share = 1.0 if fault.kind == "delay" else fault["probability"]
-        return lambda frame, sender, t_us: act(frame) if concerns(frame) and dice.random() < share else None
+    def judge(self, frame: Frame, sender: str, t_us: int) -> FrameFate | None:
+        """What becomes of a frame; None: nothing happens to it."""
+        number = SENDERS.index(sender) if sender in SENDERS else len(SENDERS)
+        place = self._meets(self.rules, self.dice, self.count, frame.can_id, number)
+        return None if place < 0 else self._ruling[place][1](frame)
 
-    def _concerns(self, fault: Fault) -> Callable[[Frame], bool]:
+    def _act_of(self, fault: Fault) -> Act:
+        match fault.kind:
+            case "duplicate":
+                return lambda frame: FrameFate(deliveries=((0, frame), (0, frame)))
+            case "reorder":
+                return _Swapping()
+            case "corrupt":
+                return lambda frame: FrameFate(deliveries=((0, self._with_a_bit_flipped(frame)),))
+            case "delay":
+                delay_us = round(fault["delay_us"])
+                return lambda frame: FrameFate(deliveries=((delay_us, frame),))
+            case "error_frames":
+                return lambda frame: CORRUPTED
+        return lambda frame: DROPPED  # drop, silent
+
+    def _concerns(self, fault: Fault) -> tuple[int, int]:
+        """The lowest and the highest identifier of its frames."""
         if not fault.part:
-            return lambda frame: True
+            return _EVERY_ID
         if fault.part == "heartbeat":
-            return lambda frame: 0x700 < frame.can_id < 0x780
-        wanted = self._ids[fault.part]
-        return lambda frame: frame.can_id == wanted
+            return _HEARTBEAT_IDS
+        return self._ids[fault.part], self._ids[fault.part]
 
     def _with_a_bit_flipped(self, frame: Frame) -> Frame:
         if not frame.data:
             return frame
-        bit = self._random.randrange(8 * len(frame.data))
+        bit = self._below(self.dice["words"][0], 8 * len(frame.data))
         flipped = bytearray(frame.data)
         flipped[bit // 8] ^= 1 << bit % 8
         return frame._replace(data=bytes(flipped))
@@ -178,13 +204,10 @@ def _download(fault: Fault) -> bytes:
 class _Swapping:
     """Holds every other frame of a kind back, until the one behind it has gone."""
 
-    def __init__(self, concerns: Callable[[Frame], bool]) -> None:
-        self._concerns = concerns
+    def __init__(self) -> None:
         self._held: dict[int, Frame] = {}  # by identifier
 
-    def __call__(self, frame: Frame, sender: str, t_us: int) -> FrameFate | None:
-        if not self._concerns(frame):
-            return None
+    def __call__(self, frame: Frame) -> FrameFate:
         held = self._held.pop(frame.can_id, None)
         if held is None:
             self._held[frame.can_id] = frame

@@ -23,7 +23,7 @@ from hil.lanes.blocks import Blocks
 from hil.lanes.setup import Setup
 from hil.lanes.stretches import Stretches
 from hil.node.wired import wired_node
-from hil.plant.on_bus import RECORD, PlantOnBus
+from hil.plant.on_bus import RECORD
 from hil.plant.truth import TRUTH_BYTES
 from pkxyz_ctrl.can.cob_id import SYNC
 from pkxyz_ctrl.can.frame import Frame
@@ -34,10 +34,11 @@ from pkxyz_ctrl.loop.controller import Controller
 from pkxyz_ctrl.loop.reference import REFERENCE
 from pkxyz_ctrl.loop.row import ROW
 from pkxyz_ctrl.loop.runtime import Clock, Port, go_on, start
+from pkxyz_ctrl.safety.modes import Mode
 
 _ROW_BYTES: Final = ROW.itemsize
 _TRUTH_AT: Final = ROW.itemsize - TRUTH_BYTES
-_FEW_MOST: Final = 32  # ticks until whole ones are tried again
+_FEW_MOST: Final = 8  # ticks until whole ones are tried again
 
 
 class WirePort:
@@ -132,7 +133,7 @@ class LockstepRig:
             clock: Clock = self.clock
             taking: Callable[[int], object] = record
             if injection is not None:
-                clock, taking = injection.arm(), injection.clearing(record, reference.begin_anew)
+                clock, taking = injection.arm(), injection.taking(record, reference.begin_anew)
             with _seldom_collected():
                 self._run_ticks(clock, reference, taking, record)
         except ControllerKilledError:
@@ -151,23 +152,30 @@ class LockstepRig:
     def _run_ticks(
         self, clock: Clock, reference: "_Reference", taking: Callable[[int], object], record: "_Recorder"
     ) -> None:
-        """Whole ticks as long as nothing happens in them; the others event by event."""
+        """Whole ticks as long as they can be played; the others event by event."""
         if not self.controller.can.driver.protection:
             clock = _Draining(clock, self._endpoint, self.controller)
         ticks, tick, t_us = record.ticks, 0, self.clock.now_us + self.controller.period_us
-        is_watched = self.injection is not None and self.injection.watched is not None
-        stretches = None if is_watched else self._stretches
+        injection, stretches = self.injection, self._stretches
+        watched, clearing = (None, None) if injection is None else (injection.watched, injection.clearing)
         if stretches is not None:
-            stretches.keep_to_tracking(taking is not record)  # somebody acts on the other modes
+            stretches.keep(begun_anew=clearing is not None, watched=watched is not None)
         few = 1
         while tick < ticks:
             if stretches is not None:
-                last_us = None if self.injection is None else self.injection.quiet_until_us
                 done = 0
-                if stretches.may_begin(t_us, last_us):
+                if stretches.may_begin(t_us, injection):
                     rows = reference(tick)
-                    done = stretches.run(rows, record.room(min(reference.left(tick), ticks - 1 - tick)), t_us)
-                record.skip(done)
+                    most = min(reference.left(tick), ticks - 1 - tick)
+                    if clearing is not None and self.controller.mode in (Mode.FAULT, Mode.BOOT):
+                        most = min(most, clearing.room)
+                    done = stretches.run(rows, record.room(most), t_us)
+                if done:
+                    record.skip(done)
+                    if clearing is not None:
+                        clearing.skip(done)
+                    if watched is not None:
+                        watched += [(a, b, c) for a, b, c in stretches.watched_v[:done].tolist()]
                 tick, t_us = tick + done, t_us + done * self.controller.period_us
                 few = 1 if done else min(2 * few, _FEW_MOST)
             some = range(tick, min(tick + few, ticks))
@@ -180,11 +188,9 @@ class LockstepRig:
         is_slow = self.setup.bus.delay_periods > 1
         if law["kind"][0] == PREDICTIVE or not can.driver.protection or is_slow:
             return None
-        if type(self.plant) is not PlantOnBus:  # one with faults
-            return None
         return Stretches(
             self.clock, self.wire, self._endpoint, self.node, self.plant, self.controller, self.log,
-            self.wire.endpoints,
+            self.wire.endpoints, self.injection,
         )  # fmt: skip
 
 

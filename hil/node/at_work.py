@@ -3,7 +3,7 @@
 import numpy as np
 
 from hil.node.amplifier import AmplifierNode, NmtState
-from hil.node.rules import NEVER_US, NODE, NODE_MEMORY, crc_start
+from hil.node.rules import NEVER_US, NODE, NODE_MEMORY, UNKNOWN, crc_start
 
 _WATCHED_MOST = 1
 
@@ -12,12 +12,12 @@ class NodeAtWork:
     """``record`` (1,) of ``NODE`` and ``memory`` (1,) of ``NODE_MEMORY``, valid between `take` and `put`."""
 
     def __init__(self, node: AmplifierNode) -> None:
-        self._node = node
+        self.node = node
         self.record, self.memory = np.zeros(1, NODE), np.zeros(1, NODE_MEMORY)
 
     def take(self) -> bool:
         """Read the node. False for one that does anything else than its daily work."""
-        node, m = self._node, self.memory[0]
+        node, m = self.node, self.memory[0]
         drive, sense = node._drive, node._sense
         watched = [consumer for consumer in node._consumers if consumer.cob_id is not None]
         if (
@@ -48,7 +48,7 @@ class NodeAtWork:
         return True
 
     def _take_settings(self) -> None:
-        node, c = self._node, self.record[0]
+        node, c = self.node, self.record[0]
         c["drive_id"], c["sense_id"] = node._drive_pdo.cob_id, node._sense_pdo.cob_id
         c["drive_crc_start"], c["sense_crc_start"] = crc_start(int(c["drive_id"])), crc_start(int(c["sense_id"]))
         c["output_id"] = next(iter(node.digital.receivers), -1)
@@ -64,7 +64,7 @@ class NodeAtWork:
 
     def put(self) -> None:
         """What has become of the node's state; `take` had said yes."""
-        node, m = self._node, self.memory[0]
+        node, m = self.node, self.memory[0]
         drive, sense = node._drive, node._sense
         node._drive_deadline.due_us, node._heartbeat.alarm.due_us = _due(m["drive_deadline_us"]), _due(m["beat_us"])
         for consumer in node._consumers:
@@ -84,6 +84,38 @@ class NodeAtWork:
         digital, node.signature.left = int(m["digital_pending"]), int(m["signature_left"])
         node.digital.bits = node.od[0x6200, 1] = int(m["digital"])
         node.digital.pending = None if digital < 0 else digital
+
+    def take_at_rest(self) -> int | None:
+        """Read a node that is not operational: its state, as its heartbeat has it. None for one that is, or that does
+        more than to beat and to count SYNCs.
+        """
+        node, m = self.node, self.memory[0]
+        watched = [consumer for consumer in node._consumers if consumer.cob_id is not None]
+        is_booting, is_ready = node.state is NmtState.INITIALISING, node.state is NmtState.PRE_OPERATIONAL
+        if not (is_booting or is_ready) or len(watched) > 1:
+            return None
+        self._take_settings()
+        m["drive_deadline_us"] = m["due_us"] = m["beat_us"] = m["consumer_us"] = NEVER_US
+        if is_ready:
+            beat_us = node._heartbeat.alarm.due_us
+            m["beat_us"] = NEVER_US if beat_us is None else beat_us
+            lasts_us = watched[0].alarm.due_us if watched else None
+            m["consumer_us"] = NEVER_US if lasts_us is None else lasts_us
+            expected = node._sync_expected
+            m["sync_expected"] = UNKNOWN if expected is None else expected[0] if expected else 0
+        return int(node.state)
+
+    def put_at_rest(self) -> None:
+        """What has become of it; ``take_at_rest`` had not said None."""
+        node, m = self.node, self.memory[0]
+        if node.state is not NmtState.PRE_OPERATIONAL:
+            return
+        node._heartbeat.alarm.due_us = None if m["beat_us"] >= NEVER_US else int(m["beat_us"])
+        for consumer in node._consumers:
+            if consumer.cob_id is not None and m["consumer_us"] != NEVER_US:
+                consumer.alarm.due_us = int(m["consumer_us"])
+        if m["sync_expected"] != UNKNOWN:
+            node._sync_expected = bytes((int(m["sync_expected"]),)) if self.record["sync_overflow"][0] else b""
 
 
 def _time(due_us: int | None) -> int:

@@ -1,4 +1,5 @@
-"""The node's part of a tick in which all is as it should be, compiled: SYNC, drive PDO, sense PDO.
+"""The node's part of a tick in which all is as it should be, compiled: SYNC, drive PDO, sense PDO; and what it does in
+pre-operational.
 
 Each kernel looks before it acts. What is out of the ordinary it leaves alone and says so: that is for the node itself.
 A payload is its bytes as an integer of 64 bits, the first one lowest.
@@ -62,6 +63,11 @@ NODE_MEMORY = np.dtype(
 )
 
 NEVER_US: Final = 1 << 62
+DEAF: Final = 0  # a node that boots: it takes nothing
+OPERATIONAL: Final = 5
+UNKNOWN: Final = -1
+"""In ``sync_expected``: any may come."""
+_LEAVE: Final = 128  # NMT: to pre-operational
 LENGTH: Final = 8  # of a process PDO with counter and CRC
 _CRC_BYTES: Final = 7
 _STEP: Final = np.frombuffer(STEP, np.uint8)
@@ -172,4 +178,27 @@ def rides(config: np.void, memory: np.void, t_us: int) -> bool:
     if t_us + memory["cycle_us"] < memory["beat_us"]:
         return False
     memory["beat_us"] = t_us + config["beat_period_us"]
+    return True
+
+
+@njit(cache=True, error_model="numpy")
+def on_frame_at_rest(config: np.void, memory: np.void, can_id: int, length: int, word: int, t_us: int) -> bool:
+    """A frame that comes in pre-operational. False, and nothing is done, for one that is for the node itself."""
+    if can_id == config["sync_id"]:
+        return _count_sync(config, memory, length, word)
+    if can_id == config["consumer_id"]:  # one that nobody waits for has been missed, and ends that
+        return memory["consumer_us"] != NEVER_US and bool(on_heartbeat(config, memory, length, word, t_us))
+    if can_id == 0:  # NMT
+        return length == 2 and word & 0xFF == _LEAVE
+    return bool(can_id == config["drive_id"] or can_id == config["output_id"])  # not taken in this state
+
+
+@njit(cache=True, error_model="numpy")
+def _count_sync(config: np.void, memory: np.void, length: int, word: int) -> bool:
+    overflow, counter = config["sync_overflow"], word & 0xFF
+    if length != (1 if overflow else 0) or (overflow and not 1 <= counter <= overflow):
+        return False
+    if memory["sync_expected"] != UNKNOWN and counter != memory["sync_expected"]:
+        return False
+    memory["sync_expected"] = counter % overflow + 1 if overflow else 0
     return True

@@ -4,6 +4,7 @@ One rig for the whole time. Its rows go to a recording a minute, which is closed
 next; then it is deleted, unless it is to be kept: half an hour is 3 GB.
 """
 
+import bisect
 import dataclasses
 import random
 import time
@@ -11,7 +12,7 @@ from collections import Counter
 from collections.abc import Callable
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -24,11 +25,14 @@ from hil.recording.recording import Recording, RecordingWriter
 from hil.runs.scenario import Scenario, load_scenario
 from hil.studies.faults.matrix import CASES, NODE_MS
 from hil.studies.faults.outcome import DISCHARGED_V, RISE_V, largest_rise_v, largest_step_v
+from pkxyz_ctrl.loop.controller import Controller
 from pkxyz_ctrl.safety.modes import MAY_ENERGISE, Mode
 from pkxyz_ctrl.safety.trips import Trip
 
 SCENARIO = "faults"
 CLEAR_S = 0.02
+AFTER_US = 50_000
+"""From the end of a fault to the last decision that it may lead to: the longest time-out, that of a heartbeat."""
 _GAP_S = (0.15, 0.7)  # between the beginnings of faults: some hit a scan, some a start-up, some a homing
 _LASTS_S = (0.0005, 0.06)
 _QUIET_S = 0.05  # at the end, so that the last one is not cut off
@@ -60,6 +64,10 @@ class Soaked:
     """most that it rose in a tick while no voltage was allowed"""
     zero_ticks: int = 0
     """longest that a comb was above 0 V after the end of a mode with voltages"""
+    unprovoked: int = 0
+    """decisions without a fault that could have led to them"""
+    latest_us: int = 0
+    """longest from the end of the last fault to a decision"""
     damaged: bool = False
     """fingers snapped or the mechanism broken"""
     memory_mb: list[float] = field(default_factory=list)
@@ -114,7 +122,7 @@ def soak(
     setup = dataclasses.replace(
         scenario.setup(), seed=seed, duration_s=duration_s, clear_s=CLEAR_S, faults=random_faults(duration_s, seed)
     )
-    rig = LockstepRig(setup)
+    rig = LockstepRig(setup, controller=NotingController)
     soaked = Soaked(seed, law, setup.ticks, faults=len(setup.faults))
     soaked.minutes_each = rows_each * setup.bus.period_s / 60.0
     log = _Log(soaked, rig, folder, rows_each, keep)
@@ -132,15 +140,46 @@ def soak(
     return soaked
 
 
+class Decided(NamedTuple):
+    """A fault decision."""
+
+    t_us: int
+    """the end of its tick, on the bus's clock"""
+    age_us: int
+    """how long ago came what it is for: an emergency of the node's may wait for the end of a start-up; else 0"""
+
+
+class NotingController(Controller):
+    """Keeps its fault decisions, until somebody takes them."""
+
+    def __init__(self, *arguments: Any) -> None:
+        super().__init__(*arguments)
+        self.decided: list[Decided] = []
+
+    def compute(self, reference: NDArray[np.void], overrun: int) -> None:
+        """As ever."""
+        before = self.mode
+        super().compute(reference, overrun)
+        if self.mode == Mode.FAULT != before:
+            row, begun_us = self.memory["row"][0], int(self.exchange["begun_us"][0])
+            came_us = int(self.exchange["driver"]["emergency_us"][0, 0])
+            age_us = begun_us + self.period_us - came_us if int(row["trips"]) == Trip.NODE_EMERGENCY else 0
+            self.decided.append(Decided(begun_us + self.period_us, age_us))
+
+
 class _Log:
     """Takes the rows: into recordings that are checked one by one, and into the figures."""
 
     def __init__(self, soaked: Soaked, rig: LockstepRig, folder: Path, rows_each: int, keep: bool) -> None:
         self._soaked, self._rig, self._folder, self._rows_each, self._keep = soaked, rig, folder, rows_each, keep
+        assert isinstance(rig.controller, NotingController)
+        self._controller = rig.controller
         self._reasons: Counter[str] = Counter()
         self._writer: RecordingWriter | None = None
         self._last_mode = int(Mode.IDLE)
         self._voltages = _Voltages(soaked, rig.setup)
+        self._begins_us = [f.at_us for f in rig.setup.faults]
+        self._ends_us = [f.end_us or f.at_us for f in rig.setup.faults]
         self._parts = 0
 
     def take(self, rows: NDArray[np.void]) -> None:
@@ -180,6 +219,12 @@ class _Log:
         entered = np.flatnonzero((mode[1:] == Mode.FAULT) & (mode[:-1] != Mode.FAULT))
         for row in rows[entered]:
             self._reasons.update(str(trip.name) for trip in Trip if trip & int(row["trips"]))
+        noted = self._controller.decided
+        for decided in noted:
+            self._explain(decided)
+        if len(noted) != len(entered):
+            soaked.problems.append(f"{len(noted)} decisions in a block whose rows show {len(entered)}")
+        noted.clear()
         soaked.decisions += len(entered)
         soaked.returns += int(np.count_nonzero((mode[1:] == Mode.TRACKING) & (mode[:-1] == Mode.ENABLED)))
         soaked.reasons = dict(self._reasons.most_common())
@@ -188,6 +233,15 @@ class _Log:
         soaked.damaged = soaked.damaged or bool(state["broken"] or state["held"].any())
         self._rig.controller.faults.clear()  # counted; the words of a thousand faults are of no use
         self._last_mode = int(mode[-1])
+
+    def _explain(self, decided: Decided) -> None:
+        """A decision has to follow a fault: itself, or the emergency that it is for and that came before."""
+        assert self._rig.injection is not None
+        t_us = decided.t_us - decided.age_us - self._rig.injection.origin_us
+        last = bisect.bisect_right(self._begins_us, t_us) - 1
+        since_us = t_us - self._ends_us[last] if last >= 0 else t_us
+        self._soaked.latest_us = max(self._soaked.latest_us, since_us)
+        self._soaked.unprovoked += since_us > AFTER_US
 
 
 class _Voltages:
@@ -200,7 +254,9 @@ class _Voltages:
     def __init__(self, soaked: Soaked, setup: Setup) -> None:
         self._soaked = soaked
         self._period_us = setup.bus.period_us
-        self._disobedient = [f for f in setup.faults if f.family == "amplifier" and f.kind != "trip"]
+        disobedient = [f for f in setup.faults if f.family == "amplifier" and f.kind != "trip"]
+        after_us = self._AFTER * self._period_us
+        self._disobedient = [(f.at_us - self._period_us, (f.end_us or 0) + after_us, f.channel) for f in disobedient]
         self._volts: NDArray[np.float64] = np.zeros((3, 3))  # the last ticks of the block before
         self._obeys: NDArray[np.bool_] = np.ones((3, 3), bool)
         self._forbidden: NDArray[np.bool_] = np.ones(3, bool)
@@ -221,20 +277,21 @@ class _Voltages:
             asked[~obeys[:, comb]] = np.nan  # and so are the steps to and from there: none
             soaked.slew_max_v = max(soaked.slew_max_v, largest_step_v(asked[:-1], asked[-1]))
             soaked.rise_max_v = max(soaked.rise_max_v, largest_rise_v(asked, forbidden))
-        for k in range(3, len(forbidden)):
-            self._forbidden_for = self._forbidden_for + 1 if forbidden[k] else 0
-            if self._forbidden_for > soaked.zero_ticks and (volts[k][obeys[k]] >= DISCHARGED_V).any():
-                soaked.zero_ticks = self._forbidden_for
+        ticks = np.arange(1, len(forbidden) - 2)
+        allowed = np.maximum.accumulate(np.where(forbidden[3:], -self._forbidden_for, ticks))
+        lasted = np.where(forbidden[3:], ticks - allowed, 0)  # so long none has been allowed
+        charged = ((volts[3:] >= DISCHARGED_V) & obeys[3:]).any(axis=1)
+        soaked.zero_ticks = max(soaked.zero_ticks, int(lasted[charged].max(initial=0)))
+        self._forbidden_for = int(lasted[-1])
         self._volts, self._obeys, self._forbidden = volts[-3:].copy(), obeys[-3:], forbidden[-3:]
 
     def _obedience(self, ticks: NDArray[np.int64]) -> NDArray[np.bool_]:
         """(n, 3), for ticks of the bus's time."""
         obeys = np.ones((len(ticks), 3), bool)
         t_us = ticks * self._period_us
-        for fault in self._disobedient:
-            end_us = (fault.end_us or 0) + self._AFTER * self._period_us
-            if fault.at_us <= t_us[-1] and end_us >= t_us[0]:
-                obeys[(fault.at_us - self._period_us <= t_us) & (t_us <= end_us), fault.channel] = False
+        for begin_us, end_us, channel in self._disobedient:
+            if begin_us <= t_us[-1] and end_us >= t_us[0]:
+                obeys[(begin_us <= t_us) & (t_us <= end_us), channel] = False
         return obeys
 
 
@@ -254,6 +311,8 @@ def _judge(soaked: Soaked, setup: Setup) -> None:
         problems.append(f"a comb's voltage rose by {soaked.rise_max_v:.1f} V while none was allowed")
     if soaked.zero_ticks > zero_ticks_max:
         problems.append(f"a voltage {soaked.zero_ticks} ticks after the end of a mode with voltages")
+    if soaked.unprovoked:
+        problems.append(f"{soaked.unprovoked} decisions without a fault in the {AFTER_US // 1000} ms before")
     if soaked.decisions == 0 or soaked.returns == 0:
         problems.append("no fault was decided, or none recovered from")
     if len(soaked.memory_mb) > 4:

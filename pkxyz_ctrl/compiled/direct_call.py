@@ -31,6 +31,8 @@ _compiled: dict[tuple[Any, ...], Callable[..., Any]] = {}  # numba takes some ms
 
 def _kind(example: object) -> object:
     """What decides the type of ``example`` for numba."""
+    if isinstance(example, tuple):
+        return tuple(map(_kind, example))
     if not isinstance(example, np.ndarray):
         return type(example)
     flags = example.flags

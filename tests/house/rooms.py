@@ -74,8 +74,8 @@ HOUSE: Mapping[str, Room] = MappingProxyType({
     "hil.plant": Room(("sim.motion", "sim.structure", "sim", "pkxyz_ctrl.compiled", "pkxyz_ctrl.loop", "pkxyz_ctrl")),
     "hil.recording": Room(("pkxyz_ctrl.can", "pkxyz_ctrl.loop", "hil.bus")),
     "hil.faults": Room((
-        "sim", "pkxyz_ctrl.can", "pkxyz_ctrl.safety", "pkxyz_ctrl.config", "pkxyz_ctrl.loop", "hil.bus", "hil.node",
-        "hil.plant",
+        "sim.motion", "sim", "pkxyz_ctrl.compiled", "pkxyz_ctrl.can", "pkxyz_ctrl.safety", "pkxyz_ctrl.config",
+        "pkxyz_ctrl.loop", "hil.bus", "hil.node", "hil.plant",
     )),
     # a loop that is closed, once
     "hil.lanes": Room(

@@ -23,11 +23,17 @@ from hil.lanes.lockstep import LockstepRig
 from hil.lanes.setup import Setup
 from hil.lanes.stretches import Stretches
 from hil.runs.scenario import load_scenario
+from hil.studies.faults.matrix import CASES
+from hil.studies.faults.outcome import setup_for
 from pkxyz_ctrl.can.driver import word_of
 from pkxyz_ctrl.can.frame import BIT_RATE_SWITCH, FD, Frame
 from pkxyz_ctrl.loop.row import ROW
 
+TEXTS = tuple(dict.fromkeys(case.text for case in CASES if case.text != "controller:killed"))
+"""Every kind of fault, as the matrix has it; a controller that is killed leaves no more ticks."""
 FAULTS = (
+    "sense.1:intermittent@{t}+0.02,probability=0.1", "sense.2:slow@{t}+0.04", "amplifier.1:slew_collapse@{t}+0.03",
+    "bus:drop@{t}+0.02,probability=0.05", "controller:late_tick@{t}+0.01,late_us=30",
     "bus.sense:drop@{t},probability=0.02", "bus.drive:corrupt@{t}+0.01,probability=0.3", "bus.sync:drop@{t}+0.002",
     "bus.drive:delay@{t}+0.004,delay_us=190", "bus:error_frames@{t}+0.01,probability=0.2", "bus:babbling@{t}+0.003",
     "bus.heartbeat:drop@{t}+0.08", "bus.drive:forged@{t}+0.01,interval_s=0.003", "node:reset@{t}",
@@ -119,6 +125,50 @@ def test_a_fault_at_any_time_is_the_same_both_ways(
     )  # fmt: skip
     same_both_ways(made, tmp_path)
     assert sum(whole) > 0 or any(at < 700 for _, at in faults)
+
+
+@pytest.mark.parametrize("text", TEXTS)
+def test_every_fault_of_the_matrix_is_the_same_both_ways(text: str, tmp_path: Path, whole: list[int]) -> None:
+    """Its onset, what is decided and when, 20 ms of it, the clear and the start-up behind it."""
+    head, comma, rest = text.partition(",")
+    fault = parse(f"{head}@0.11+0.02{comma}{rest}")
+    made = dataclasses.replace(setup("nominal"), duration_s=0.35, clear_s=0.02, faults=(fault,))
+    same_both_ways(made, tmp_path)
+    assert sum(whole) > 0.75 * made.ticks
+
+
+@pytest.mark.parametrize(
+    ("text", "share"),
+    [
+        ("sense.2:slow,corner_hz=2000", 0.99), ("sense.1:offset,offset_m=0.2e-6", 0.99),
+        ("plant:stiffness,factor=1.02", 0.99),
+        ("amplifier.1:stuck", 0.5), ("bus.sense:drop,probability=0.01", 0.95), ("bus.heartbeat:drop", 0.9),
+        ("controller:late_tick,late_us=30", 0.98),
+    ],
+)  # fmt: skip
+def test_ticks_under_a_lasting_fault_are_whole(text: str, share: float, tmp_path: Path, whole: list[int]) -> None:
+    """Channels that do what they should not, frames that are lost now and then, ticks that are late: all compiled."""
+    head, comma, rest = text.partition(",")
+    made = dataclasses.replace(setup("nominal"), duration_s=0.25, faults=(parse(f"{head}@0.11+0.13{comma}{rest}"),))
+    rig = same_both_ways(made, tmp_path)
+    assert sum(whole) > share * made.ticks, rig.controller.faults
+
+
+@pytest.mark.parametrize("text", ["sense.1:off", "amplifier.2:slew_collapse", "bus.drive:drop", "node:silent"])
+def test_combs_that_are_watched_are_the_same_both_ways(text: str, whole: list[int]) -> None:
+    """What ``pkxyz faults`` judges by: the voltages behind each tick."""
+    case = next(case for case in CASES if case.text == text)
+    made = dataclasses.replace(setup_for("lqg"), faults=(case.fault,), clear_s=0.05, duration_s=0.4)
+    seen = []
+    for whole_ticks in (True, False):
+        rig = LockstepRig(made, whole_ticks=whole_ticks)
+        assert rig.injection is not None
+        rig.injection.watched = []
+        rig.run(Blocks(made.trajectory, made.bus.period_us, made.ticks, lambda block: None, lambda *_: None))
+        seen.append((rig.injection.watched, rig.controller.faults))
+    assert seen[0] == seen[1]
+    assert len(seen[0][0]) == made.ticks
+    assert sum(whole) > 0.75 * made.ticks
 
 
 def test_who_else_is_on_the_bus_meets_every_frame(tmp_path: Path, whole: list[int]) -> None:

@@ -6,13 +6,15 @@ import pytest
 from hil.bus.endpoint import Endpoint
 from hil.faults.catalogue import KINDS
 from hil.faults.fault import parse
+from hil.faults.injection import Injection
 from hil.lanes.lockstep import LockstepRig
+from hil.lanes.stretches import Stretches
 from hil.node.amplifier import AmplifierNode
 from hil.node.drive import DriveReceiver
 from hil.recording.recording import Recording
 from hil.runs.scenario import load_scenario
 from hil.studies.faults.outcome import RISE_V
-from hil.studies.soak import random_faults, soak, soaked_scenario
+from hil.studies.soak import AFTER_US, random_faults, soak, soaked_scenario
 
 
 @pytest.fixture(scope="module")
@@ -33,6 +35,8 @@ def test_nothing_is_lost_and_nothing_breaks(soaked):
     assert 0.9 < found.slew_max_v < 5.0
     assert found.rise_max_v < RISE_V
     assert 1 <= found.zero_ticks <= 106  # 20 ms where no frame reaches the node
+    assert found.unprovoked == 0
+    assert 0 <= found.latest_us < AFTER_US
     parts = sorted(folder.glob("*.parquet"))
     assert len(parts) == len(found.memory_mb) == 3
     for total, each in (
@@ -107,6 +111,38 @@ def exceeds(self, counts, t_us):
 def applied_as_shipped(self, counts, t_us):
     self._drive.pending, self._silent_syncs, self.outputs = None, 0, counts
     return counts
+
+
+def test_a_decision_without_a_fault_is_found(tmp_path, monkeypatch):
+    """An amplifier that trips by itself, 0.15 s after the only fault that was planned."""
+    shipped = Injection.arm
+
+    def arm_and_trip(self):
+        clock = shipped(self)
+        self._clock.call_at(self.origin_us + 450_000, lambda: self.wire_faults._node.amplifier_fault(0x2310))
+        return clock
+
+    monkeypatch.setattr(Injection, "arm", arm_and_trip)
+    monkeypatch.setattr("hil.studies.soak.random_faults", lambda *_: (parse("sense.1:off@0.29+0.01"),))
+    found = soak(0.6, 1, soaked_scenario("lqg"), tmp_path)
+    assert found.unprovoked == 1
+    assert "1 decisions without a fault in the 50 ms before" in found.problems
+
+
+def test_a_defect_within_whole_ticks_is_found(tmp_path, monkeypatch):
+    """Combs that keep 30 V more than they are told, in the plant itself: the compiled ticks have it, too."""
+    whole, run = [], Stretches.run
+
+    def counted(self, *arguments):
+        self._plant.plant.params["amplifier_offset_v"][0, 0] = 30.0
+        whole.append(run(self, *arguments))
+        return whole[-1]
+
+    monkeypatch.setattr(Stretches, "run", counted)
+    monkeypatch.setattr("hil.studies.soak.random_faults", lambda *_: (parse("bus.sync:drop@0.3+0.01"),))
+    found = soak(0.5, 1, soaked_scenario("lqg"), tmp_path)
+    assert sum(whole) > 1_500
+    assert any("ticks after the end of a mode with voltages" in problem for problem in found.problems), found.problems
 
 
 @pytest.mark.parametrize(
