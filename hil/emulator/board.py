@@ -124,9 +124,10 @@ class Board:
 
     def _ending(self) -> BoardGoneError:
         code = self._process.wait(timeout=_SILENT_MOST_S)
-        how = f"ended by signal {-code} ({signal.Signals(-code).name})" if code < 0 else f"ended with code {code}"
+        if code < 0:
+            return BoardGoneError(f"ended by signal {-code} ({signal.Signals(-code).name})")
         said = " ".join(self._said.read_text(encoding="utf-8", errors="replace").split())
-        return BoardGoneError(f"{how}{': ' if said else ''}{said[-300:]}")
+        return BoardGoneError(f"ended with code {code}: {said[-300:]}")
 
 
 def _dies_with_its_parent(parent: int) -> None:
