@@ -75,9 +75,11 @@ def served(folder):
             assert time.monotonic() < end_s, f"the node is not {state}, driven {driven}: {lines}"
             time.sleep(0.02)
 
-    yield seen
-    process.terminate()
-    _, err = process.communicate(timeout=60)
+    try:
+        yield seen
+    finally:
+        process.terminate()
+        _, err = process.communicate(timeout=60)
     assert process.returncode == 0, err
 
 
