@@ -10,7 +10,7 @@ import re
 from pathlib import Path
 from typing import Any
 
-from hil.bench.figure import Figure
+from hil.bench.rigs.figure import Figure
 from hil.commands.bench import bound_of, in_digits
 from hil.pictures.style import BLUE, FAINT, GREEN, MUTED, ORANGE, SKY, TINY_PT, dress, legend, save, sheet
 

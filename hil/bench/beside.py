@@ -6,7 +6,7 @@ from functools import cache
 
 import numpy as np
 
-from hil.bench.figure import Figure
+from hil.bench.rigs.figure import Figure
 from hil.lanes import in_process as lanes
 from hil.lanes.lane import Lane
 from hil.lanes.setup import Setup, bare_setup

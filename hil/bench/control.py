@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from hil.bench.figure import Figure
+from hil.bench.rigs.figure import Figure
 from hil.bench.rigs.held import HOLD_S, STROKES_M, held_nm, shortest_step_s
 from hil.bench.rigs.motions import MIDDLE_M, error_m, run, settled_s, setup_of
 from hil.bench.rigs.predictive import LOW_M, TOLERANCE, WAY_M, mpc_ticks_us, osqp_us, solver_us

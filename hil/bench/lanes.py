@@ -7,8 +7,8 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from hil.bench.figure import Figure, once, repeated, times_of
 from hil.bench.rigs.closed_loop import scan
+from hil.bench.rigs.figure import Figure, once, repeated, times_of
 from hil.bench.rigs.played import Played, PlayedPort, drive_counts, recorded_frames
 from hil.bench.tick import ticks_from_python
 from hil.lanes import in_process as lanes

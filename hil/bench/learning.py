@@ -2,7 +2,7 @@
 
 import numpy as np
 
-from hil.bench.figure import Figure
+from hil.bench.rigs.figure import Figure
 from hil.lanes import in_process as lanes
 from hil.lanes.lane import Lane
 from hil.runs.metrics import Metrics

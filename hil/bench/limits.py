@@ -2,8 +2,8 @@
 
 import numpy as np
 
-from hil.bench.figure import Figure, calls
 from hil.bench.rigs.closed_loop import scan
+from hil.bench.rigs.figure import Figure, calls
 from hil.bench.rigs.kernels import no_argument, one_array, three_arrays, two_arrays
 from hil.bus.frame_time import INTERFRAME_BITS, frame_range_us
 from pkxyz_ctrl.can import cob_id

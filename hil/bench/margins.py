@@ -5,7 +5,7 @@ import math
 import numpy as np
 from numpy.typing import NDArray
 
-from hil.bench.figure import Figure
+from hil.bench.rigs.figure import Figure
 from hil.lanes.excitation import excitation, tones
 from hil.lanes.lane import Lane
 from hil.lanes.setup import bare_setup

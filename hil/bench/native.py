@@ -15,7 +15,7 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from hil.bench.figure import Figure
+from hil.bench.rigs.figure import Figure
 from hil.native.program import compiled
 from hil.runs.at_rate import RanAtRate, run_into
 from hil.runs.run_folder import RunFolder

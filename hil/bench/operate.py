@@ -12,7 +12,7 @@ import time
 from collections.abc import Iterator
 from pathlib import Path
 
-from hil.bench.figure import Figure
+from hil.bench.rigs.figure import Figure
 from pkxyz_ctrl.client import place
 from pkxyz_ctrl.client.stage import AsyncStage, connect_async
 

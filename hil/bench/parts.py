@@ -4,8 +4,8 @@ from functools import partial
 
 import numpy as np
 
-from hil.bench.figure import Figure, calls, once, times_of
 from hil.bench.rigs.closed_loop import scan
+from hil.bench.rigs.figure import Figure, calls, once, times_of
 from hil.bench.rigs.played import Played, PlayedPort, TimedPort, recorded_frames
 from hil.bus.clock import Lockstep
 from hil.bus.frame_time import frame_duration_ns

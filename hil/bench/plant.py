@@ -2,8 +2,8 @@
 
 import numpy as np
 
-from hil.bench.figure import Figure, repeated
 from hil.bench.rigs.closed_loop import scan
+from hil.bench.rigs.figure import Figure, repeated
 from hil.bench.rigs.kernels import replay_plant
 from hil.bench.rigs.reference_motion import reference_motion
 

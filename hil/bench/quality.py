@@ -3,7 +3,7 @@
 import dataclasses
 from typing import Any
 
-from hil.bench.figure import Direction, Figure
+from hil.bench.rigs.figure import Direction, Figure
 from hil.lanes import in_process as lanes
 from hil.lanes.lane import Lane
 from hil.runs.metrics import Metrics

@@ -10,7 +10,7 @@ import time
 from collections import Counter
 from pathlib import Path
 
-from hil.bench.figure import Figure
+from hil.bench.rigs.figure import Figure
 from hil.runs.run_folder import PICTURE
 
 REPEATS = 3

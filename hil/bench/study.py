@@ -7,7 +7,7 @@ import statistics
 import time
 from importlib.util import find_spec
 
-from hil.bench.figure import Figure
+from hil.bench.rigs.figure import Figure
 from hil.runs.scenario import Scenario, build_scenario, load_scenario
 from hil.studies.montecarlo import PLANTS_AT_ONCE, Study, run_one
 from hil.studies.spread.cluster import Cluster

@@ -22,7 +22,7 @@ from hil.bench import (
     study,
     tick,
 )
-from hil.bench.figure import Figure
+from hil.bench.rigs.figure import Figure
 from hil.runs.versions import versions
 from pkxyz_ctrl.config.files import ConfigError
 from pkxyz_ctrl.io.realtime import cores

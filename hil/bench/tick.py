@@ -7,8 +7,8 @@ import numpy as np
 from filterpy.kalman import KalmanFilter
 from numpy.typing import NDArray
 
-from hil.bench.figure import Figure, repeated
 from hil.bench.rigs.closed_loop import ClosedLoop, scan
+from hil.bench.rigs.figure import Figure, repeated
 from hil.bench.rigs.kernels import replay_cycle
 from pkxyz_ctrl.design.laws.estimator_gain import measurement_matrix, measurement_noise, process_noise
 from pkxyz_ctrl.design.model.plant_model import amplifier_time_constant_s, linearise, sample

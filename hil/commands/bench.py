@@ -12,7 +12,7 @@ from hil.screen.terminal import bad, good, notes, plain_table, screen
 if TYPE_CHECKING:
     from rich.table import Table
 
-    from hil.bench.figure import Figure
+    from hil.bench.rigs.figure import Figure
 
 _WIDE = 120
 """Columns of a terminal from which on there is room for what a figure means."""

@@ -21,10 +21,10 @@ from hil.faults.clock import ControllerKilledError
 from hil.faults.injection import Injection, plant_of
 from hil.lanes.blocks import Blocks
 from hil.lanes.setup import Setup
-from hil.lanes.stretches import Stretches
 from hil.node.wired import wired_node
 from hil.plant.on_bus import RECORD
 from hil.plant.truth import TRUTH_BYTES
+from hil.whole_ticks.stretches import Stretches
 from pkxyz_ctrl.can.cob_id import SYNC
 from pkxyz_ctrl.can.frame import Frame
 from pkxyz_ctrl.config.bus import CanConfig

@@ -75,9 +75,7 @@ class AmplifierNode:
         self._boot_alarm = Alarm(clock, self._boot)
         self._receivers: dict[int, Receiver] = {}  # by COB-ID, only what the present state lets in
         self._holds: set[int] = set()  # errors that keep the outputs at their error values
-        self._silent_syncs = 0
-        self._step_max = 0
-        self._drive_timeout_us = 0
+        self._silent_syncs = self._step_max = self._drive_timeout_us = 0
         self._drive_deadline = Alarm(clock, self._drive_overdue)
         self._sync_following: dict[bytes, bytes] = {}
         self._sync_expected: bytes | None = None
@@ -99,15 +97,17 @@ class AmplifierNode:
         self._sense = SenseTransmitter(
             od, self._sense_pdo, clock, plant, self._transmit, self._heartbeat, self.signature, turnaround_us
         )
-        objects = NodeObjects(
-            od,
+        self._sdo = SdoServer(self._objects(signature_pdo))
+
+    def _objects(self, signature_pdo: PdoParameters) -> NodeObjects:
+        return NodeObjects(
+            self.od,
             (self._drive_pdo, self._sense_pdo, self.digital.parameters, signature_pdo),
             refresh=self._refresh,
             changed=self._configure,
-            may_drive=lambda: not protection and self.state is NmtState.OPERATIONAL and not self._holds,
+            may_drive=lambda: not self._protection and self.state is NmtState.OPERATIONAL and not self._holds,
             is_operational=lambda: self.state is NmtState.OPERATIONAL,
         )
-        self._sdo = SdoServer(objects)
 
     # -- from outside ------------------------------------------------------------------------------------------------
 

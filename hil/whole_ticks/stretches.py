@@ -16,13 +16,13 @@ from hil.faults.channels import DICE
 from hil.faults.frame_rules import RULE
 from hil.faults.injection import Injection
 from hil.faults.plant import channels_of
-from hil.lanes.happenings import BENCH, INBOX, NEVER_US
-from hil.lanes.whole_ticks import whole_ticks
 from hil.node.alarm import Alarm
 from hil.node.amplifier import AmplifierNode
-from hil.node.at_work import NodeAtWork
 from hil.node.rules import OPERATIONAL
 from hil.plant.on_bus import PlantOnBus
+from hil.whole_ticks.happenings import BENCH, INBOX, NEVER_US
+from hil.whole_ticks.node_at_work import NodeAtWork
+from hil.whole_ticks.ticks import whole_ticks
 from pkxyz_ctrl.can.driver import bytes_of, word_of
 from pkxyz_ctrl.can.frame import UNUSUAL, Frame
 from pkxyz_ctrl.compiled.direct_call import direct

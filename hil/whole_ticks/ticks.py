@@ -12,8 +12,8 @@ from numba import njit
 from numpy.typing import NDArray
 
 from hil.bus.log_lines import LINE_MOST
-from hil.lanes.happenings import Bytes, Line, Records, Stage, happen, look, next_us, pass_time, send, take_first
 from hil.node.rules import NEVER_US, OPERATIONAL
+from hil.whole_ticks.happenings import Bytes, Line, Records, Stage, happen, look, next_us, pass_time, send, take_first
 from pkxyz_ctrl.can.driver_rules import FRESH, RUNNING
 from pkxyz_ctrl.loop.exchange import BLOCKED, NOT_RESTARTED, RESTARTED, begin, finish, on_frame, period
 from pkxyz_ctrl.safety.modes import Mode

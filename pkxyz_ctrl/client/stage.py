@@ -393,9 +393,8 @@ def connect_async(
     if url is None:
         found = place.read(name, "server")
         if found is None:
-            raise NoStageError(
-                f"no server for {name!r} runs on this machine: start `pkxyz serve`, or give url and token"
-            )
+            words = f"no server for {name!r} runs on this machine: start `pkxyz serve`, or give url and token"
+            raise NoStageError(words)
         url, token = found["url"], token or found["token"]
     url, _, behind = url.partition("#")
     return AsyncStage(url, token or behind, control=control)

@@ -16,9 +16,10 @@ import numpy as np
 import pytest
 from sim_rig import config, counts, plant
 
-from hil.bench import beside, figure, quality, startup, suite, tick
-from hil.bench.figure import Figure
+from hil.bench import beside, quality, startup, suite, tick
+from hil.bench.rigs import figure
 from hil.bench.rigs.closed_loop import scan
+from hil.bench.rigs.figure import Figure
 from hil.bench.rigs.reference_motion import reference_motion
 from pkxyz_ctrl.config.files import ConfigError
 

@@ -78,9 +78,10 @@ HOUSE: Mapping[str, Room] = MappingProxyType({
         "pkxyz_ctrl.loop", "hil.bus", "hil.node", "hil.plant",
     )),
     # a loop that is closed, once
-    "hil.lanes": Room(
-        ("sim.config", "sim", "pkxyz_ctrl.*", "hil.bus", "hil.node", "hil.plant", "hil.faults")
-    ),
+    "hil.whole_ticks": Room(("pkxyz_ctrl.*", "hil.bus", "hil.node", "hil.plant", "hil.faults")),
+    "hil.lanes": Room((
+        "sim.config", "sim", "pkxyz_ctrl.*", "hil.bus", "hil.node", "hil.plant", "hil.faults", "hil.whole_ticks",
+    )),
     "hil.emulator": Room(("pkxyz_ctrl.*", "hil.faults", "hil.lanes")),
     "hil.conformance": Room(("sim.config", "sim", "pkxyz_ctrl.*", "hil.bus", "hil.node", "hil.plant", "hil.lanes")),
     "hil.operate": Room(("pkxyz_ctrl.*", "hil.bus", "hil.lanes")),

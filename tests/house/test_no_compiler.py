@@ -14,7 +14,7 @@ from pkxyz_ctrl.safety.modes import Mode
 from pkxyz_ctrl.safety.trips import Trip
 
 ROOT = Path(__file__).parents[2]
-RIGS = ROOT / "tests" / "rigs"
+HERE, RIGS = Path(__file__).parent, ROOT / "tests" / "rigs"
 
 
 def without_compiler(*arguments: str) -> subprocess.CompletedProcess[str]:
@@ -43,7 +43,7 @@ def test_the_stories_tell_something(compiled):
 
 def test_140_ticks_agree_to_a_billionth(compiled, tmp_path):
     """Counts, modes and events exactly, everything else to 1e-9 of the largest value of its field."""
-    done = without_compiler(str(RIGS / "scripted_ticks.py"), str(tmp_path / "rows.npy"))
+    done = without_compiler(str(HERE / "scripted_ticks.py"), str(tmp_path / "rows.npy"))
     assert done.returncode == 0, done.stderr
     interpreted = np.load(tmp_path / "rows.npy")
     assert interpreted.dtype == ROW

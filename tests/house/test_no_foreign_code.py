@@ -14,6 +14,8 @@ ALLOWED = {
     ("hil/bench/startup.py", "subprocess"): "this program, timed",
     ("hil/bench/operate.py", "subprocess"): "this program: what it serves, timed",
     ("hil/bench/native.py", "subprocess"): "this program: the plant, beside which loops are timed",
+    ("hil/emulator/image.py", "subprocess"): "the cross compiler, for sources of this package",
+    ("hil/emulator/board.py", "subprocess"): "the emulator, with the firmware that was made of them",
     ("hil/native/program.py", "subprocess"): "the C compiler, for sources of this package",
     ("hil/native/native_rig.py", "subprocess"): "the program that it made of them",
     ("hil/server/serving.py", "subprocess"): "this program: the loop and the plant, in processes of their own",

@@ -6,7 +6,7 @@ from hypothesis import strategies as st
 from node_rig import CONTROLLER, DRIVE, EMCY, SENSE, SYNC, Rig, protected, sample_at
 
 from hil.node import rules
-from hil.node.at_work import NodeAtWork
+from hil.whole_ticks.node_at_work import NodeAtWork
 from pkxyz_ctrl.can.driver import bytes_of, word_of
 
 CONSUMER = 0x1016, 1, 0x7F_0032, 4  # the controller's heartbeat, 50 ms

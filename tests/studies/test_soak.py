@@ -8,13 +8,13 @@ from hil.faults.catalogue import KINDS
 from hil.faults.fault import parse
 from hil.faults.injection import Injection
 from hil.lanes.lockstep import LockstepRig
-from hil.lanes.stretches import Stretches
 from hil.node.amplifier import AmplifierNode
 from hil.node.drive import DriveReceiver
 from hil.recording.recording import Recording
 from hil.runs.scenario import load_scenario
 from hil.studies.faults.outcome import RISE_V
 from hil.studies.soak import AFTER_US, random_faults, soak, soaked_scenario
+from hil.whole_ticks.stretches import Stretches
 
 
 @pytest.fixture(scope="module")

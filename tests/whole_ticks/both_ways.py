@@ -1,7 +1,7 @@
 """Every case of the fault matrix in whole ticks and event by event, under laws and on buses: the same rows, voltages
 behind each tick, decisions and words. Some minutes a law and bus.
 
-    python tests/lanes/both_ways.py [--law LAW]... [--bus BUS]... [--lasting]
+    python tests/whole_ticks/both_ways.py [--law LAW]... [--bus BUS]... [--lasting]
 """
 
 import argparse

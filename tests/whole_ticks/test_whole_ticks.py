@@ -21,10 +21,10 @@ from hil.faults.fault import parse
 from hil.lanes.blocks import Blocks
 from hil.lanes.lockstep import LockstepRig
 from hil.lanes.setup import Setup
-from hil.lanes.stretches import Stretches
 from hil.runs.scenario import load_scenario
 from hil.studies.faults.matrix import CASES
 from hil.studies.faults.outcome import setup_for
+from hil.whole_ticks.stretches import Stretches
 from pkxyz_ctrl.can.driver import word_of
 from pkxyz_ctrl.can.frame import BIT_RATE_SWITCH, FD, Frame
 from pkxyz_ctrl.loop.row import ROW
