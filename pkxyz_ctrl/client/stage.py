@@ -133,7 +133,9 @@ class AsyncStage:
         trigger the node's digital outputs, and ``pixels`` of each line.
         """
         limits = limits_of(velocity_m_per_s, acceleration_m_per_s2, jerk_m_per_s3)
-        return await self._done("path", wait=wait, pixels=pixels, **path_of(scenario, segments, table_csv, limits))
+        return await self._done(
+            "path", wait=wait, pixels=pixels or None, **path_of(scenario, segments, table_csv, limits)
+        )
 
     async def preview(
         self,

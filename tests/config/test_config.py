@@ -282,4 +282,8 @@ def test_what_write_toml_writes_anyone_can_read(tmp_path):
 @pytest.mark.parametrize("name", names("controllers"))
 def test_every_shipped_law_is_watched_alike(name):
     """A fault is decided after as many ticks whatever law runs: ``pkxyz faults`` holds them all to one bound."""
-    assert load("controllers", name, ControllerConfig).monitors == load("controllers", "lqg", ControllerConfig).monitors
+    watched = load("controllers", name, ControllerConfig).monitors
+    if name == "open_loop":  # nothing brings a soft device back to its force: safety/thresholds.py
+        assert watched.force_change_share == 0.58
+        watched = watched.model_copy(update={"force_change_share": 0.47})
+    assert watched == load("controllers", "lqg", ControllerConfig).monitors

@@ -48,8 +48,8 @@ def file_of(folder, report):
 def started(monkeypatch, bus, node_type=AmplifierNode, serial=1):
     """The rig of a run with a module, once it is started; ``missed``: how often the module missed our heartbeat."""
 
-    def wired(can, clock, send, plant):
-        node = wired_node(can, clock, send, plant, node_type)
+    def wired(can, clock, send, plant, switch):
+        node = wired_node(can, clock, send, plant, node_type, switch)
         node.od.entry(0x1018, 4).default = serial
         return node
 

@@ -27,7 +27,7 @@ def refused(capsys, monkeypatch, *words):
 @pytest.mark.parametrize(
     ("words", "says"),
     [
-        (("--target", "z80"), "--target: 'z80' is none; choose host, cortex-m7"),
+        (("--target", "z80"), "--target: 'z80' is none; choose host, linux, cortex-m7"),
         (("nowhere",), "nowhere"),
         (("--controller", "mpc"), "controller 'mpc' solves a problem in the middle of a tick"),
         (("--controller", "nope"), "nope"),
@@ -58,6 +58,6 @@ def test_a_path_that_no_board_holds_is_refused_with_what_it_takes(tmp_path):
     config = np.zeros(1, EXCHANGE)
     config["law"][0] = load_scenario("raster").setup().law
     exported = Exported(config, np.zeros(20_000, REFERENCE), np.zeros(100, CALL), "raster", "youla", "")
-    with pytest.raises(ExportError, match=r"takes 2\.4 MiB.*give --ticks 16384 or less"):
+    with pytest.raises(ExportError, match=r"takes 2\.6 MiB.*give --ticks 15420 or less"):
         write(tmp_path / "out", "cortex-m7", exported)
     assert not (tmp_path / "out").exists()

@@ -137,6 +137,7 @@ def test_what_is_lost_with_it_is_said(monkeypatch):
     assert [line.split(":")[0] for line in told] == [
         'identity "any"',
         "protection = false",
+        "no digital outputs (0x6200",
         "no 0x1019 (SYNC counter overflow)",
         "no 0x1029 (after a communication error",
     ]

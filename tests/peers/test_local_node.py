@@ -70,6 +70,8 @@ DEFECTS = {  # it knows neither process data nor states, takes any value, resets
     "SYNC: SYNC counter": "no EMCY 0x8240",
     "drive PDO: accepted": "0x6411 (0, 0, 0), sent (164, 328, 492)",
     "outputs: heartbeat consumer": "no EMCY 0x8130",
+    "digital outputs: RPDO 1": "",
+    "signature: of what is read": "",
 }
 
 

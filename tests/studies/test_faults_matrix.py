@@ -39,7 +39,7 @@ def test_without_a_fault_the_scan_is_clean():
     assert rows["mode"][-1] == Mode.TRACKING
 
 
-OTHER_BUSES = ("classic_2k", "socketcan_classic", "socketcan_fd", "unix_1k", "unix_2k")
+OTHER_BUSES = ("classic_2k", "socketcan_classic", "socketcan_fd", "unix_1k", "unix_2k", "unix_5k")
 
 
 def test_every_bus_file_with_frames_is_among_those_that_are_broken():

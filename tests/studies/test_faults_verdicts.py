@@ -7,6 +7,7 @@ import numpy as np
 import pytest
 from defective.kernels import planted, says_nothing
 
+from hil.lanes.lockstep import LockstepRig
 from hil.node.amplifier import AmplifierNode
 from hil.studies.faults.matrix import CASES
 from hil.studies.faults.outcome import RISE_V, largest_rise_v, largest_step_v, run_case, setup_for
@@ -57,6 +58,8 @@ def test_what_is_a_little_beyond_a_bound_is_told(monkeypatch, owner, part, defec
     if part == "_enter":
         defect = commanding(Controller._enter)
     monkeypatch.setattr(owner, part, defect)
+    if owner is AmplifierNode:  # whole ticks are played by kernels, which have no such defect
+        monkeypatch.setattr(LockstepRig, "_stretches_of", lambda rig: None)
     problems = run_case("lqg", scan(), case(fault)).problems
     assert any(words in problem for problem in problems), problems
 
