@@ -133,9 +133,8 @@ class AsyncStage:
         trigger the node's digital outputs, and ``pixels`` of each line.
         """
         limits = limits_of(velocity_m_per_s, acceleration_m_per_s2, jerk_m_per_s3)
-        return await self._done(
-            "path", wait=wait, pixels=pixels or None, **path_of(scenario, segments, table_csv, limits)
-        )
+        path = path_of(scenario, segments, table_csv, limits)
+        return await self._done("path", wait=wait, pixels=pixels or None, **path)
 
     async def preview(
         self,
@@ -393,8 +392,7 @@ def connect_async(
     ``control``: take control, without which one can only look on. Raises ``NoStageError``.
     """
     if url is None:
-        found = place.read(name, "server")
-        if found is None:
+        if (found := place.read(name, "server")) is None:
             words = f"no server for {name!r} runs on this machine: start `pkxyz serve`, or give url and token"
             raise NoStageError(words)
         url, token = found["url"], token or found["token"]

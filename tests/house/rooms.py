@@ -75,7 +75,7 @@ HOUSE: Mapping[str, Room] = MappingProxyType({
     "hil.recording": Room(("pkxyz_ctrl.can", "pkxyz_ctrl.loop", "hil.bus")),
     "hil.faults": Room((
         "sim.motion", "sim", "pkxyz_ctrl.compiled", "pkxyz_ctrl.can", "pkxyz_ctrl.safety", "pkxyz_ctrl.config",
-        "pkxyz_ctrl.loop", "hil.bus", "hil.node", "hil.plant",
+        "pkxyz_ctrl.loop", "pkxyz_ctrl", "hil.bus", "hil.node", "hil.plant",
     )),
     # a loop that is closed, once
     "hil.whole_ticks": Room(("pkxyz_ctrl.*", "hil.bus", "hil.node", "hil.plant", "hil.faults")),

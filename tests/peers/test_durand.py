@@ -138,6 +138,7 @@ def test_what_is_lost_with_it_is_said(monkeypatch):
         'identity "any"',
         "protection = false",
         "no digital outputs (0x6200",
+        "no signature of its safety objects (0x2020) in TPDO 3",
         "no 0x1019 (SYNC counter overflow)",
         "no 0x1029 (after a communication error",
     ]
