@@ -70,12 +70,18 @@ def _alike(one: Records, other: Records) -> bool:
 
 
 class Listening:
-    """A linear law of ``new`` (1,) that does not act yet. ``x`` (ORDER_MAX,) is its memory."""
+    """A linear law of ``new`` (1,) that does not act yet. ``x`` (ORDER_MAX,) is its memory.
+
+    What holds the stage is the mean of the force that is fed back. A law that answers to noise from tick to tick does
+    not hand that on, nor is it to end in the middle of it.
+    """
 
     def __init__(self, new: Records, memory: Records) -> None:
         self._linear, self._state = new["tick"]["linear"][0], memory["tick"][0]
         self.x = np.zeros(ORDER_MAX)
         self._expected_m = self._state["set_point_model"]["sample_m"][0].copy()
+        self._ticks = 0
+        self._mean_n, self._square_n2, self._off_n = np.zeros(3), np.zeros(3), np.zeros(3)
 
     def listen(self) -> None:
         """A tick is over: x+ = A x + B e + U (w - w given), with w = -(C x + D e)."""
@@ -83,8 +89,16 @@ class Listening:
         error = state["seen_m"] - self._expected_m
         self._expected_m[:] = state["set_point_model"]["sample_m"][0]
         w = -(linear["c"] @ self.x + linear["d"] @ error)
+        self._ticks += 1
         fed_back_n = state["set_point_model"]["fed_back_n"]
-        self.x = linear["a"] @ self.x + linear["b"] @ error + linear["unwind"] @ (w - fed_back_n)
+        self._mean_n += (fed_back_n - self._mean_n) / self._ticks
+        self._off_n = fed_back_n - self._mean_n
+        self._square_n2 += (self._off_n**2 - self._square_n2) / self._ticks
+        self.x = linear["a"] @ self.x + linear["b"] @ error + linear["unwind"] @ (w - self._mean_n)
+
+    def is_calm(self, deviations: float) -> bool:
+        """Whether the force of this tick is within so many of its standard deviations of its mean, in each axis."""
+        return bool(np.all(self._off_n**2 <= deviations**2 * self._square_n2))
 
 
 def _move_origin(before: np.void, after: np.void, state: np.void) -> None:

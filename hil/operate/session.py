@@ -37,6 +37,7 @@ _AT_ONCE = frozenset({Verb.SETTLE, Verb.LIMITS, Verb.SAMPLE, Verb.QUIET, Verb.TR
 _LEAST, _MOST = 1e-12, 1e6
 _SIGMAS_MOST = 10.0
 _LISTENS_S = 0.05  # a new law, before it acts
+_CALM_S, _CALM_DEVIATIONS = 0.2, 0.25  # for so long at most it waits for a tick whose force is as near to its mean
 
 
 class _Job(NamedTuple):
@@ -241,6 +242,11 @@ class Session:
             raise RefusedError(f"{offered['name'].decode()}: {why}")
         heard = law_change.Listening(new, stage.controller.memory)
         for _ in stage.ticks(_LISTENS_S if stage.is_driven else 0.0):
+            yield
+            heard.listen()
+        for _ in stage.ticks(_CALM_S if stage.is_driven else 0.0):
+            if heard.is_calm(_CALM_DEVIATIONS):
+                break
             yield
             heard.listen()
         if stage.mode not in (Mode.IDLE, Mode.TRACKING):

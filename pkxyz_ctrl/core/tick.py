@@ -100,7 +100,6 @@ MEMORY = np.dtype(
         ("measurement_m", "f8", (3,)),
         ("seen_m", "f8", (3,)),  # the measurement, or the estimate in its place
         ("linear", linear_law.LINEAR_STATE),
-        ("youla", youla.YOULA_STATE),
         ("set_point_model", set_point_model.SET_POINT_MODEL),
         ("plan_n", "f8", (3,)),  # force at the platform that a plan adds to the feed-forward of this tick
         ("plan_known", "i4"),
@@ -118,6 +117,7 @@ MEMORY = np.dtype(
         ("landing", "i4"),  # 1: the stage is led down; instead of the feedback acts ...
         ("landing_share", "f8"),  # ... so much of its last force
         ("scratch", SCRATCH),
+        ("youla", youla.YOULA_STATE),  # last but one: without taps nobody looks at its ring
         ("adaptation", adaptation.ADAPTATION_STATE),  # last: without adaptation nobody looks at it
     ],
     align=True,
@@ -253,7 +253,8 @@ def release(law: np.void, memory: np.void) -> None:
     memory["feedforward_known"] = 0
     memory["landing"] = 0
     linear_law.clear(memory["linear"])
-    youla.clear(memory["youla"])
+    if law["youla"]["taps"] > 0:
+        youla.clear(memory["youla"])
     if law["adaptation"]["on"] != 0:
         adaptation.clear(memory["adaptation"])
     set_point_model.set_out(law["estimator"], memory["set_point_model"], memory["scratch"]["nothing"])

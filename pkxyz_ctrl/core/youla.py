@@ -30,10 +30,10 @@ YOULA = np.dtype(
 
 YOULA_STATE = np.dtype(
     [
-        ("innovation_m", "f8", (2 * TAPS_MAX, 3)),  # twice the same ring: from ``newest`` on, newest first
         ("newest", "i4"),
         ("quiet", "i4"),  # 1: a quiet hold is asked for
         ("faded", "i4"),  # ticks of ``fade_ticks`` on the way to the quiet taps
+        ("innovation_m", "f8", (2 * TAPS_MAX, 3)),  # twice the same ring: from ``newest`` on, newest first
     ],
     align=True,
 )

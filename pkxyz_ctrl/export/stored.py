@@ -8,6 +8,7 @@ from numpy.typing import NDArray
 from pkxyz_ctrl.core import tick
 from pkxyz_ctrl.core.demand import LINEAR, PREDICTIVE
 from pkxyz_ctrl.core.linear_law import LINEAR_LAW
+from pkxyz_ctrl.core.youla import YOULA_STATE
 from pkxyz_ctrl.loop import cycle as cycling
 from pkxyz_ctrl.loop.exchange import EXCHANGE, EXCHANGE_MEMORY
 
@@ -32,8 +33,13 @@ def stored(law: Records) -> Stored:
     settings = linear_at + _at(LINEAR_LAW, "a") + rows * row_bytes if rows else linear_at
     if numbers["kind"] == PREDICTIVE:
         settings = cycling.LAW.itemsize
-    learns = numbers["adaptation"]["on"] != 0
-    memory = cycling.MEMORY.itemsize if learns else _at(cycling.MEMORY, "tick") + _at(tick.MEMORY, "adaptation")
+    last = _at(cycling.MEMORY, "tick")
+    if numbers["adaptation"]["on"] != 0:
+        memory = cycling.MEMORY.itemsize
+    elif numbers["youla"]["taps"] > 0:
+        memory = last + _at(tick.MEMORY, "adaptation")
+    else:
+        memory = last + _at(tick.MEMORY, "youla") + _at(YOULA_STATE, "innovation_m")
     return Stored(_whole(settings), _whole(memory))
 
 

@@ -130,7 +130,7 @@ def test_what_a_board_does_not_hold_is_neither_read_nor_written(law, poisoned):
     setup = load_scenario("raster", controller=law).setup()
     run = Run(dataclasses.replace(setup, duration_s=TICKS * setup.bus.period_s))
     held = stored_in_exchange(run.config["law"][0])
-    assert sum(held) <= 21 << 10  # 20 wanted: taps and their memory, which a linear law has no use for, stand among it
+    assert sum(held) <= 20 << 10
     assert (held.memory < EXCHANGE_MEMORY.itemsize) == poisoned
     assert held.settings < EXCHANGE.itemsize
     config = run.config.copy()
