@@ -73,7 +73,7 @@ class Adaptation(FrozenModel):
     """... and for so long afterwards, or after a comb was at a limit"""
     base_s: Positive = 3.0
     """after learning for so long, what is known is what changes are counted from"""
-    forget_s: Positive = 2.0
+    forget_s: Positive = 1.0
     """time constant with which what speaks for a change is forgotten"""
     warn_relative: Annotated[float, Field(gt=0, le=0.3)] = 0.01
     """change of a comb or of springs from which on there is a warning"""

@@ -64,6 +64,7 @@ NOT_RESTARTED: Final = 1 << 10
 
 _CLEAR, _GATE_BLOCKED, _CHANGED = int(Event.CLEAR), int(Trip.GATE_BLOCKED), int(Trip.SAFETY_OBJECTS)
 _FOUND, _READY, _LOST = int(Event.NODE_FOUND), int(Event.NODE_READY), int(Event.NODE_LOST)
+_SHORT_FRAMES_MOST: Final = 3  # that anybody asks for: outputs, our heartbeat and the node's
 _SIGNATURE_TICKS: Final = 4  # in which it may come: when it is due, and a tick or two behind
 _BOOT, _IDLE, _FAULT = int(Mode.BOOT), int(Mode.IDLE), int(Mode.FAULT)
 
@@ -234,14 +235,14 @@ def finish(config_array: Records, memory_array: Records, t_us: int, heartbeat_un
         drive(config["driver"], memory["driver"], 0, 0, 0)
         if judge_one(config, memory, driver["out"][1], t_us) != 0:
             driver["outgoing"] = 1
-    first, sent = driver["outgoing"], 0
+    first, sent, until_us = driver["outgoing"], 0, heartbeat_until_us
+    if _is_signature_near(config["driver"][0], driver):
+        until_us -= config["driver"][0]["short_frame_us"]
     if memory["cycle"][0]["mode"] >= _IDLE and memory["cycle"][0]["mode"] != _FAULT and told & BLOCKED == 0:
-        room = _short_frames(config["driver"][0], driver, memory["begun_us"], t_us, heartbeat_until_us)
+        room = _short_frames(config["driver"][0], driver, memory["begun_us"], t_us, until_us)
         bits = memory["outputs"][0]["bits"]
         sent = _put_outputs(config["driver"], memory["driver"], bits, t_us, room)
-    if _is_signature_near(config["driver"][0], driver):
-        sent += 1
-    last_us = heartbeat_until_us - sent * config["driver"][0]["short_frame_us"]
+    last_us = until_us - sent * config["driver"][0]["short_frame_us"]
     if driver["heartbeat_next_us"] <= t_us <= last_us:
         driver_rules.heartbeat(config["driver"], memory["driver"], t_us)
     told |= judge(config, memory, first, t_us)
@@ -250,15 +251,15 @@ def finish(config_array: Records, memory_array: Records, t_us: int, heartbeat_un
 
 @njit(cache=True, error_model="numpy")
 def _short_frames(config: np.void, memory: np.void, begun_us: int, t_us: int, until_us: int) -> int:
-    """How many frames of one byte still fit behind a drive frame that is sent at ``t_us``, of which the first had to be
-    sent by ``until_us``; the node's heartbeat and signature, where they are due in the period that began at
-    ``begun_us``, left out.
+    """How many frames of one byte, up to ``_SHORT_FRAMES_MOST``, still fit behind a drive frame that is sent at
+    ``t_us``, of which the first had to be sent by ``until_us``; the node's heartbeat, where it is due in the period
+    that began at ``begun_us``, left out.
     """
-    if _is_signature_near(config, memory):
-        until_us -= config["short_frame_us"]
     if t_us > until_us:
         return 0
-    room: int = 1 + (until_us - t_us) // config["short_frame_us"]
+    room, left_us = 1, until_us - t_us - config["short_frame_us"]
+    while left_us >= 0 and room < _SHORT_FRAMES_MOST:  # a division of 64 bits takes a board longer than its law
+        room, left_us = room + 1, left_us - config["short_frame_us"]
     ahead_us = memory["node_heartbeat_us"] + config["node_period_us"] - begun_us
     return room - 1 if -config["period_us"] < ahead_us <= 2 * config["period_us"] else room
 
@@ -266,8 +267,11 @@ def _short_frames(config: np.void, memory: np.void, begun_us: int, t_us: int, un
 @njit(cache=True, error_model="numpy")
 def _is_signature_near(config: np.void, memory: np.void) -> bool:
     """Whether the node may send its signature in this period, or would have to: one that is lost is not waited for."""
-    every, age = config["signature_syncs"], memory["signature_age"]
-    return bool(memory["signature"] >= 0 and age >= every - 1 and (age + 1) % every < _SIGNATURE_TICKS)
+    every = config["signature_syncs"]
+    over = memory["signature_age"] + 1 - every
+    return bool(
+        memory["signature"] >= 0 and (0 <= over < _SIGNATURE_TICKS or every <= over < every + _SIGNATURE_TICKS)
+    )  # a third is not waited for: without two the node has tripped
 
 
 @njit(cache=True, error_model="numpy")

@@ -85,7 +85,7 @@ def decide(law_array: Records, memory_array: Records, outputs_array: Records, re
     row["output"] = row["output_late_ns"] = 0
     _look(law, memory, outputs)
     position, trigger = outputs["position"], outputs["trigger"]
-    if outputs["window_m"] > 0.0 and 0 < outputs["dwell_ticks"] <= position["ticks"]:
+    if 0 < outputs["dwell_ticks"] <= position["ticks"]:
         row["output"] = IN_POSITION
     if memory["mode"] == _TRACKING:
         row["output"] |= _of_path(law, memory, reference)
@@ -103,7 +103,7 @@ def decide(law_array: Records, memory_array: Records, outputs_array: Records, re
 def _look(law: np.void, memory: np.void, outputs: np.void) -> None:
     """For how long the stage has been in position: within the window of a set-point that stands."""
     row, position = memory["row"], outputs["position"]
-    if LOOP_CLOSED[memory["mode"]] == 0:
+    if LOOP_CLOSED[memory["mode"]] == 0 or outputs["window_m"] == 0.0:
         position["ticks"] = position["seen"] = 0
         return
     in_position.look(

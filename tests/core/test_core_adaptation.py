@@ -282,7 +282,9 @@ def test_a_change_of_two_per_cent_is_followed(ageing):
 @pytest.mark.parametrize(("what", "named"), [("springs", 5), ("combs", 3)])
 @pytest.mark.parametrize(("end", "time_constant_s", "most"), [(0.1, 3.0, 0.06), (0.6, 4.0, 0.09)])
 def test_a_drift_towards_danger_is_told_long_before_it_is_a_fault(what, named, end, time_constant_s, most):
-    """A chain's springs or a comb that lose 3 or 15 % a second: named early, and no fault even at 35 %."""
+    """A chain's springs or a comb that lose 3 or 15 % a second: named early, and no fault even at 35 %. What is told
+    is a second behind.
+    """
     share = (0, 0, -end) if what == "combs" else (0, -end, 0)
     rows, faults = aged("mild", time_constant_s=time_constant_s, **{what: share})
     told, later = rows[np.argmax(rows["warning"] == named)], rows[np.argmax(rows["t_us"] > 8_000_000)]
@@ -294,8 +296,7 @@ def test_a_drift_towards_danger_is_told_long_before_it_is_a_fault(what, named, e
     assert 0.01 < lost(told) < most
     assert not faults
     assert lost(later) > 0.06
-    if end == 0.1:  # what is told is a second behind
-        assert 0.5 < -later["warning_share"] / lost(later) < 0.9
+    assert (0.85 if end == 0.1 else 0.65) < -later["warning_share"] / lost(later) < 1.1
 
 
 @pytest.mark.parametrize("plant", ["nominal", "mild", "harsh"])
