@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
+from hil.screen.options import AsJson
 from hil.screen.outputs import folder_to_write, writing
 from hil.screen.terminal import bad, faint, good, say
 from pkxyz_ctrl.config.files import CONFIG_DIR, load
@@ -29,7 +30,7 @@ def check_amplifier(
         bool, typer.Option("--allow-voltage", help="Also drive a few volts; with the high voltage off, device removed.")
     ] = False,
     out: Annotated[Path | None, typer.Option(help="Folder for conformance.md and conformance.json.")] = None,
-    as_json: Annotated[bool, typer.Option("--json", help="Print JSON, and nothing else.")] = False,
+    as_json: AsJson = False,
 ) -> None:
     """Conformance run for a CANopen amplifier; exit code 1 if it is unsafe here, or a voltmeter has to tell, else 0."""
     from datetime import UTC, datetime

@@ -4,10 +4,8 @@ import itertools
 import json
 import tomllib
 from pathlib import Path
-from typing import Annotated
 
-import typer
-
+from hil.screen.options import AnswerAsJson
 from hil.screen.terminal import faint, plain_table, print_whole
 from pkxyz_ctrl.config.files import CONFIG_DIR, names
 
@@ -15,7 +13,7 @@ KINDS = ("scenarios", "stages", "plants", "controllers", "buses", "tolerances", 
 """Folders of configs/, as ``pkxyz configs`` lists them."""
 
 
-def configs(as_json: Annotated[bool, typer.Option("--json", help="Print JSON.")] = False) -> None:
+def configs(as_json: AnswerAsJson = False) -> None:
     """List the shipped configurations, with the folder of each kind: NAME is the file NAME.toml in it."""
     found = {kind: {name: _description(CONFIG_DIR / kind / f"{name}.toml") for name in names(kind)} for kind in KINDS}
     if as_json:

@@ -5,6 +5,7 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
+from hil.screen.options import BusFile
 from pkxyz_ctrl.config.files import CONFIG_DIR, ConfigError
 from pkxyz_ctrl.config.refused import reason
 
@@ -15,7 +16,7 @@ EDS = CONFIG_DIR / "comb_amplifier.eds"
 
 
 def dbc(
-    bus: Annotated[str, typer.Option(help="Name or file of the bus.")] = "fd_5k",
+    bus: BusFile = "fd_5k",
     out: Annotated[Path | None, typer.Option(help="File to write; default: print it.")] = None,
 ) -> None:
     """Write the DBC of a bus: every frame between controller and amplifier, its process data in volts and femtofarads,

@@ -9,6 +9,7 @@ from typing import Annotated, Literal, NamedTuple
 
 import typer
 
+from hil.screen.options import AsJson
 from pkxyz_ctrl.io.realtime import cores
 
 _CAN = "280"  # ARPHRD_CAN of linux/if_arp.h
@@ -30,7 +31,7 @@ class Finding(NamedTuple):
 def doctor(
     bus: Annotated[str, typer.Option(help="The bus whose bit rates an adapter is to have.")] = "fd_5k",
     seconds: Annotated[float, typer.Option(help="How long to measure how late the loop wakes; 0: not.")] = 2.0,
-    as_json: Annotated[bool, typer.Option("--json", help="Print JSON, and nothing else.")] = False,
+    as_json: AsJson = False,
 ) -> None:
     """Look at Python, cores, real-time rights, CAN adapters, kernels and latency; exit code 1 if one is bad."""
     from pkxyz_ctrl.config.bus import BusConfig

@@ -8,12 +8,12 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from hil.commands.run import ReplaceEarlier
 from hil.commands.sil import show
 from hil.lanes.lane import Lane
 from hil.pictures.drawing_process import DrawingProcess
 from hil.screen.choices import require_simulated
 from hil.screen.first_run import say_if_compiling
+from hil.screen.options import Faults, FileInstead, ReplaceEarlier, ScenarioName, SeedInstead, SummaryAsJson
 from hil.screen.progress import progress_bar
 from hil.screen.terminal import say
 from pkxyz_ctrl.config.files import ConfigError, find
@@ -27,19 +27,16 @@ _MHZ = 480
 
 
 def emulate(
-    scenario: Annotated[str, typer.Argument(help="A shipped scenario's name or a TOML file.")] = "raster",
-    seed: Annotated[int | None, typer.Option(help="Instead of the scenario's.")] = None,
+    scenario: ScenarioName = "raster",
+    seed: SeedInstead = None,
     out: Annotated[Path | None, typer.Option(help="Folder to write; default: runs/<scenario>-emulated-<n>.")] = None,
-    stage: Annotated[str | None, typer.Option(help="Name or file, instead of the scenario's.")] = None,
-    plant: Annotated[str | None, typer.Option(help="Name or file, instead of the scenario's.")] = None,
-    controller: Annotated[str | None, typer.Option(help="Name or file, instead of the scenario's.")] = None,
-    bus: Annotated[str | None, typer.Option(help="Name or file, instead of the scenario's.")] = None,
-    fault: Annotated[
-        list[str] | None,
-        typer.Option(metavar="TARGET:KIND@S[+S][,NAME=VALUE]", help="Such as sense.2:stuck@0.3+0.05; may be repeated."),
-    ] = None,
+    stage: FileInstead = None,
+    plant: FileInstead = None,
+    controller: FileInstead = None,
+    bus: FileInstead = None,
+    fault: Faults = None,
     replace_earlier: ReplaceEarlier = False,
-    as_json: Annotated[bool, typer.Option("--json", help="Print the summary as JSON, and nothing else.")] = False,
+    as_json: SummaryAsJson = False,
 ) -> None:
     """Close the loop with the exported controller on an emulated Cortex-M7; bus, amplifier and plant are those of sil.
 

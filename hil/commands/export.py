@@ -7,6 +7,7 @@ from typing import TYPE_CHECKING, Annotated
 import typer
 
 from hil.screen.first_run import say_if_compiling
+from hil.screen.options import FileInstead, ScenarioName
 from hil.screen.terminal import plain_table, say, screen
 from pkxyz_ctrl.config.files import ConfigError, find
 from pkxyz_ctrl.config.refused import reason
@@ -20,15 +21,15 @@ TEST_TICKS = 1000
 
 
 def export(
-    scenario: Annotated[str, typer.Argument(help="A shipped scenario's name or a TOML file.")] = "raster",
+    scenario: ScenarioName = "raster",
     target: Annotated[
         str,
         typer.Option(help="host, linux (with a loop at rate), cortex-m7, cortex-m4, aarch64 or riscv32."),
     ] = "cortex-m7",
     out: Annotated[Path | None, typer.Option(help="Folder to write, new or empty; default: export/<target>.")] = None,
-    stage: Annotated[str | None, typer.Option(help="Name or file, instead of the scenario's.")] = None,
-    controller: Annotated[str | None, typer.Option(help="Name or file, instead of the scenario's.")] = None,
-    bus: Annotated[str | None, typer.Option(help="Name or file, instead of the scenario's.")] = None,
+    stage: FileInstead = None,
+    controller: FileInstead = None,
+    bus: FileInstead = None,
     ticks: Annotated[
         int | None, typer.Option(min=TEST_TICKS, help="Rows of the reference that go with it; default: all.")
     ] = None,

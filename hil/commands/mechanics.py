@@ -13,6 +13,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
+from hil.screen.options import AsJson, Workers
 from hil.screen.outputs import folder_to_write, picture_to_write
 from hil.screen.terminal import bad, good, plain_table, say, screen, warned
 from pkxyz_ctrl.config.files import ConfigError, load, require_finite
@@ -28,7 +29,6 @@ if TYPE_CHECKING:
 _WIDE = 150  # columns that the table of the paper's numbers needs
 _STYLES = {"reproduces": good, "rounded": good, "misprint": warned, "not reproducible": bad}
 
-AsJson = Annotated[bool, typer.Option("--json", help="Print JSON, and nothing else.")]
 StageName = Annotated[str, typer.Option("--stage", help="A shipped stage's name or a TOML file.")]
 OutFolder = Annotated[Path | None, typer.Option(help="Folder for the pictures; none are drawn without it.")]
 
@@ -219,7 +219,7 @@ def design(
     ] = None,
     trials: Annotated[int, typer.Option(min=1, help="Drawings to try for --for-yield, in all.")] = 300,
     devices: Annotated[int, typer.Option(min=8, help="Fresh devices that confirm it, in a closed loop.")] = 400,
-    workers: Annotated[int | None, typer.Option(min=1, help="Processes; default: as many as cores.")] = None,
+    workers: Workers = None,
     as_json: AsJson = False,
 ) -> None:
     """Dimensions from requirements (the paper's section IV),

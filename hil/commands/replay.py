@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
+from hil.screen.options import AsJson
 from hil.screen.progress import progress_bar
 from hil.screen.terminal import plain_table, say, screen
 
@@ -24,7 +25,7 @@ def replay(
     controller: Annotated[
         str | None, typer.Option(help="Name or file, instead of the recorded one: where would it act differently?")
     ] = None,
-    as_json: Annotated[bool, typer.Option("--json", help="Print JSON, and nothing else.")] = False,
+    as_json: AsJson = False,
 ) -> None:
     """Put a recording through the tick again; exit code 0 if it agrees in every bit, is whole, and its files are as the
     run left them, 1 if not, 2 for what can't be read.

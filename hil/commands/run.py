@@ -11,6 +11,18 @@ import typer
 from hil.screen.errors import amplifier_errors
 from hil.screen.figures import error_lines, lacking_lines, loss_lines, where_to_read
 from hil.screen.first_run import say_if_compiling
+from hil.screen.options import (
+    Adapted,
+    Apply,
+    AsJson,
+    FileInstead,
+    Learn,
+    Refresh,
+    ReplaceEarlier,
+    Report,
+    ScenarioName,
+    SeedInstead,
+)
 from hil.screen.terminal import note
 from pkxyz_ctrl.config.files import ConfigError
 from pkxyz_ctrl.config.refused import reason
@@ -19,32 +31,11 @@ if TYPE_CHECKING:
     from hil.runs.summary import Summary
     from pkxyz_ctrl.config.bus import CanConfig
 
-Scenario = Annotated[str, typer.Argument(help="A shipped scenario's name or a TOML file.")]
 Bus = Annotated[
     str | None,
     typer.Option(
         help="Name or file of the bus to meet on, instead of the scenario's. Where that is simulated: unix_2k, and for "
         "`run` whichever of unix_2k and unix_1k this machine keeps up with."
-    ),
-]
-Json = Annotated[bool, typer.Option("--json", help="Print JSON, and nothing else.")]
-Learn = Annotated[bool, typer.Option("--learn", help="Learn what errs alike in every period of the scan.")]
-Apply = Annotated[
-    str | None, typer.Option(metavar="FILE", help="Correct by what a run has learnt (its learnt.json), as it is.")
-]
-ReplaceEarlier = Annotated[
-    bool, typer.Option("--replace", help="An earlier run in --out goes once the new one records; else it is refused.")
-]
-Refresh = Annotated[
-    str | None, typer.Option(metavar="FILE", help="Begin with what a run has learnt, and go on learning.")
-]
-Adapted = Annotated[
-    str | None, typer.Option(metavar="FILE", help="Begin with what a run has learnt of the device (its adapted.json).")
-]
-Report = Annotated[
-    Path | None,
-    typer.Option(
-        help="conformance.json of `pkxyz check-amplifier` on this very module: what passed is not tried anew."
     ),
 ]
 Native = Annotated[
@@ -54,11 +45,11 @@ _MEETING_BUSES = ("unix_2k", "unix_1k")  # on one channel: a plant on one of the
 
 
 def run(
-    scenario: Scenario = "raster",
+    scenario: ScenarioName = "raster",
     bus: Bus = None,
     out: Annotated[Path | None, typer.Option(help="Folder to write; default: runs/<scenario>-wall-<n>.")] = None,
-    stage: Annotated[str | None, typer.Option(help="Name or file, instead of the scenario's.")] = None,
-    controller: Annotated[str | None, typer.Option(help="Name or file, instead of the scenario's.")] = None,
+    stage: FileInstead = None,
+    controller: FileInstead = None,
     duration_s: Annotated[float | None, typer.Option("--seconds", help="Instead of the scenario's.")] = None,
     learn: Learn = False,
     apply: Apply = None,
@@ -70,7 +61,7 @@ def run(
     ] = 30.0,
     report: Report = None,
     native: Native = False,
-    as_json: Json = False,
+    as_json: AsJson = False,
 ) -> None:
     """Control an amplifier at rate; exit code 0 if the checks hold, 1 if not, 2 for bad input or a full disk, 128 +
     signal if ended.
@@ -124,11 +115,9 @@ def run(
 def plant(
     scenario: Annotated[str, typer.Argument(help="The scenario whose stage, plant and seed to serve.")] = "raster",
     bus: Bus = None,
-    plant_config: Annotated[
-        str | None, typer.Option("--plant", help="Name or file, instead of the scenario's.")
-    ] = None,
-    stage: Annotated[str | None, typer.Option(help="Name or file, instead of the scenario's.")] = None,
-    seed: Annotated[int | None, typer.Option(help="Instead of the scenario's.")] = None,
+    plant: FileInstead = None,
+    stage: FileInstead = None,
+    seed: SeedInstead = None,
     truth: Annotated[
         Path | None, typer.Option(help="File for the truth at each sample, as rows of hil.lanes.wall_plant.TRUTH.")
     ] = None,
@@ -141,7 +130,7 @@ def plant(
     from pkxyz_ctrl.io.can_port import open_bus
     from pkxyz_ctrl.io.realtime import go_real_time, settle_memory
 
-    loaded = _met(scenario, seed=seed, stage=stage, plant=plant_config, bus=bus)
+    loaded = _met(scenario, seed=seed, stage=stage, plant=plant, bus=bus)
     can_config = require_real_bus(loaded.bus)
 
     def show(t_s: float, state: str, driven: bool) -> None:

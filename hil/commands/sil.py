@@ -7,12 +7,25 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from hil.commands.run import Adapted, Apply, Learn, Refresh, ReplaceEarlier, learning_of
+from hil.commands.run import learning_of
 from hil.lanes.lane import Lane
 from hil.pictures.drawing_process import DrawingProcess
 from hil.screen.choices import InProcessLane, require_simulated
 from hil.screen.figures import error_lines, lacking_lines, where_to_read
 from hil.screen.first_run import say_if_compiling
+from hil.screen.options import (
+    Adapted,
+    Apply,
+    ChosenLane,
+    Faults,
+    FileInstead,
+    Learn,
+    Refresh,
+    ReplaceEarlier,
+    ScenarioName,
+    SeedInstead,
+    SummaryAsJson,
+)
 from hil.screen.progress import progress_bar
 from hil.screen.terminal import bad, faint, good, plain_table, say, screen
 from pkxyz_ctrl.config.files import ConfigError, find
@@ -23,26 +36,21 @@ if TYPE_CHECKING:
 
 
 def sil(
-    scenario: Annotated[str, typer.Argument(help="A shipped scenario's name or a TOML file.")] = "raster",
-    in_process: Annotated[
-        InProcessLane, typer.Option("--lane", help="lockstep: over the simulated bus; fast: compiled, no frames.")
-    ] = InProcessLane.LOCKSTEP,
-    seed: Annotated[int | None, typer.Option(help="Instead of the scenario's.")] = None,
+    scenario: ScenarioName = "raster",
+    in_process: ChosenLane = InProcessLane.LOCKSTEP,
+    seed: SeedInstead = None,
     out: Annotated[Path | None, typer.Option(help="Folder to write; default: runs/<scenario>-<lane>-<n>.")] = None,
-    stage: Annotated[str | None, typer.Option(help="Name or file, instead of the scenario's.")] = None,
-    plant: Annotated[str | None, typer.Option(help="Name or file, instead of the scenario's.")] = None,
-    controller: Annotated[str | None, typer.Option(help="Name or file, instead of the scenario's.")] = None,
-    bus: Annotated[str | None, typer.Option(help="Name or file, instead of the scenario's.")] = None,
-    fault: Annotated[
-        list[str] | None,
-        typer.Option(metavar="TARGET:KIND@S[+S][,NAME=VALUE]", help="Such as sense.2:stuck@0.3+0.05; may be repeated."),
-    ] = None,
+    stage: FileInstead = None,
+    plant: FileInstead = None,
+    controller: FileInstead = None,
+    bus: FileInstead = None,
+    fault: Faults = None,
     learn: Learn = False,
     apply: Apply = None,
     refresh: Refresh = None,
     adapted: Adapted = None,
     replace_earlier: ReplaceEarlier = False,
-    as_json: Annotated[bool, typer.Option("--json", help="Print the summary as JSON, and nothing else.")] = False,
+    as_json: SummaryAsJson = False,
 ) -> None:
     """Close the loop on a scenario; exit code 0 if its checks hold, 1 if not,
     2 for bad input or a full disk, 130 if interrupted.

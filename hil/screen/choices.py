@@ -1,12 +1,7 @@
 """What several commands let one choose."""
 
 from enum import StrEnum
-from pathlib import Path
-from typing import TYPE_CHECKING, Annotated
-
-import typer
-
-from pkxyz_ctrl.config.files import ConfigError
+from typing import TYPE_CHECKING
 
 if TYPE_CHECKING:
     from pkxyz_ctrl.config.bus import BusConfig
@@ -28,17 +23,11 @@ class Tones(StrEnum):
 
 def require_simulated(bus: "BusConfig", command: str) -> None:
     """Raise ``ConfigError`` for a bus with real sockets or adapters: ``command`` would simulate it without a word."""
+    from pkxyz_ctrl.config.files import ConfigError
+
     if bus.can is not None and bus.can.interface != "pkxyz-sim":
         raise ConfigError(
             f"bus {bus.name!r} leads to other processes or devices (can.interface = {bus.can.interface!r}), and "
             f"`pkxyz {command}` simulates: run on it with `pkxyz run --bus {bus.name}`, or simulate with --bus fd_5k, "
             "classic_2k or local_20k"
         )
-
-
-ClusterAddress = Annotated[
-    str | None, typer.Option(metavar="ADDRESS", help="Scheduler of a Dask cluster to work on instead: tls://HOST:PORT.")
-]
-ClusterTls = Annotated[
-    Path | None, typer.Option(metavar="DIR", help="Folder with ca.pem, cert.pem and key.pem for a scheduler at tls://.")
-]

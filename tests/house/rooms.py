@@ -128,7 +128,7 @@ HOUSE: Mapping[str, Room] = MappingProxyType({
         "hil.runs", "hil.studies", "hil.pictures", "hil.screen", "hil.bench.rigs", "hil.bench", "hil.commands.studies",
     )),
     "hil.commands.operation": Room((
-        "pkxyz_ctrl.*", "hil.lanes", "hil.conformance", "hil.operate", "hil.server", "hil.screen", "hil.commands",
+        "pkxyz_ctrl.*", "hil.lanes", "hil.conformance", "hil.operate", "hil.server", "hil.screen",
     )),
     "hil": Room((
         "pkxyz_ctrl.*", "hil.lanes", "hil.runs", "hil.screen", "hil.api", "hil.commands.studies", "hil.commands",

@@ -9,6 +9,7 @@ from typing import Annotated, Any
 
 import typer
 
+from hil.screen.options import AnswerAsJson, ServedAt, StageCalled
 from pkxyz_ctrl.config.files import ConfigError
 
 _PLAIN = (
@@ -43,9 +44,9 @@ def ask(
         ),
     ] = None,
     by: Annotated[bool, typer.Option("--by", help="move: by a way from the present target, not to a point.")] = False,
-    name: Annotated[str, typer.Option(help="What the stage is called, where there are several.")] = "stage",
-    url: Annotated[str | None, typer.Option(help="The address that serve printed, for a stage elsewhere.")] = None,
-    as_json: Annotated[bool, typer.Option("--json", help="Print JSON.")] = False,
+    name: StageCalled = "stage",
+    url: ServedAt = None,
+    as_json: AnswerAsJson = False,
 ) -> None:
     """Ask a stage in operation, and wait until it is done; exit code 1 if it was refused or did not come to its end."""
     import pkxyz_ctrl

@@ -8,15 +8,17 @@ from typing import Annotated
 
 import typer
 
+from hil.screen.options import ControllerFile, ListenPort
+
 _NAME = "demo"
 
 
 def demo(
-    port: Annotated[int, typer.Option(help="0: any that is free.", min=0, max=65535)] = 8765,
+    port: ListenPort = 8765,
     scenario: Annotated[str, typer.Option(help="The shipped scenario whose path is followed again and again.")] = (
         "raster"
     ),
-    controller: Annotated[str, typer.Option(help="Name or file of the controller.")] = "youla",
+    controller: ControllerFile = "youla",
     bus: Annotated[str | None, typer.Option(help="Name or file of a bus between processes.")] = None,
 ) -> None:
     """Operate a simulated stage that scans, until Ctrl-C: take control on the page and the scan gives way to you."""

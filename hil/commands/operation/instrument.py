@@ -9,18 +9,15 @@ from typing import Annotated, Any
 
 import typer
 
+from hil.screen.options import ListenAt, ListenPort, ServedAt, StageCalled
 from pkxyz_ctrl.config.files import ConfigError
-
-Name = Annotated[str, typer.Option(help="What the stage is called, where there are several.")]
-Url = Annotated[str | None, typer.Option(help="The address that serve printed, for a stage elsewhere.")]
-Host = Annotated[str, typer.Option(help="Address to listen at. Others than this machine's can reach it then.")]
 
 
 def ioc(
     prefix: Annotated[str, typer.Option(help="Before the names of all channels.")] = "pkxyz:",
-    name: Name = "stage",
-    url: Url = None,
-    host: Host = "127.0.0.1",
+    name: StageCalled = "stage",
+    url: ServedAt = None,
+    host: ListenAt = "127.0.0.1",
     port: Annotated[int, typer.Option(help="For Channel Access.", min=1, max=65535)] = 5064,
 ) -> None:
     """Serve a stage in operation to EPICS: a motor record per axis, and its verbs, until Ctrl-C."""
@@ -35,10 +32,10 @@ def ioc(
 
 
 def scpi(
-    name: Name = "stage",
-    url: Url = None,
-    host: Host = "127.0.0.1",
-    port: Annotated[int, typer.Option(help="0: any that is free.", min=0, max=65535)] = 5025,
+    name: StageCalled = "stage",
+    url: ServedAt = None,
+    host: ListenAt = "127.0.0.1",
+    port: ListenPort = 5025,
 ) -> None:
     """Serve a stage in operation to programs that speak SCPI over TCP, until Ctrl-C."""
     import pkxyz_ctrl

@@ -1,32 +1,21 @@
 """``pkxyz operate``: the loop of a stage in operation, without a server."""
 
 import sys
-from typing import Annotated, Literal
+from typing import Literal
 
 import typer
 
-from hil.commands.run import Report
+from hil.screen.options import BusFile, ControllerFile, OnSilence, Report, SilentFor, StageCalled, StageFile
 from hil.screen.terminal import note
 from pkxyz_ctrl.config.files import ConfigError
 
-Name = Annotated[str, typer.Option(help="What the stage is called, where there are several.")]
-Stage = Annotated[str, typer.Option(help="Name or file of the stage.")]
-Controller = Annotated[str, typer.Option(help="Name or file of the controller.")]
-Silence = Annotated[
-    str, typer.Option(help="What becomes of a moving stage when the server falls silent: hold or park.")
-]
-
-SilentFor = Annotated[
-    float, typer.Option(help="After how long a silent server is taken to be gone.", min=0.03, max=10.0)
-]
-
 
 def operate(
-    bus: Annotated[str, typer.Option(help="Name or file of the bus.")] = "unix_2k",
-    stage: Stage = "reconstructed",
-    controller: Controller = "youla",
-    name: Name = "stage",
-    on_silence: Silence = "hold",
+    bus: BusFile = "unix_2k",
+    stage: StageFile = "reconstructed",
+    controller: ControllerFile = "youla",
+    name: StageCalled = "stage",
+    on_silence: OnSilence = "hold",
     report: Report = None,
     silence_s: SilentFor = 0.06,
 ) -> None:

@@ -7,31 +7,35 @@ from typing import Annotated
 
 import typer
 
-from hil.commands.operation.operate import SilentFor
-from hil.commands.run import Report
 from hil.screen.first_run import say_if_compiling
+from hil.screen.options import (
+    ControllerFile,
+    ListenAt,
+    ListenPort,
+    OnSilence,
+    Report,
+    SilentFor,
+    StageCalled,
+    StageFile,
+)
 
 
 def serve(
     bus: Annotated[
         str | None, typer.Option(help="Name or file of the bus of real hardware; without it a stage is simulated.")
     ] = None,
-    stage: Annotated[str, typer.Option(help="Name or file of the stage.")] = "reconstructed",
-    controller: Annotated[str, typer.Option(help="Name or file of the controller.")] = "youla",
+    stage: StageFile = "reconstructed",
+    controller: ControllerFile = "youla",
     plant: Annotated[str, typer.Option(help="Name or file of the simulated plant.")] = "nominal",
-    name: Annotated[str, typer.Option(help="What the stage is called, where there are several.")] = "stage",
-    on_silence: Annotated[
-        str, typer.Option(help="What becomes of a moving stage when the server falls silent: hold or park.")
-    ] = "hold",
+    name: StageCalled = "stage",
+    on_silence: OnSilence = "hold",
     silence_s: SilentFor = 0.06,
     saves: Annotated[Path, typer.Option(help="Folder for what was around each fault.")] = Path("runs"),
     settings: Annotated[
         Path | None, typer.Option(help="Folder for what is set, with its history; the user's if not given.")
     ] = None,
-    host: Annotated[str, typer.Option(help="Address to listen at. Others than this machine's can reach it then.")] = (
-        "127.0.0.1"
-    ),
-    port: Annotated[int, typer.Option(help="0: any that is free.", min=0, max=65535)] = 8765,
+    host: ListenAt = "127.0.0.1",
+    port: ListenPort = 8765,
     report: Report = None,
     as_json: Annotated[bool, typer.Option("--json", help="Print where it is as JSON.")] = False,
 ) -> None:

@@ -9,6 +9,7 @@ import typer
 from hil.lanes.lane import Lane
 from hil.screen.choices import InProcessLane
 from hil.screen.first_run import say_if_compiling
+from hil.screen.options import AsJson, ChosenLane, FileInstead, ScenarioName
 from hil.screen.outputs import picture_to_write
 from hil.screen.progress import progress_bar
 from hil.screen.terminal import bad, plain_table, print_whole, say
@@ -18,18 +19,16 @@ if TYPE_CHECKING:
 
 
 def compare(
-    scenario: Annotated[str, typer.Argument(help="A shipped scenario's name or a TOML file.")] = "raster",
+    scenario: ScenarioName = "raster",
     controllers: Annotated[
         str, typer.Option(metavar="A,B,...", help="Names or files, separated by commas; default: one for each law.")
     ] = "",
-    stage: Annotated[str | None, typer.Option(help="Name or file, instead of the scenario's.")] = None,
-    plant: Annotated[str | None, typer.Option(help="Name or file, instead of the scenario's.")] = None,
+    stage: FileInstead = None,
+    plant: FileInstead = None,
     seed: Annotated[int | None, typer.Option(min=0, help="Instead of the scenario's.")] = None,
-    lane: Annotated[
-        InProcessLane, typer.Option(help="lockstep: over the simulated bus; fast: compiled, no frames.")
-    ] = InProcessLane.FAST,
+    lane: ChosenLane = InProcessLane.FAST,
     out: Annotated[Path, typer.Option(help="The picture to write.")] = Path("compare.png"),
-    as_json: Annotated[bool, typer.Option("--json", help="Print JSON, and nothing else.")] = False,
+    as_json: AsJson = False,
 ) -> None:
     """Run all laws on one scenario and plant. Exit code 0 if each ran without a fault, 1 if not, 2 for bad input."""
     from hil.pictures.compare import draw

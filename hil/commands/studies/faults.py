@@ -6,8 +6,8 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
-from hil.screen.choices import ClusterAddress, ClusterTls
 from hil.screen.first_run import say_if_compiling
+from hil.screen.options import AsJson, ClusterAddress, ClusterTls
 from hil.screen.outputs import folder_to_write, writing
 from hil.screen.progress import progress_bar
 from hil.screen.terminal import bad, faint, good, plain_table, say, screen
@@ -35,7 +35,7 @@ def faults(
         Path | None,
         typer.Option(help="Folder for what was found and its picture; called again, it goes on."),
     ] = None,
-    as_json: Annotated[bool, typer.Option("--json", help="Print JSON, and nothing else.")] = False,
+    as_json: AsJson = False,
 ) -> None:
     """Break everything once under each law: who notices, after how many ticks, and what the combs did meanwhile.
 

@@ -10,6 +10,7 @@ from hil.lanes.lane import Lane
 from hil.screen.choices import InProcessLane, Tones
 from hil.screen.errors import amplifier_errors, one_line_errors
 from hil.screen.first_run import say_if_compiling
+from hil.screen.options import AsJson, AtStrokes, ExcitationSeed, NameOrFile
 from hil.screen.outputs import folder_to_write, writing
 from hil.screen.progress import bar_apart, progress_bar
 from hil.screen.terminal import bad, note, plain_table, print_whole, say
@@ -23,9 +24,9 @@ STAGE = "stage.toml"
 
 
 def identify(
-    stage: Annotated[str, typer.Option(help="Name or file.")] = "reconstructed",
+    stage: NameOrFile = "reconstructed",
     plant: Annotated[str | None, typer.Option(help="Name or file of the simulated plant; default: nominal.")] = None,
-    controller: Annotated[str, typer.Option(help="Name or file.")] = "lqg",
+    controller: NameOrFile = "lqg",
     bus: Annotated[
         str, typer.Option(help="Name or file. One that leads to other processes or devices is excited at rate.")
     ] = "fd_5k",
@@ -41,11 +42,8 @@ def identify(
     periods: Annotated[
         int, typer.Option(min=3, max=1000, help="Of 1 s (multisine) or 0.1 s (stepped), measured on each axis.")
     ] = 6,
-    at_um: Annotated[
-        tuple[float, float, float] | None,
-        typer.Option("--at", metavar="Q1 Q2 Q3", help="Strokes in um; default: mid-workspace."),
-    ] = None,
-    seed: Annotated[int, typer.Option(min=0, help="Of the noise and of the tones' phases.")] = 1,
+    at_um: AtStrokes = None,
+    seed: ExcitationSeed = 1,
     reference: Annotated[
         Path | None,
         typer.Option(
@@ -55,7 +53,7 @@ def identify(
     out: Annotated[
         Path | None, typer.Option(help="Folder to write; default: runs/identify_<plant>-<lane>-<n>.")
     ] = None,
-    as_json: Annotated[bool, typer.Option("--json", help="Print JSON, and nothing else.")] = False,
+    as_json: AsJson = False,
 ) -> None:
     """Frequency response from squared voltages to sense counts, modes, static gains and offsets, in the closed loop;
     and a stage file with what was found, which runs at once: --stage FOLDER/stage.toml.

@@ -11,6 +11,7 @@ from hil.lanes.lane import Lane
 from hil.screen.choices import InProcessLane, Tones
 from hil.screen.errors import amplifier_errors, one_line_errors
 from hil.screen.first_run import say_if_compiling
+from hil.screen.options import AsJson, AtStrokes, ExcitationSeed, NameOrFile
 from hil.screen.outputs import folder_to_write, writing
 from hil.screen.progress import bar_apart, progress_bar
 from hil.screen.terminal import bad, note, plain_table, print_whole, say, warned
@@ -28,13 +29,10 @@ if TYPE_CHECKING:
 
 
 def margins(
-    controller: Annotated[str, typer.Option(help="Name or file.")] = "lqg",
-    stage: Annotated[str, typer.Option(help="Name or file.")] = "reconstructed",
-    bus: Annotated[str, typer.Option(help="Name or file.")] = "fd_5k",
-    at_um: Annotated[
-        tuple[float, float, float] | None,
-        typer.Option("--at", metavar="Q1 Q2 Q3", help="Strokes in um; default: mid-workspace."),
-    ] = None,
+    controller: NameOrFile = "lqg",
+    stage: NameOrFile = "reconstructed",
+    bus: NameOrFile = "fd_5k",
+    at_um: AtStrokes = None,
     perturbed: Annotated[bool, typer.Option("--perturbed", help="Also Ms over the changed plants.")] = False,
     tolerances: Annotated[str, typer.Option(help="Name or file of what changes, for --perturbed.")] = "wide",
     measured: Annotated[bool, typer.Option("--measured", help="Also measure by exciting the running loop.")] = False,
@@ -50,9 +48,9 @@ def margins(
     ] = None,
     amplitude_nm: Annotated[float, typer.Option(min=0.1, max=100.0, help="Of each tone.")] = 5.0,
     periods: Annotated[int, typer.Option(min=3, max=1000, help="Of one second, measured on each axis.")] = 6,
-    seed: Annotated[int, typer.Option(min=0, help="Of the noise and of the tones' phases.")] = 1,
+    seed: ExcitationSeed = 1,
     out: Annotated[Path | None, typer.Option(help="Folder for margins.json, bode.png and nyquist.png.")] = None,
-    as_json: Annotated[bool, typer.Option("--json", help="Print JSON, and nothing else.")] = False,
+    as_json: AsJson = False,
 ) -> None:
     """Loop, sensitivity and complementary sensitivity, per axis and MIMO, exact at the samples, delays included.
 

@@ -9,8 +9,8 @@ from typing import TYPE_CHECKING, Annotated, Any
 import typer
 
 from hil.lanes.lane import Lane
-from hil.screen.choices import ClusterAddress, ClusterTls
 from hil.screen.first_run import say_if_compiling
+from hil.screen.options import AsJson, ClusterAddress, ClusterTls, FileInstead, ScenarioName, Workers
 from hil.screen.outputs import folder_to_write
 from hil.screen.progress import progress_bar
 from hil.screen.terminal import bad, plain_table, print_whole, say
@@ -20,15 +20,15 @@ if TYPE_CHECKING:
 
 
 def montecarlo(
-    scenario: Annotated[str, typer.Argument(help="A shipped scenario's name or a TOML file.")] = "raster",
+    scenario: ScenarioName = "raster",
     plants: Annotated[int, typer.Option(min=1, help="How many, sampled by the seeds from --seed on.")] = 200,
     seed: Annotated[int, typer.Option(min=0, help="The first plant's.")] = 1,
     tolerances: Annotated[str, typer.Option(help="Name or file of what they are sampled from.")] = "wide",
-    controller: Annotated[str | None, typer.Option(help="Name or file, instead of the scenario's.")] = None,
-    stage: Annotated[str | None, typer.Option(help="Name or file, instead of the scenario's.")] = None,
+    controller: FileInstead = None,
+    stage: FileInstead = None,
     plant: Annotated[str | None, typer.Option(help="Name or file of the plant that is changed.")] = None,
-    bus: Annotated[str | None, typer.Option(help="Name or file, instead of the scenario's.")] = None,
-    workers: Annotated[int | None, typer.Option(min=1, help="Processes; default: as many as cores.")] = None,
+    bus: FileInstead = None,
+    workers: Workers = None,
     cluster: ClusterAddress = None,
     cluster_tls: ClusterTls = None,
     alone: Annotated[
@@ -37,7 +37,7 @@ def montecarlo(
     out: Annotated[Path, typer.Option(help="Folder for results.jsonl, summary.json and distributions.png.")] = Path(
         "montecarlo"
     ),
-    as_json: Annotated[bool, typer.Option("--json", help="Print JSON, and nothing else.")] = False,
+    as_json: AsJson = False,
 ) -> None:
     """Run a law against plants sampled from tolerances, on the fast lane. Call it again to go on, or for more plants.
 

@@ -8,8 +8,8 @@ from typing import TYPE_CHECKING, Annotated, NoReturn
 
 import typer
 
-from hil.screen.choices import ClusterAddress, ClusterTls
 from hil.screen.first_run import say_if_compiling
+from hil.screen.options import AsJson, ClusterAddress, ClusterTls
 from hil.screen.outputs import folder_to_write, writing
 from hil.screen.progress import progress_bar
 from hil.screen.terminal import bad, say
@@ -36,7 +36,7 @@ def soak(
         Path | None, typer.Option(help="Folder for soak.json, soak.png and, with --keep, recordings; or soaks.jsonl.")
     ] = None,
     keep: Annotated[bool, typer.Option("--keep", help="Keep the recordings, 100 MB a minute.")] = False,
-    as_json: Annotated[bool, typer.Option("--json", help="Print JSON, and nothing else.")] = False,
+    as_json: AsJson = False,
 ) -> None:
     """Run in lockstep under random faults and clears: is anything lost, does anything grow, does anything break?
 

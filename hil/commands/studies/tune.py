@@ -6,8 +6,8 @@ from typing import Annotated
 
 import typer
 
-from hil.screen.choices import ClusterAddress, ClusterTls
 from hil.screen.first_run import say_if_compiling
+from hil.screen.options import AsJson, ClusterAddress, ClusterTls, Workers
 from hil.screen.outputs import folder_to_write
 from hil.screen.progress import progress_bar
 from hil.screen.terminal import plain_table, say, screen
@@ -17,7 +17,7 @@ from pkxyz_ctrl.config.files import ConfigError
 def tune(
     search: Annotated[str, typer.Argument(help="A shipped search's name or a TOML file.")] = "lqg",
     trials: Annotated[int, typer.Option(min=0, help="How many to add to the study; 0 only shows it.")] = 100,
-    workers: Annotated[int | None, typer.Option(min=1, help="Processes; default: as many as cores.")] = None,
+    workers: Workers = None,
     cluster: ClusterAddress = None,
     cluster_tls: ClusterTls = None,
     storage: Annotated[
@@ -31,7 +31,7 @@ def tune(
         ),
     ] = None,
     out: Annotated[Path, typer.Option(help="Folder for the controller file, study and pictures.")] = Path("tuned"),
-    as_json: Annotated[bool, typer.Option("--json", help="Print JSON, and nothing else.")] = False,
+    as_json: AsJson = False,
 ) -> None:
     """Search a law's weights: margins are constraints and computed first, runs on the fast lane follow if they hold.
 

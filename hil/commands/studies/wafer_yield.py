@@ -8,8 +8,8 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
-from hil.screen.choices import ClusterAddress, ClusterTls
 from hil.screen.first_run import say_if_compiling
+from hil.screen.options import AsJson, ClusterAddress, ClusterTls, FileInstead, Workers
 from hil.screen.outputs import folder_to_write, writing
 from hil.screen.progress import progress_bar
 from hil.screen.terminal import bad, good, plain_table, print_whole, say
@@ -33,21 +33,21 @@ def wafer_yield(
         int, typer.Option(metavar="N", min=0, max=1_000_000, help="Devices in a closed loop, one a wafer; 0: none.")
     ] = 64,
     scenario: Annotated[str, typer.Option(help="Name or file of what is run in the loop.")] = "raster",
-    controller: Annotated[str | None, typer.Option(help="Name or file, instead of the scenario's.")] = None,
+    controller: FileInstead = None,
     known: Annotated[
         bool, typer.Option("--known/--shipped", help="Also under a law for the device as it is, or not.")
     ] = True,
     identified: Annotated[
         bool, typer.Option("--identified", help="Also under laws for what `pkxyz identify` finds of the device.")
     ] = False,
-    workers: Annotated[int | None, typer.Option(min=1, help="Processes; default: as many as cores.")] = None,
+    workers: Workers = None,
     cluster: ClusterAddress = None,
     cluster_tls: ClusterTls = None,
     alone: Annotated[int | None, typer.Option(metavar="NUMBER", min=0, help="This device alone.")] = None,
     out: Annotated[
         Path, typer.Option(help="Folder for devices/ and loops/ (Parquet), summary.json and pictures.")
     ] = Path("yield"),
-    as_json: Annotated[bool, typer.Option("--json", help="Print JSON, and nothing else.")] = False,
+    as_json: AsJson = False,
 ) -> None:
     """Sample devices from a process, and see which meet its requirements. Call it again to go on, or for more devices.
 
