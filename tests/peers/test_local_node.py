@@ -55,7 +55,7 @@ class LocalNodeModule:
             self._network.notify(frame.can_id, bytearray(frame.data), 1e-6 * t_us)
 
 
-DEFECTS = {  # it knows neither process data nor states, takes any value, resets nothing
+DEFECTS = {  # it knows neither process data nor states, takes any value, resets nothing, computes no signature
     "object dictionary: read-only objects": "0x1008:00: accepted",
     "object dictionary: mapping in use": "0x1601:00 = 0: accepted",
     "SDO: out of range": "0x1019:00 = 241: accepted",
@@ -70,8 +70,8 @@ DEFECTS = {  # it knows neither process data nor states, takes any value, resets
     "SYNC: SYNC counter": "no EMCY 0x8240",
     "drive PDO: accepted": "0x6411 (0, 0, 0), sent (164, 328, 492)",
     "outputs: heartbeat consumer": "no EMCY 0x8130",
-    "digital outputs: RPDO 1": "",
-    "signature: of what is read": "",
+    "digital outputs: RPDO 1": "0x6200:01 after 0x15 in RPDO 1 and a SYNC: 00",
+    "signature: of what is read": "0x2020:01 is 0x0000: not the CRC of what its objects read",
 }
 
 
