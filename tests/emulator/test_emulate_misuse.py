@@ -2,11 +2,9 @@
 ``make test-firmware``."""
 
 import os
-import sys
 
 import pytest
-
-from hil import cli
+from command_line import refused
 
 
 @pytest.fixture
@@ -21,23 +19,11 @@ def programs(tmp_path, monkeypatch):
     return folder
 
 
-def refused(capsys, monkeypatch, *words):
-    monkeypatch.setattr(sys, "argv", ["pkxyz", "emulate", *map(str, words)])
-    with pytest.raises(SystemExit) as ended:
-        cli.main()
-    shown = capsys.readouterr()
-    lines = [line for line in shown.err.splitlines() if not line.startswith("First run here")]
-    assert ended.value.code == 2
-    assert shown.out == ""
-    assert len(lines) == 1, shown.err
-    return lines[0]
-
-
 @pytest.mark.parametrize("missing", ["qemu-system-arm", "arm-none-eabi-gcc"])
 def test_a_missing_program_is_named_with_what_brings_it(tmp_path, capsys, monkeypatch, programs, missing):
     (programs / missing).unlink()
     monkeypatch.setenv("PATH", str(programs))
-    line = refused(capsys, monkeypatch, "--out", tmp_path / "out")
+    line = refused(capsys, monkeypatch, "emulate", "--out", tmp_path / "out")
     assert f"{missing} is not on PATH" in line
     assert "apt-get install qemu-system-arm gcc-arm-none-eabi" in line
     assert not (tmp_path / "out").exists()
@@ -55,19 +41,19 @@ def test_a_missing_program_is_named_with_what_brings_it(tmp_path, capsys, monkey
     ],
 )
 def test_what_does_not_go_is_said_in_a_line(tmp_path, capsys, monkeypatch, programs, words, says):
-    assert says in refused(capsys, monkeypatch, *words, "--out", tmp_path / "out")
+    assert says in refused(capsys, monkeypatch, "emulate", *words, "--out", tmp_path / "out")
     assert not (tmp_path / "out").exists()
 
 
 def test_a_firmware_that_does_not_link(tmp_path, capsys, monkeypatch, programs):
     """A compiler that fails says so before anything is written; what lies in the folder stays as it is."""
     monkeypatch.setattr("hil.emulator.image.object_code", lambda: b"")
-    assert "could not link the firmware" in refused(capsys, monkeypatch, "--out", tmp_path / "out")
+    assert "could not link the firmware" in refused(capsys, monkeypatch, "emulate", "--out", tmp_path / "out")
     assert not (tmp_path / "out").exists()
 
 
 def test_nothing_of_the_users_is_overwritten(tmp_path, capsys, monkeypatch, programs):
     (tmp_path / "thesis.tex").write_text("years")
     monkeypatch.setattr("hil.emulator.rig.image_of", lambda setup, place: place / "image.elf")
-    assert str(tmp_path) in refused(capsys, monkeypatch, "--out", tmp_path)
+    assert str(tmp_path) in refused(capsys, monkeypatch, "emulate", "--out", tmp_path)
     assert (tmp_path / "thesis.tex").read_text() == "years"

@@ -1,27 +1,13 @@
 """``pkxyz export`` asked for what it can't give: one line, exit code 2, nothing written and nothing overwritten."""
 
-import sys
-
 import pytest
+from command_line import refused
 
-from hil import cli
 from hil.runs.scenario import load_scenario
 from pkxyz_ctrl.export.calls import CALL
 from pkxyz_ctrl.export.folder import Exported, write
 from pkxyz_ctrl.export.kernels import ExportError
 from pkxyz_ctrl.loop.exchange import EXCHANGE
-
-
-def refused(capsys, monkeypatch, *words):
-    monkeypatch.setattr(sys, "argv", ["pkxyz", "export", *map(str, words)])
-    with pytest.raises(SystemExit) as ended:
-        cli.main()
-    shown = capsys.readouterr()
-    lines = [line for line in shown.err.splitlines() if not line.startswith("First run here")]
-    assert ended.value.code == 2
-    assert shown.out == ""
-    assert len(lines) == 1, shown.err
-    return lines[0]
 
 
 @pytest.mark.parametrize(
@@ -39,14 +25,14 @@ def refused(capsys, monkeypatch, *words):
 )
 def test_what_does_not_go_is_said_in_a_line(tmp_path, capsys, monkeypatch, words, says):
     out = tmp_path / "out"
-    assert says in refused(capsys, monkeypatch, *words, "--out", out)
+    assert says in refused(capsys, monkeypatch, "export", *words, "--out", out)
     assert not out.exists()
 
 
 def test_nothing_of_the_users_is_overwritten(tmp_path, capsys, monkeypatch):
     (tmp_path / "thesis.tex").write_text("years")
-    assert "is not empty, and nothing is overwritten" in refused(capsys, monkeypatch, "--out", tmp_path)
-    assert "is not empty" in refused(capsys, monkeypatch, "--out", tmp_path / "thesis.tex")
+    assert "is not empty, and nothing is overwritten" in refused(capsys, monkeypatch, "export", "--out", tmp_path)
+    assert "is not empty" in refused(capsys, monkeypatch, "export", "--out", tmp_path / "thesis.tex")
     assert [item.name for item in tmp_path.iterdir()] == ["thesis.tex"]
 
 

@@ -12,6 +12,7 @@ import time
 from pathlib import Path
 
 import pytest
+from command_line import refused
 
 from hil import cli
 from hil.screen.errors import was_interrupted
@@ -22,20 +23,6 @@ from pkxyz_ctrl.config.files import CONFIG_DIR
 pytestmark = pytest.mark.at_rate
 
 ROOT = Path(__file__).parents[2]
-
-
-def refused(capsys, monkeypatch, *words):
-    """The line that ``pkxyz`` answers with, in this process."""
-    monkeypatch.setattr(sys, "argv", ["pkxyz", *map(str, words)])
-    with pytest.raises(SystemExit) as ended:
-        cli.main()
-    shown = capsys.readouterr()
-    lines = [line for line in shown.err.splitlines() if not line.startswith("First run here")]
-    assert ended.value.code == 2, shown
-    assert shown.out == ""
-    assert len(lines) == 1, shown.err
-    assert lines[0].startswith("pkxyz: ")
-    return lines[0]
 
 
 @pytest.mark.parametrize(

@@ -1,4 +1,4 @@
-"""``pkxyz`` in a process of its own, as a user starts it; and a stage that it serves, patiently, over loopback."""
+"""``pkxyz`` as a user starts it, and what it refuses; and a stage that it serves, patiently, over loopback."""
 
 import contextlib
 import os
@@ -9,9 +9,11 @@ import time
 from collections.abc import Iterator
 from pathlib import Path
 
+import pytest
 from patience import patient_bus, patient_law
 
 import pkxyz_ctrl
+from hil import cli
 from pkxyz_ctrl.client import place
 from pkxyz_ctrl.client.plain import Stage
 
@@ -21,7 +23,7 @@ STARTS_S = 200.0
 
 
 def pkxyz(*words, cwd):
-    """Run ``pkxyz`` in a folder; the checkout itself is found by PYTHONPATH, as if installed."""
+    """Run ``pkxyz`` in a folder, as a process; the checkout itself is found by PYTHONPATH, as if installed."""
     return subprocess.run(
         [sys.executable, "-m", "hil.cli", *map(str, words)],
         cwd=cwd,
@@ -31,6 +33,20 @@ def pkxyz(*words, cwd):
         check=False,
         timeout=1200,
     )
+
+
+def refused(capsys, monkeypatch, *words):
+    """The one line that ``pkxyz`` answers with to what it can't do, in this process."""
+    monkeypatch.setattr(sys, "argv", ["pkxyz", *map(str, words)])
+    with pytest.raises(SystemExit) as ended:
+        cli.main()
+    shown = capsys.readouterr()
+    lines = [line for line in shown.err.splitlines() if not line.startswith("First run here")]
+    assert ended.value.code == 2, shown
+    assert shown.out == ""
+    assert len(lines) == 1, shown.err
+    assert lines[0].startswith("pkxyz: ")
+    return lines[0]
 
 
 class Server:
