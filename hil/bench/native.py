@@ -1,14 +1,9 @@
 """The native loop beside Python's, at 5 kHz on a bus among processes, in turn, with one plant's process for both."""
 
-import contextlib
 import dataclasses
 import re
 import shutil
-import signal
-import subprocess
-import sys
 import tempfile
-from collections.abc import Iterator
 from pathlib import Path
 from typing import NamedTuple
 
@@ -16,6 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from hil.bench.rigs.figure import Figure
+from hil.bench.rigs.running import running
 from hil.native.program import compiled
 from hil.runs.at_rate import RanAtRate, run_into
 from hil.runs.run_folder import RunFolder
@@ -53,7 +49,7 @@ def native() -> list[Figure]:
         program, cyclictest = compiled(), shutil.which("cyclictest")
         ran: dict[str, list[tuple[RanAtRate, NDArray[np.int64]]]] = {"python": [], "native": []}
         bare = np.zeros(0, np.int64)
-        with _plant(folder):
+        with running("plant", "raster", "--bus", str(folder / "bus.toml")):
             for turn in range(TURNS):
                 for loop, by in (("python", None), ("native", program)):
                     beside = start_cyclictest(cyclictest if by is not None else None, period_us, SECONDS)
@@ -139,17 +135,3 @@ def _patient(folder: Path) -> Scenario:
     write_toml(law, folder / "law.toml")
     loaded = load_scenario("raster", bus=str(folder / "bus.toml"), controller=str(folder / "law.toml"))
     return dataclasses.replace(loaded, config=loaded.config.model_copy(update={"duration_s": SECONDS}))
-
-
-@contextlib.contextmanager
-def _plant(folder: Path) -> Iterator[None]:
-    words = [sys.executable, "-m", "hil", "plant", "raster", "--bus", str(folder / "bus.toml")]
-    process = subprocess.Popen(words, stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL)
-    try:
-        yield
-    finally:
-        process.send_signal(signal.SIGTERM)
-        try:
-            process.wait(20)
-        except subprocess.TimeoutExpired:
-            process.kill()

@@ -5,14 +5,13 @@ import contextlib
 import json
 import os
 import signal
-import subprocess
-import sys
 import tempfile
 import time
 from collections.abc import Iterator
 from pathlib import Path
 
 from hil.bench.rigs.figure import Figure
+from hil.bench.rigs.running import running
 from pkxyz_ctrl.client import place
 from pkxyz_ctrl.client.stage import AsyncStage, connect_async
 
@@ -93,17 +92,12 @@ def _processor_s(pid: int) -> float:
 def _served() -> Iterator[tuple[str, int]]:
     """Its address, and the server's process."""
     with tempfile.TemporaryDirectory(prefix="pkxyz-bench-") as folder:
-        words = ["serve", "--name", _NAME, "--port", "0", "--json", "--saves", folder, "--settings", folder]
-        process = subprocess.Popen([sys.executable, "-m", "hil", *words], stdout=subprocess.PIPE, text=True)
+        words = ("serve", "--name", _NAME, "--port", "0", "--json", "--saves", folder, "--settings", folder)
         try:
-            assert process.stdout is not None
-            yield json.loads(process.stdout.readline())["url"], process.pid
+            with running(*words, is_heard=True) as server:
+                assert server.stdout is not None
+                yield json.loads(server.stdout.readline())["url"], server.pid
         finally:
-            process.send_signal(signal.SIGTERM)
-            try:
-                process.wait(20)
-            except subprocess.TimeoutExpired:
-                process.kill()
             for kind in ("loop", "plant"):
                 if (found := place.read(_NAME, kind)) is not None:
                     os.kill(found["pid"], signal.SIGKILL)
