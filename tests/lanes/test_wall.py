@@ -15,13 +15,18 @@ import numpy as np
 import pytest
 from two_processes import (
     ROOT,
+    assert_0_v_in_the_time_of_drive_frames,
     assert_ended_by_the_controller,
-    bench_in,
+    assert_led_down_from_outside,
+    assert_missed_by_the_node,
+    assert_skipped_whole_ticks,
+    bench,
+    changes,
     controller,
     driving,
     is_driving,
     next_with,
-    served,
+    stand_still,
 )
 
 from hil.bus.unix_bus import UnixBus
@@ -39,20 +44,9 @@ from pkxyz_ctrl.safety.modes import NODE_EXPECTED, Mode
 
 pytestmark = pytest.mark.at_rate
 
-PERIOD_US = 1000
-DRIVE_TIMEOUT_US = 20_000
-EMCY, SDO_REPLY, SDO_REQUEST = 0x08A, 0x58A, 0x60A
+__all__ = ["bench", "changes"]
 
-
-@pytest.fixture(scope="module")
-def bench(tmp_path_factory):
-    return bench_in(tmp_path_factory.mktemp("wall"))
-
-
-@pytest.fixture(scope="module")
-def changes(bench):
-    with served(bench) as seen:
-        yield seen
+SDO_REPLY, SDO_REQUEST = 0x58A, 0x60A
 
 
 def truth_of(folder, rows, since):
@@ -132,23 +126,14 @@ def test_killed_controller_leaves_0_v_in_the_time_of_its_drive_frames_and_then_n
         os.kill(run.pid, signal.SIGKILL)
         killed_s = time.time()
         run.communicate(timeout=30)
-        for code in (b"\x50\x82", b"\x30\x81"):  # RPDO time-out, then heartbeat error (CiA 301, table 26)
-            emergency = next_with(observer, EMCY)
-            assert emergency.data[:2] == code
-            assert emergency.timestamp - killed_s < 1.0
+        assert_missed_by_the_node(observer, killed_s)
         for comb in (1, 2, 3):
             request = bytes((0x40, 0x11, 0x64, comb, 0, 0, 0, 0))
             observer.send(can.Message(arbitration_id=SDO_REQUEST, data=request, is_extended_id=False))
             reply = next_with(observer, SDO_REPLY)
             assert reply.data[1:4] == bytes((0x11, 0x64, comb))
             assert int.from_bytes(reply.data[4:6], "little") == 0
-    lines = changes("pre-operational", False)
-    assert [(line["state"], line["driven"]) for line in lines[-3:]] == [
-        ("operational", True), ("operational", False), ("pre-operational", False),
-    ]  # fmt: skip
-    last_us = int(np.fromfile(bench / "truth.bin", TRUTH)["t_us"][-1])
-    waited_us = 1e6 * lines[-2]["t_s"] - last_us
-    assert DRIVE_TIMEOUT_US - 2 * PERIOD_US < waited_us <= DRIVE_TIMEOUT_US + PERIOD_US
+    assert_0_v_in_the_time_of_drive_frames(bench, changes("pre-operational", False))
     for _ in range(100):  # the writer outlives the controller and closes the recording
         if (bench / "killed" / "recording.parquet").is_file():
             break
@@ -163,26 +148,14 @@ def test_a_stopped_controller_goes_on_and_sigterm_ends_it_at_0_v(bench, changes)
     changes("pre-operational", False)
     words = ("on_slow.toml", "--bus", "slow.toml", "--out", "ended", "--replace", "--seconds", "60")
     with UnixBus(f"{bench}/bus") as observer, driving(bench, observer, *words) as run:
-        os.kill(run.pid, signal.SIGSTOP)
-        time.sleep(0.04)
-        os.kill(run.pid, signal.SIGCONT)
+        stand_still(run.pid)
         assert is_driving(observer, run)
         run.send_signal(signal.SIGTERM)
         out, err = run.communicate(timeout=60)
         assert run.returncode == 128 + signal.SIGTERM, err
-    assert "ended from outside" in out
     assert changes("pre-operational", False)[-2]["driven"]
-    ended = Recording.open(bench / "ended" / "recording.parquet")
-    overrun = ended["overrun"]
-    at = int(np.argmax(overrun))
-    assert overrun[at] >= 35
-    modes = ended["mode"][at:]
-    assert (modes[:-20] == Mode.TRACKING).all()
-    assert set(modes[-20:]) == {Mode.TRACKING, Mode.LANDING, Mode.IDLE}  # led down, not dropped
-    assert ended.ticks - at > 100
-    summary = json.loads((bench / "ended" / "summary.json").read_text(encoding="utf-8"))
-    assert summary["interrupted"]
-    assert summary["faults"] == []
+    assert_skipped_whole_ticks(Recording.open(bench / "ended" / "recording.parquet"))
+    assert_led_down_from_outside(bench / "ended", out)
     assert (bench / "ended" / "report.png").stat().st_size > 10_000
     log = list(can.LogReader(bench / "ended" / "frames.log"))
     drives = [message for message in log if message.arbitration_id == 0x30A]

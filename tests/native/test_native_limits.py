@@ -12,7 +12,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from two_processes import assert_ended_by_the_controller, bench_in, served
+from two_processes import assert_ended_by_the_controller, bench, changes
 
 from hil import cli
 from hil.bus.unix_folder import UnsafeFolderError, open_folder
@@ -27,18 +27,9 @@ from pkxyz_ctrl.config.files import ConfigError
 from pkxyz_ctrl.export.shared import BLOCK_ROWS
 from pkxyz_ctrl.safety.modes import Mode
 
+__all__ = ["bench", "changes"]
+
 TICKS = 1800
-
-
-@pytest.fixture(scope="module")
-def bench(tmp_path_factory):
-    return bench_in(tmp_path_factory.mktemp("limits"))
-
-
-@pytest.fixture(scope="module")
-def changes(bench):
-    with served(bench) as seen:
-        yield seen
 
 
 class Ran:

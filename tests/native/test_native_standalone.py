@@ -5,7 +5,7 @@ import subprocess
 import can
 import numpy as np
 import pytest
-from two_processes import assert_ended_by_the_controller, bench_in, served
+from two_processes import assert_ended_by_the_controller, bench, served
 
 from hil.commands.export import run_beside
 from hil.native.program import compiled
@@ -15,12 +15,9 @@ from hil.runs.scenario import load_scenario
 from pkxyz_ctrl.config.files import ConfigError
 from pkxyz_ctrl.safety.modes import Mode
 
+__all__ = ["bench"]
+
 TICKS = 1800
-
-
-@pytest.fixture(scope="module")
-def bench(tmp_path_factory):
-    return bench_in(tmp_path_factory.mktemp("standalone"))
 
 
 def written(folder, scenario):

@@ -2,6 +2,7 @@
 
 import json
 import os
+import signal
 import subprocess
 import sys
 import time
@@ -13,8 +14,14 @@ import numpy as np
 import pytest
 from patience import patient_bus, patient_law
 
+from hil.lanes.wall_plant import TRUTH
+from hil.recording.recording import Recording
+from pkxyz_ctrl.safety.modes import Mode
+
 ROOT = Path(__file__).parents[2]
 DRIVE, EMCY = 0x30A, 0x08A
+CRC = 4
+PERIOD_US, DRIVE_TIMEOUT_US = 1000, 20_000
 SCENARIO = """
 name = "to_and_fro"
 duration_s = 1.8
@@ -52,6 +59,12 @@ def bench_in(folder):
     return folder
 
 
+@pytest.fixture(scope="module")
+def bench(tmp_path_factory):
+    """A folder of the module's, with all that two processes need."""
+    return bench_in(tmp_path_factory.mktemp("bench"))
+
+
 def started(folder, *words, stdout=subprocess.PIPE):
     return subprocess.Popen(
         [sys.executable, "-m", "hil.cli", *map(str, words)], cwd=folder, text=True,
@@ -81,6 +94,13 @@ def served(folder):
         process.terminate()
         _, err = process.communicate(timeout=60)
     assert process.returncode == 0, err
+
+
+@pytest.fixture(scope="module")
+def changes(bench):
+    """Waits for a state of the node that is served in the folder, and returns all changes so far."""
+    with served(bench) as seen:
+        yield seen
 
 
 @contextmanager
@@ -142,3 +162,56 @@ def assert_ended_by_the_controller(log):
     assert (np.diff(most[last - 11 : last + 1]) <= 50).all()
     driven = next(i for i, m in enumerate(frames) if m.arbitration_id == DRIVE and any(m.data[:6]))
     assert not any(message.arbitration_id == EMCY for message in frames[driven:])
+
+
+def assert_missed_by_the_node(observer, killed_s):
+    """Within a second the node says that drive frames, then the heartbeat, of whoever was killed do not come."""
+    for code in (b"\x50\x82", b"\x30\x81"):  # RPDO time-out, then heartbeat error (CiA 301, table 26)
+        emergency = next_with(observer, EMCY)
+        assert emergency.data[:2] == code
+        assert emergency.timestamp - killed_s < 1.0
+
+
+def assert_0_v_in_the_time_of_drive_frames(folder, lines):
+    """By the node's changes: a time-out after the last drive frame it is at 0 V, and then no longer operational."""
+    assert [(line["state"], line["driven"]) for line in lines[-3:]] == [
+        ("operational", True), ("operational", False), ("pre-operational", False),
+    ]  # fmt: skip
+    last_us = int(np.fromfile(folder / "truth.bin", TRUTH)["t_us"][-1])
+    waited_us = 1e6 * lines[-2]["t_s"] - last_us
+    assert DRIVE_TIMEOUT_US - 2 * PERIOD_US < waited_us <= DRIVE_TIMEOUT_US + PERIOD_US
+
+
+def stand_still(pid):
+    """A process sleeps for 40 ms in the middle of whatever it does."""
+    os.kill(pid, signal.SIGSTOP)
+    time.sleep(0.04)
+    os.kill(pid, signal.SIGCONT)
+
+
+def assert_skipped_whole_ticks(recording):
+    """And went on tracking until somebody ended it."""
+    at = int(np.argmax(recording["overrun"]))
+    assert recording["overrun"][at] >= 35
+    assert (recording["mode"][at:-20] == Mode.TRACKING).all()
+    assert recording.ticks - at > 100
+
+
+def assert_led_down_from_outside(folder, out):
+    """A run that SIGTERM ended, without a fault: it says so, and led the stage down."""
+    assert "ended from outside" in out
+    summary = json.loads((folder / "summary.json").read_text(encoding="utf-8"))
+    assert summary["interrupted"]
+    assert summary["faults"] == []
+    modes = Recording.open(folder / "recording.parquet")["mode"]
+    assert set(modes[-20:]) == {Mode.TRACKING, Mode.LANDING, Mode.IDLE}  # not dropped
+
+
+def assert_damage_was_a_fault(folder, out):
+    """A run that met damaged sense frames, by its folder and output: it said so, and from then on only 0 V went out."""
+    (fault,) = json.loads(out)["faults"]
+    assert "SENSE_CRC" in fault
+    damaged = Recording.open(folder / "recording.parquet")
+    at = int(np.argmax(damaged["mode"] == Mode.FAULT))
+    assert (damaged["sense_status"][: at + 1] & CRC > 0).sum() >= 5
+    assert not damaged.vector("drive_count")[at:].any()

@@ -27,6 +27,7 @@ import numpy as np
 import pyarrow.parquet  # noqa: F401
 import pytest
 from patience import patient_law, replaced
+from two_processes import assert_damage_was_a_fault
 
 import hil.commands.check_amplifier
 import hil.commands.run  # noqa: F401  a command is loaded when it is called, which in the guest takes a while
@@ -254,6 +255,18 @@ def driving(bench, plant, *words, bus="bus.toml"):
     pytest.fail(f"no voltages came: {said}")
 
 
+def send_damaged_sense_frames(bench, looking):
+    """After each of some SYNCs one with the node's identifier and a wrong CRC, from a third socket."""
+    for n in range(20):
+        while next_frame(looking)[0] != SYNC:
+            pass
+        data = bytes((1, 2, 3, 4, 5, 6, n, 0))
+        if is_fd(bench):
+            looking.send(struct.pack("<IBBBB64s", SENSE, 8, CANFD_BRS, 0, 0, data))
+        else:
+            looking.send(struct.pack("<IBBBB8s", SENSE, 8, 0, 0, 0, data))
+
+
 def test_start_up_and_scan(bench, plant):
     """The stage follows; on the wire stands what the bus file says; the recording replays bit for bit."""
     with driving(bench, plant, "--out", "scan", "--replace", "--json") as (run, _, seen):
@@ -327,27 +340,13 @@ def test_a_node_that_falls_silent_is_a_fault(bench, plant):
 
 
 def test_someone_else_who_sends_damaged_sense_frames_is_a_fault(bench, plant):
-    """Frames with the node's identifier and a wrong CRC, from a third socket."""
     with driving(bench, plant, "--out", "damaged", "--replace", "--seconds", "60", "--json") as (run, looking, _):
-        for n in range(20):
-            while next_frame(looking)[0] != SYNC:
-                pass
-            data = bytes((1, 2, 3, 4, 5, 6, n, 0))
-            if is_fd(bench):
-                looking.send(struct.pack("<IBBBB64s", SENSE, 8, CANFD_BRS, 0, 0, data))
-            else:
-                looking.send(struct.pack("<IBBBB8s", SENSE, 8, 0, 0, 0, data))
+        send_damaged_sense_frames(bench, looking)
         assert drive_frames(looking, run, driven=False)
         run.signal(signal.SIGTERM)
         code, out, err = run.wait()
     assert code == 128 + signal.SIGTERM, err
-    faults = json.loads(out)["faults"]
-    assert len(faults) == 1
-    assert "SENSE_CRC" in faults[0]
-    damaged = Recording.open(bench / "damaged" / "recording.parquet")
-    at = int(np.argmax(damaged["mode"] == Mode.FAULT))
-    assert (damaged["sense_status"][: at + 1] & 4 > 0).sum() >= 5
-    assert not damaged.vector("drive_count")[at:].any()
+    assert_damage_was_a_fault(bench / "damaged", out)
     plant.seen("pre-operational", False)
 
 

@@ -5,7 +5,6 @@
 import json
 import os
 import signal
-import struct
 import time
 from contextlib import suppress
 from pathlib import Path
@@ -28,7 +27,9 @@ from on_vcan import (
     is_fd,
     next_frame,
     plant,
+    send_damaged_sense_frames,
 )
+from two_processes import assert_damage_was_a_fault
 
 import hil.native.native_rig  # noqa: F401  in the guest an import takes a while
 from hil.lanes.wall_plant import TRUTH
@@ -111,23 +112,10 @@ def test_a_loop_that_is_killed_leaves_0_v_in_the_time_of_its_drive_frames(bench,
 def test_someone_else_who_sends_damaged_sense_frames_is_a_fault(bench, plant):
     words = ("--native", "--out", "damaged", "--replace", "--seconds", "60", "--json")
     with driving(bench, plant, *words) as (run, looking, _):
-        for n in range(20):
-            while next_frame(looking)[0] != SYNC:
-                pass
-            data = bytes((1, 2, 3, 4, 5, 6, n, 0))
-            if is_fd(bench):
-                looking.send(struct.pack("<IBBBB64s", SENSE, 8, CANFD_BRS, 0, 0, data))
-            else:
-                looking.send(struct.pack("<IBBBB8s", SENSE, 8, 0, 0, 0, data))
+        send_damaged_sense_frames(bench, looking)
         assert drive_frames(looking, run, driven=False)
         os.kill(loop_of(run), signal.SIGTERM)
         code, out, err = run.wait()
     assert code == 128 + signal.SIGTERM, err
-    faults = json.loads(out)["faults"]
-    assert len(faults) == 1
-    assert "SENSE_CRC" in faults[0]
-    damaged = Recording.open(bench / "damaged" / "recording.parquet")
-    at = int(np.argmax(damaged["mode"] == Mode.FAULT))
-    assert (damaged["sense_status"][: at + 1] & 4 > 0).sum() >= 5
-    assert not damaged.vector("drive_count")[at:].any()
+    assert_damage_was_a_fault(bench / "damaged", out)
     plant.seen("pre-operational", False)
