@@ -98,11 +98,9 @@ def run_block_with_outputs(
 ) -> None:
     """``run_block`` with the node's digital outputs, (1,) of ``outputs.OUTPUTS``, which act as the voltages do."""
     seen, row, late = memory[0]["input"], memory[0]["row"], law[0]["tick"]["delay_periods"] - 1
-    due = memory[0]["tick"]["count"][late]
     for i in range(count):
         switch(seen, row, outputs[0]["bits"], late)
-        exchange(plant_params, plant_state, sample_us[i], due, row, seen["sense_count"])
-        cycle(law, memory, reference)
+        run_block(law, memory, reference, plant_params, plant_state, sample_us[i : i + 1], rows[i : i + 1], 1)
         decide(law, memory, outputs, reference)
         rows[i] = row
 
