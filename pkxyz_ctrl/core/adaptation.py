@@ -43,6 +43,7 @@ CAUSES = 7
 """What may change by itself: each comb, the springs of each chain, the out-of-plane hinges."""
 LEAST_LOSS = 0.1
 """By how much, in variances of the noise, innovations have to be worse with the base before something has changed."""
+_PARAMETERS, _CAUSES = np.int32(PARAMETERS), np.int32(CAUSES)  # a processor of 32 bits counts these for less
 AGES = 2
 """Intervals that are remembered: two periods of delay."""
 
@@ -138,7 +139,7 @@ def learn(
     if near and state["calm"] >= adaptation["calm_ticks"]:
         _update(adaptation, state, axis, innovation_m[axis])
     change = state["work"]
-    for p in range(PARAMETERS):
+    for p in range(_PARAMETERS):
         change[p] = adaptation["follow"] * (state["learnt"][p] - state["acting"][p])
         state["acting"][p] += change[p]
     for i in range(3):
@@ -146,10 +147,10 @@ def learn(
         force = state["force_n"][delay - 1, i]
         for s in range(3):
             moved = 0.0
-            for p in range(PARAMETERS):
+            for p in range(_PARAMETERS):
                 moved += u[s, p] * change[p]
             filtered[3 * s + i] += moved
-        for p in range(PARAMETERS):
+        for p in range(_PARAMETERS):
             x, v, d, f = u[0, p], u[1, p], u[2, p], force[p]
             u[0, p] = phi[0, 0] * x + phi[0, 1] * v + phi[0, 2] * d - gamma[0] * f
             u[1, p] = phi[1, 0] * x + phi[1, 1] * v + phi[1, 2] * d - gamma[1] * f
@@ -161,12 +162,12 @@ def _show(adaptation: np.void, state: np.void, row: Array) -> None:
     tau, spread, shown = adaptation["sense_delay_s"], adaptation["spread"], state["shown"]
     for i in range(3):
         u, k = state["sensitivity"][i], adaptation["gain"][i]
-        for p in range(PARAMETERS):
+        for p in range(_PARAMETERS):
             shown[i, p] = tau * u[1, p] - u[0, p]
         shown[i, DELAY] += spread[DELAY] * row[3 + i]
         shown[i, BEND] -= spread[BEND] * row[6 + i]
         for s in range(3):
-            for p in range(PARAMETERS):
+            for p in range(_PARAMETERS):
                 u[s, p] += k[s] * shown[i, p]
 
 
@@ -176,9 +177,9 @@ def _update(adaptation: np.void, state: np.void, axis: int, innovation_m: float)
     p, learnt, acting = state["covariance"], state["learnt"], state["acting"]
     by, gain, base = state["shown"][axis], state["work"], state["base"]
     told, missing, since = 0.0, innovation_m, innovation_m
-    for i in range(PARAMETERS):
+    for i in range(_PARAMETERS):
         total = 0.0
-        for k in range(PARAMETERS):
+        for k in range(_PARAMETERS):
             total += p[i, k] * by[k]
         gain[i] = total
         told += total * by[i]
@@ -188,12 +189,12 @@ def _update(adaptation: np.void, state: np.void, axis: int, innovation_m: float)
     if not told > adaptation["least"] * noise_m2:
         return
     scale = 1.0 / (told + noise_m2)
-    for i in range(PARAMETERS):
+    for i in range(_PARAMETERS):
         weight = gain[i] * scale
         learnt[i] -= weight * missing
-        for k in range(PARAMETERS):
+        for k in range(_PARAMETERS):
             p[i, k] -= weight * gain[k]
-    for i in range(PARAMETERS):
+    for i in range(_PARAMETERS):
         p[i, i] = min(p[i, i] + adaptation["drift"], 1.0)
     _keep_within(adaptation["bound"], p, learnt)
     state["updates"] += 1
@@ -208,9 +209,9 @@ def _update(adaptation: np.void, state: np.void, axis: int, innovation_m: float)
 def begin(adaptation: np.void, state: np.void) -> None:
     """Know no more than the spreads, or what an earlier run has learnt."""
     state["begun"] = 1
-    for i in range(PARAMETERS):
+    for i in range(_PARAMETERS):
         state["learnt"][i] = state["acting"][i] = adaptation["start"][i]
-        for k in range(PARAMETERS):
+        for k in range(_PARAMETERS):
             state["covariance"][i, k] = adaptation["start_covariance"][i, k]
     if adaptation["known"] != 0:
         set_base(state)
@@ -222,9 +223,9 @@ def set_base(state: np.void) -> None:
     state["based"] = 1
     state["left_by_base"] = state["left"] = 0.0
     state["cause"], state["change"] = 0, 0.0
-    for i in range(PARAMETERS):
+    for i in range(_PARAMETERS):
         state["base"][i] = state["learnt"][i]
-    for c in range(CAUSES):
+    for c in range(_CAUSES):
         state["answer"][c] = state["clue"][c] = 0.0
 
 
@@ -235,7 +236,7 @@ def _compare(adaptation: np.void, state: np.void, by: Array, since: float, missi
     state["left_by_base"] += forget * (since * since - state["left_by_base"])
     state["left"] += forget * (missing * missing - state["left"])
     best, most, change = 0, 0.0, 0.0
-    for c in range(CAUSES):
+    for c in range(_CAUSES):
         if c < 3:
             shown = by[COMB + c] / spread[COMB + c]
         elif c < 6:
@@ -258,13 +259,13 @@ def _compare(adaptation: np.void, state: np.void, by: Array, since: float, missi
 @njit(cache=True, error_model="numpy")
 def _keep_within(bound: Array, p: Array, learnt: Array) -> None:
     """Take numbers back to their bounds, and the others along by as much as they depend on them."""
-    for i in range(PARAMETERS):
+    for i in range(_PARAMETERS):
         beyond = learnt[i] - min(max(learnt[i], -bound[i]), bound[i])
         if beyond != 0.0:
             share = beyond / p[i, i]
-            for k in range(PARAMETERS):
+            for k in range(_PARAMETERS):
                 learnt[k] -= share * p[k, i]
-    for i in range(PARAMETERS):
+    for i in range(_PARAMETERS):
         learnt[i] = min(max(learnt[i], -bound[i]), bound[i])
 
 
@@ -276,7 +277,7 @@ def tell(state: np.void, age: int) -> None:
     acting, force, out = state["acting"], state["force_n"][age], state["told_n"]
     for i in range(3):
         total = 0.0
-        for p in range(PARAMETERS):
+        for p in range(_PARAMETERS):
             total += force[i, p] * acting[p]
         out[i] = -total
 
@@ -304,7 +305,7 @@ def note(
         for i in range(9):
             motion[age, i] = motion[age - 1, i]
         for i in range(3):
-            for p in range(PARAMETERS):
+            for p in range(_PARAMETERS):
                 force[age, i, p] = force[age - 1, i, p]
     for i in range(9):
         motion[0, i] = start[i]
@@ -319,7 +320,7 @@ def note(
         _note_chain(adaptation["fringe_m"], geometry, elasticity, i, row, drop, pulls[i], pull, newest)
     for i in range(3):
         total = 0.0
-        for p in range(PARAMETERS):
+        for p in range(_PARAMETERS):
             newest[i, p] *= adaptation["spread"][p]
             total += newest[i, p] * state["acting"][p]
         added[i] = total
@@ -382,7 +383,7 @@ def clear(state: np.void) -> None:
     """The loop is open, or the filter begins anew: forget the motion, keep what was learnt."""
     for i in range(3):
         state["added_n"][i] = state["told_n"][i] = 0.0
-        for p in range(PARAMETERS):
+        for p in range(_PARAMETERS):
             state["shown"][i, p] = 0.0
             for k in range(3):
                 state["sensitivity"][i, k, p] = 0.0
