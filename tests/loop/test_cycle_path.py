@@ -7,7 +7,9 @@ from loop_rig import Cycle, bus, controller_with, stage
 from numpy.typing import NDArray
 
 from pkxyz_ctrl.design.law import design_law
+from pkxyz_ctrl.loop.reference import reference_rows
 from pkxyz_ctrl.safety.modes import Event, Mode
+from pkxyz_ctrl.safety.trips import Trip
 
 
 def ramp(n: int = 16) -> NDArray[np.float64]:
@@ -53,11 +55,11 @@ def swing(tick):
     return rows
 
 
-def asked(c, ticks, event=Event.NONE):
-    """Set-points (n, 9) of so many ticks, the first with an event."""
+def asked(c, ticks, event=Event.NONE, base=0):
+    """Set-points (n, 9) of so many ticks, the first with an event. ``base``: the block's first row of the path."""
     rows = []
     for k in range(ticks):
-        c.tick(noisy(AT_REST, k), event=event if k == 0 else Event.NONE)
+        c.tick(noisy(AT_REST, k), event=event if k == 0 else Event.NONE, base=base)
         rows.append(c.memory["here"][0].copy())
     return np.array(rows)
 
@@ -130,6 +132,62 @@ def test_a_hold_that_is_cut_short_turns_round_without_a_jump(after):
     assert np.abs(np.diff(steps)).max() < 1.6 / 20
     assert np.hypot(rows[:, 0], rows[:, 1]) == pytest.approx(np.full(len(rows), SWING_M), rel=1e-6)
     assert steps[-20:] == pytest.approx(np.ones(20), abs=1e-6)
+    # between two rows of the path, at its own speed: so are velocity and acceleration, 2e-4 off as chords of a circle
+    on_path = swing(phases(rows)[-20:])
+    for part in (slice(3, 6), slice(6, 9)):
+        assert np.abs(rows[-20:, part] - on_path[:, part]).max() < 1e-3 * np.abs(on_path[:, part]).max()
+    again = np.concatenate([rows[-20:], asked(c, 40, Event.HOLD)])
+    assert np.abs(np.diff(phases(again), 2)).max() < 1.6 / 20
+    assert not again[-1, 3:].any()
+
+
+def test_a_hold_is_the_same_wherever_the_block_of_rows_begins():
+    whole, later = tracking(swing(range(300))), tracking(swing(range(300)))
+    for c in (whole, later):
+        asked(c, 30)
+    later.reference = reference_rows(swing(range(20, 300)))
+    for ticks, event in ((7, Event.HOLD), (60, Event.TRACK), (60, Event.HOLD), (60, Event.TRACK)):
+        rows = asked(whole, ticks, event)
+        assert asked(later, ticks, event, base=20) == pytest.approx(rows, rel=1e-9, abs=1e-15)
+
+
+BEFORE = {
+    "standing on the path": [(60, Event.HOLD)],
+    "slowing down": [(7, Event.HOLD)],
+    "starting again": [(60, Event.HOLD), (7, Event.TRACK)],
+    "between two rows of the path": [(7, Event.HOLD), (60, Event.TRACK)],
+}
+
+
+@pytest.mark.parametrize("before", BEFORE.values(), ids=BEFORE)
+def test_a_loop_that_is_closed_again_holds_rest_and_the_path_begins_anew(before):
+    """Nothing of a hold outlives the way down: neither where it stood, nor where the path was, nor that it was asked
+    for, by which the path would begin with a ramp.
+    """
+    c = tracking(swing(range(300)))
+    asked(c, 30)
+    for ticks, event in before:
+        asked(c, ticks, event)
+    assert c.memory["here"][0, :3].any()
+    asked(c, 60, Event.DISABLE)
+    assert c.mode is Mode.IDLE
+    held = asked(c, 30, Event.ENABLE)
+    assert c.mode is Mode.ENABLED
+    assert not held.any()
+    assert np.array_equal(asked(c, 40, Event.TRACK), swing(range(40)))
+
+
+@pytest.mark.parametrize("before", BEFORE.values(), ids=BEFORE)
+def test_a_path_does_not_go_on_after_a_fault(before):
+    """Else the record would show a set-point that moves where nothing is driven."""
+    c = tracking(swing(range(300)))
+    asked(c, 30)
+    for ticks, event in before:
+        asked(c, ticks, event)
+    c.tick(noisy(AT_REST, 0), trips=int(Trip.GATE_BLOCKED))
+    assert c.mode is Mode.FAULT
+    rows = asked(c, 30)
+    assert (rows == rows[0]).all()
 
 
 def test_the_automatic_start_leaves_a_hold_alone():
@@ -139,4 +197,13 @@ def test_the_automatic_start_leaves_a_hold_alone():
     asked(c, 60, Event.HOLD)
     assert c.mode is Mode.ENABLED
     asked(c, 1, Event.TRACK)
+    assert c.mode is Mode.TRACKING
+
+
+def test_the_automatic_start_no_longer_knows_of_a_hold_once_the_stage_was_led_down():
+    c = homed(autostart=True, reference=swing(range(300)))
+    asked(c, 40)
+    asked(c, 60, Event.HOLD)
+    assert c.mode is Mode.ENABLED
+    asked(c, 60, Event.DISABLE)
     assert c.mode is Mode.TRACKING

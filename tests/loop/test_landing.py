@@ -4,6 +4,7 @@ import numpy as np
 import pytest
 from cycle_rig import AT_REST, in_the_middle, noisy, tracking
 from loop_rig import MIDDLE, Cycle, counts_at
+from numpy.typing import NDArray
 from stopped import stopped
 
 from pkxyz_ctrl.safety.modes import Event, Mode
@@ -86,6 +87,31 @@ def test_nothing_that_is_asked_for_stops_or_prolongs_the_way_down(event):
             assert asked.mode is Mode.LANDING
     assert c.mode is Mode.IDLE
     assert c.memory["homed"][0] == 1
+
+
+def led_to(c: Cycle) -> NDArray[np.float64]:
+    """Where the set-points (3,) are led to by the end of this tick's action, what is left of a jump taken off."""
+    place: NDArray[np.float64] = c.memory["after"][0, :3] + c.memory["tick"]["set_point_model"]["short_m"][0]
+    return place
+
+
+@pytest.mark.parametrize(("ticks", "missing_m"), [(3, 0.0), (5, 5e-6), (6, 2e-6), (8, 0.0)])
+def test_the_way_down_begins_where_the_set_points_were_led_to(ticks, missing_m):
+    """On a scan, before, in and after a jump of 8 um, 3 um of it in a tick: not where the jump was to end."""
+    c = in_the_middle()
+    motion, tick = c.reference["motion"], np.arange(16)
+    motion[:, 3] = 0.1e-3
+    motion[:, 0] += 0.1e-3 * 200e-6 * tick + np.where(tick < 8, 0.0, 8e-6)
+    for k in range(ticks):
+        c.tick(noisy(counts_at(MIDDLE), k))
+    assert c.mode is Mode.TRACKING
+    place = led_to(c)
+    assert c.memory["after"][0, :3] - place == pytest.approx([missing_m, 0.0, 0.0], rel=1e-9, abs=1e-15)
+    c.tick(noisy(counts_at(MIDDLE), ticks), event=Event.DISABLE)
+    assert c.mode is Mode.LANDING
+    assert c.memory["now"][0, :3] == pytest.approx(place, rel=0, abs=1e-15)
+    assert c.memory["now"][0, 3:6] == pytest.approx([0.1e-3, 0.0, 0.0], rel=0, abs=1e-12)
+    assert led_to(c) == pytest.approx(c.memory["after"][0, :3], rel=0, abs=1e-15), "the rest of the jump is not made"
 
 
 @pytest.mark.parametrize(("off_m", "stays"), [(0.1e-9, True), (20e-9, False)])

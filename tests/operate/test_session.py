@@ -185,6 +185,31 @@ def test_a_jog_stops_at_the_end_of_what_the_combs_hold():
     assert not rig.controller.faults
 
 
+@pytest.mark.parametrize("verb", [Verb.MOVE, Verb.JOG])
+def test_a_loop_that_is_closed_again_holds_rest_wherever_it_was_opened(verb):
+    """In the middle of a way: neither where it led nor where it had come to is what the next enable holds."""
+    rig = OperatedRig()
+    at: list[int] = []
+
+    def script() -> Script:
+        yield from rig.switched_on()
+        rig.give(verb, target_m=(1.0, 0.0, 0.0) if verb is Verb.JOG else (6e-6, 3e-6, NAN))
+        yield from rig.wait_s(0.006)
+        assert (yield from rig.do(Verb.DISABLE)) is State.DONE
+        at.append(len(rig.rows))
+        assert (yield from rig.do(Verb.ENABLE)) is State.DONE
+        assert rig.session.state["activity"] == Activity.HOLDING
+        assert not rig.session.state["target_m"].any()
+        yield from rig.wait_s(0.02)
+        at.append(len(rig.rows))
+        assert (yield from rig.do(Verb.MOVE, target_m=MIDDLE_M)) is State.DONE
+
+    rows = rig.play(script())
+    assert not rig.controller.faults
+    assert not tracked(rows[at[0] : at[1]])["reference_m"].any()
+    require_smooth(rows[at[0] :])
+
+
 def test_released_by_hand_is_led_down_in_5_ms_and_latched_until_cleared():
     rig = OperatedRig()
 
