@@ -73,8 +73,8 @@ def started(folder, *words, stdout=subprocess.PIPE):
 
 
 @contextmanager
-def served(folder):
-    """Serves node and plant in a process; gives a function that waits for a state and returns all changes so far."""
+def plant_in(folder):
+    """Serves node and plant in a process; gives it, and a function that waits for a state and returns all changes."""
     words = ("plant", "on_slow.toml", "--bus", "slow.toml", "--truth", "truth.bin", "--json")
     with (folder / "changes").open("wb") as out:
         process = started(folder, *words, stdout=out)
@@ -89,11 +89,19 @@ def served(folder):
             time.sleep(0.02)
 
     try:
-        yield seen
+        yield process, seen
     finally:
         process.terminate()
         _, err = process.communicate(timeout=60)
-    assert process.returncode == 0, err
+    assert process.returncode in (0, -signal.SIGKILL), err
+
+
+@contextmanager
+def served(folder):
+    """The same where the plant is there to the end; gives the function that waits for a state."""
+    with plant_in(folder) as (process, seen):
+        yield seen
+    assert process.returncode == 0
 
 
 @pytest.fixture(scope="module")
