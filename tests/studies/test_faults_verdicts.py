@@ -7,13 +7,17 @@ import numpy as np
 import pytest
 from defective.kernels import planted, says_nothing
 
+from hil.faults.injection import Injection
 from hil.lanes.lockstep import LockstepRig
 from hil.node.amplifier import AmplifierNode
 from hil.studies.faults.matrix import CASES
-from hil.studies.faults.outcome import RISE_V, largest_rise_v, largest_step_v, run_case, setup_for
+from hil.studies.faults.outcome import RISE_V, Outcome, _problems, largest_rise_v, largest_step_v, run_case, setup_for
 from pkxyz_ctrl.config.controller import ControllerConfig
 from pkxyz_ctrl.loop import exchange
 from pkxyz_ctrl.loop.controller import Controller
+from pkxyz_ctrl.loop.row import ROW
+from pkxyz_ctrl.safety.modes import Mode
+from pkxyz_ctrl.safety.trips import Trip
 
 
 @cache
@@ -37,16 +41,40 @@ def steps(self, counts, t_us):
     return applied_as_shipped(self, (a + 4096, b, c) if self.applied == 1050 else counts, t_us)
 
 
+def steps_after_the_clear(self, counts, t_us):
+    """25 V too much at comb 1, once, on the way up that follows the fault; a release is at once and passes nothing."""
+    a, b, c = counts
+    self.highest = max(getattr(self, "highest", 0), a)
+    if self.highest > 20_000 and 8_000 < a < 12_000:
+        a, self.highest = a + 4096, 0
+    return applied_as_shipped(self, (a, b, c), t_us)
+
+
 def exceeds(self, counts, t_us):
     a, b, c = counts
     return applied_as_shipped(self, (36_000, b, c) if a > 20_000 else counts, t_us)
+
+
+def lifting(by_v):
+    """An amplifier whose channel 1 gains an offset 30 ms after the fault, while no voltage is allowed."""
+    arm = Injection.arm
+
+    def armed(self):
+        clock, params = arm(self), self._plant.plant.params
+        self._clock.call_at(self.origin_us + 250_000, lambda: params["amplifier_offset_v"].__setitem__((0, 0), by_v))
+        return clock
+
+    return armed
 
 
 @pytest.mark.parametrize(
     ("owner", "part", "defect", "fault", "words"),
     [
         (AmplifierNode, "_apply", steps, "sense.1:off", "a step of 25"),
+        (AmplifierNode, "_apply", steps_after_the_clear, "sense.1:off", "a step of 25"),
         (AmplifierNode, "_apply", exceeds, "sense.1:off", "beyond 200 V"),
+        (Injection, "arm", lifting(0.3), "sense.1:off", "a comb rose by 0.3 V after the decision"),
+        (Injection, "arm", lifting(1.2), "sense.1:off", "after the release at"),
         (exchange, "begin", planted(exchange.begin, release=says_nothing), "bus.sync:drop", "not within 0.4 ms"),
         (Controller, "__init__", None, "bus.sense:drop", "instead of 5"),
         (Controller, "_enter", None, "bus.sync:drop", "a voltage was commanded in a mode that allows none"),
@@ -80,6 +108,44 @@ def commanding(enter):
         self.memory["row"]["drive_count"][0, 1] = 7
 
     return entered
+
+
+ONSET = 1100
+SAVED = Outcome("lqg", "sense.1:off", ("SENSE_RANGE_1",), 5, 200.0, 20.0, 0.1, 0.4, 0.0, ("stop",), True, ())
+"""At its bounds in everything that is bounded."""
+
+
+def told(outcome, ticks=5, trips=Trip.SENSE_RANGE_1):
+    """What the verdict says of an outcome whose fault was decided so many ticks after its beginning, and cleared."""
+    rows = np.zeros(2000, ROW)
+    rows["mode"] = Mode.TRACKING
+    rows["mode"][ONSET + ticks : ONSET + 255], rows["mode"][ONSET + 255 : 1600] = Mode.FAULT, Mode.BOOT
+    rows["trips"][ONSET + ticks] = trips
+    return _problems(case("sense.1:off"), scan(), rows, outcome, ONSET, ONSET + ticks, True)
+
+
+@pytest.mark.parametrize(
+    ("changes", "words"),
+    [
+        ({"voltage_max_v": 200.1}, "200.1 V at a comb, beyond 200 V"),
+        ({"slew_max_v": 20.1}, "a step of 20.1 V in a tick, beyond 20 V"),
+        ({"rise_max_v": 0.11}, "a comb rose by 0.1 V after the decision"),
+        ({"zero_ms": 0.6}, "0 V after 0.6 ms, not within 0.4 ms"),
+        ({"zero_ms": None}, "0 V after never, not within 0.4 ms"),
+        ({"events": ("broken", "stop")}, "the stage is damaged: broken, stop"),
+        ({"events": ("pulled_in",)}, "the stage is damaged: pulled_in"),
+        ({"recovered": False}, "did not track again after the clear"),
+    ],
+)
+def test_at_a_bound_all_is_well_and_beyond_it_that_is_told(changes, words):
+    assert told(SAVED) == []
+    assert told(dataclasses.replace(SAVED, **changes)) == [words]
+
+
+def test_a_decision_too_late_too_early_or_for_another_cause_is_told():
+    assert told(SAVED, ticks=6) == ["noticed after 6 ticks instead of 5"]
+    assert told(SAVED, ticks=-1) == ["a fault 1 ticks before anything was wrong"]
+    assert told(SAVED, trips=Trip.OVERRUN) == ["latched SENSE_RANGE_1, which is not the cause"]
 
 
 def test_steps_and_rises_are_those_of_the_whole_run():

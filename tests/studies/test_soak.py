@@ -1,4 +1,7 @@
-"""Five seconds of what `pkxyz soak` does for half an hour."""
+"""Five seconds of what `pkxyz soak` does for half an hour, and what it says of a run a little beyond a bound."""
+
+import dataclasses
+from functools import cache
 
 import numpy as np
 import pytest
@@ -13,8 +16,10 @@ from hil.node.drive import DriveReceiver
 from hil.recording.recording import Recording
 from hil.runs.scenario import load_scenario
 from hil.studies.faults.outcome import RISE_V
-from hil.studies.soak import AFTER_US, random_faults, soak, soaked_scenario
+from hil.studies.soak import AFTER_US, Soaked, _judge, _Voltages, random_faults, soak, soaked_scenario
 from hil.whole_ticks.stretches import Stretches
+from pkxyz_ctrl.loop.row import ROW
+from pkxyz_ctrl.safety.modes import Mode
 
 
 @pytest.fixture(scope="module")
@@ -113,6 +118,22 @@ def applied_as_shipped(self, counts, t_us):
     return counts
 
 
+def test_a_voltage_that_rises_while_none_is_allowed_is_found(tmp_path, monkeypatch):
+    """Channel 1 gains an offset of 0.3 V in FAULT: less than what counts as driven, and three times what may be."""
+    shipped = Injection.arm
+
+    def arm_and_lift(self):
+        clock, params = shipped(self), self._plant.plant.params
+        self._clock.call_at(self.origin_us + 400_000, lambda: params["amplifier_offset_v"].__setitem__((0, 0), 0.3))
+        return clock
+
+    monkeypatch.setattr(Injection, "arm", arm_and_lift)
+    monkeypatch.setattr("hil.studies.soak.random_faults", lambda *_: (parse("sense.1:off@0.3"),))
+    monkeypatch.setattr("hil.studies.soak.CLEAR_S", 10.0)
+    found = soak(0.5, 1, soaked_scenario("lqg"), tmp_path)
+    assert "a comb's voltage rose by 0.3 V while none was allowed" in found.problems
+
+
 def test_a_decision_without_a_fault_is_found(tmp_path, monkeypatch):
     """An amplifier that trips by itself, 0.15 s after the only fault that was planned."""
     shipped = Injection.arm
@@ -161,3 +182,90 @@ def test_a_soak_sees_what_a_node_does_that_it_must_not(tmp_path, monkeypatch, pa
     monkeypatch.setattr("hil.studies.soak.CLEAR_S", 10.0)
     found = soak(0.5, 1, soaked_scenario("lqg"), tmp_path)
     assert any(words in problem for problem in found.problems), found.problems
+
+
+@cache
+def setup():
+    return soaked_scenario("lqg").setup()
+
+
+AT_ITS_BOUNDS = Soaked(
+    seed=1, law="lqg", ticks=1000, recorded_ticks=1000, decisions=1, returns=1, voltage_max_v=200.0, slew_max_v=20.0,
+    rise_max_v=RISE_V, zero_ticks=106, memory_mb=[50.0, 100.0, 130.0, 110.0, 120.0],
+)  # fmt: skip
+
+
+@pytest.mark.parametrize(
+    ("name", "value", "words"),
+    [
+        ("recorded_ticks", 999, "999 ticks recorded of 1000"),
+        ("damaged", True, "the stage is damaged"),
+        ("voltage_max_v", 200.1, "200.1 V at a comb"),
+        ("slew_max_v", 20.1, "a comb's voltage changed by 20.1 V in a tick"),
+        ("rise_max_v", 0.11, "a comb's voltage rose by 0.1 V while none was allowed"),
+        ("zero_ticks", 107, "a voltage 107 ticks after the end of a mode with voltages"),
+        ("unprovoked", 1, "1 decisions without a fault in the 50 ms before"),
+        ("decisions", 0, "no fault was decided, or none recovered from"),
+        ("returns", 0, "no fault was decided, or none recovered from"),
+        ("memory_mb", [50.0, 100.0, 110.0, 110.0, 120.1], "memory grew from 100 to 120 MB"),
+    ],
+)
+def test_at_a_bound_all_is_well_and_beyond_it_that_is_told(name, value, words):
+    """200 V and 20 V a tick are the controller's, 106 ticks the node's 20 ms without a frame, with the look behind."""
+    for changes, problems in (({}, []), ({name: value}, [words])):
+        soaked = dataclasses.replace(AT_ITS_BOUNDS, **changes, problems=[])
+        _judge(soaked, setup())
+        assert soaked.problems == problems
+
+
+def looked_at(volts, mode, overrun=(), fault="amplifier.2:stuck@0.02+0.01", rows_each=1000):
+    """Figures of the combs' voltages (n, 3), looked at in blocks."""
+    rows = np.zeros(len(volts), ROW)
+    rows["tick"], rows["comb_voltage_v"], rows["mode"] = np.arange(len(rows)), volts, mode
+    for at, ticks in overrun:
+        rows["overrun"][at] = ticks
+    soaked = Soaked(seed=1, law="lqg")
+    voltages = _Voltages(soaked, dataclasses.replace(setup(), faults=(parse(fault),)))
+    for first in range(0, len(rows), rows_each):
+        voltages.look_at(rows[first : first + rows_each])
+    return soaked
+
+
+def driven_up():
+    """Volts (300, 3): to 100 V in 10 V steps, and there."""
+    return np.tile(np.minimum(10.0 * np.arange(300), 100.0)[:, np.newaxis], 3)
+
+
+@pytest.mark.parametrize("rows_each", [1000, 7, 1])
+@pytest.mark.parametrize(
+    ("comb", "tick", "is_asked"),
+    [(1, 97, True), (1, 99, False), (1, 125, False), (1, 154, False), (1, 156, True), (1, 298, True), (0, 125, True)],
+)
+def test_only_a_comb_whose_channel_fails_is_not_asked_and_only_so_long(comb, tick, is_asked, rows_each):
+    """From the tick before the fault, which lasts from 100 to 150, to four behind it. A spike of 30 V for a tick."""
+    volts = driven_up()
+    volts[tick, comb] = 130.0
+    found = looked_at(volts, Mode.TRACKING, rows_each=rows_each)
+    assert (found.slew_max_v, found.voltage_max_v) == ((30.0, 130.0) if is_asked else (10.0, 100.0))
+
+
+def test_ticks_that_the_controller_skipped_count_for_when_a_channel_fails():
+    """18 of them: the fault's 100 to 150 of the bus are the rows 82 to 132."""
+    for tick, slew_v in ((79, 30.0), (84, 10.0), (110, 10.0), (138, 30.0)):
+        volts = driven_up()
+        volts[tick, 1] = 130.0
+        assert looked_at(volts, Mode.TRACKING, overrun=[(20, 9), (40, 9)], rows_each=7).slew_max_v == slew_v
+
+
+@pytest.mark.parametrize("rows_each", [1000, 7, 1])
+def test_how_long_a_voltage_stays_and_what_rises_is_found_to_the_end_of_the_run(rows_each):
+    """A comb is let go 40 ticks after the others, another rises a little, much later."""
+    volts, mode = driven_up(), np.full(300, Mode.TRACKING)
+    mode[200:] = Mode.FAULT
+    volts[200:] = 0.0
+    volts[200:240, 2] = 60.0
+    volts[299, 0] = 0.3
+    found = looked_at(volts, mode, rows_each=rows_each)
+    assert found.zero_ticks == 40
+    assert found.rise_max_v == 0.3
+    assert found.slew_max_v == 40.0
