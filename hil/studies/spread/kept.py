@@ -48,7 +48,7 @@ class Kept(Generic[Key, Value]):
             raise ConfigError(f"{path}: {reason(error)}; give another --out") from None
 
     def add(self, value: Value) -> None:
-        """Keep a result, at once."""
-        self.found[self._key(value)] = value
+        """Keep a result, at once. It counts once it is written: who is interrupted is told of no more than is there."""
         with self._path.open("a", encoding="utf-8") as file:
             file.write(json.dumps(self._plain(value), allow_nan=False) + "\n")
+        self.found[self._key(value)] = value
