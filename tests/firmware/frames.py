@@ -108,7 +108,7 @@ class Sender:
 
     def _odd(self) -> tuple[int, ...]:
         draw, gate = self._draw, self._gate
-        kind = draw.randint(0, 6)
+        kind = draw.randint(0, 7)
         if kind == 0:
             return self._made(draw.randint(0, 0x7FF), draw.getrandbits(64), draw.randint(0, 64), draw.randint(0, 31))
         if kind == 1:
@@ -120,6 +120,9 @@ class Sender:
             return self._made(0x080, draw.randint(0, 255), draw.randint(0, 2))
         if kind == 4:
             return self._made(int(gate["drive_id"]), draw.getrandbits(64), 8)
+        if kind == 5:
+            length = 1 if draw.random() < 0.9 else draw.randint(0, 8)
+            return self._made(int(gate["output_id"]), draw.getrandbits(draw.choice((3, 6, 8))), length)
         index, value = draw.choice(_OBJECTS), draw.choice((0, 1, 2, 0x80, 240, 1000, draw.getrandbits(32)))
         command = draw.choice((0x2F, 0x2B, 0x27, 0x23, 0x40, 0x60, 0x80, draw.randint(0, 255)))
         data = command | index << 8 | draw.randint(0, 4) << 24 | value << 32
