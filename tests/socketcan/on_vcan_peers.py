@@ -211,7 +211,7 @@ def test_canopens_master_finds_our_node_as_its_eds_says(bench):
             node.sdo.RESPONSE_TIMEOUT = 3
             node.nmt.send_command(0x81)
             node.nmt.wait_for_bootup(10)
-            assert node.sdo[0x1000].raw == 0x000C0191
+            assert node.sdo[0x1000].raw == 0x000E0191
             assert node.sdo[0x1008].raw == "pkxyz comb amplifier"  # in segments
             assert [node.sdo[0x1018][part].raw for part in (1, 2, 3, 4)] == [0x7078797A, 3, 0x10000, 1]
             with pytest.raises(canopen.SdoAbortedError, match="0x06020000"):
