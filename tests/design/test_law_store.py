@@ -2,20 +2,27 @@
 
 import subprocess
 import sys
+from functools import cache
 from pathlib import Path
 
 import numpy as np
 import pytest
 
 from hil.runs.scenario import load_scenario
+from pkxyz_ctrl.config.bus import BusConfig
+from pkxyz_ctrl.config.controller import ControllerConfig
 from pkxyz_ctrl.config.files import ConfigError
+from pkxyz_ctrl.config.stage import StageConfig
 from pkxyz_ctrl.design import law as design
 from pkxyz_ctrl.design import law_store
 from pkxyz_ctrl.design.law_store import law_of
 from pkxyz_ctrl.stage import Stage
 
-SETUP = load_scenario("raster").setup()
-PARTS = (SETUP.stage, SETUP.controller, SETUP.bus)
+
+@cache
+def shipped() -> tuple[StageConfig, ControllerConfig, BusConfig]:
+    setup = load_scenario("raster").setup()
+    return setup.stage, setup.controller, setup.bus
 
 
 @pytest.fixture
@@ -34,9 +41,9 @@ def designs(monkeypatch: pytest.MonkeyPatch) -> list[object]:
 
 
 def test_what_is_read_back_is_what_was_designed(folder: Path, designs: list[object]) -> None:
-    anew = design.design_law(Stage(SETUP.stage), *PARTS[1:], autostart=True)
+    anew = design.design_law(Stage(shipped()[0]), *shipped()[1:], autostart=True)
     designs.clear()
-    first, second = (law_of(*PARTS, autostart=True) for _ in range(2))
+    first, second = (law_of(*shipped(), autostart=True) for _ in range(2))
     assert len(designs) == 1
     for law in (first, second):
         assert law.tobytes() == anew.tobytes()
@@ -47,14 +54,14 @@ def test_what_is_read_back_is_what_was_designed(folder: Path, designs: list[obje
 
 
 def test_every_input_counts(folder: Path, designs: list[object]) -> None:
-    stage, controller, bus = PARTS
-    law_of(*PARTS, autostart=True)
+    stage, controller, bus = shipped()
+    law_of(*shipped(), autostart=True)
     stiff = stage.model_copy(update={"dynamics": stage.dynamics.model_copy(update={"quality_factor": 19.0})})
     calm = controller.model_copy(update={"homing_s": 0.06})
     slow = bus.model_copy(update={"period_us": 2 * bus.period_us})
     for parts in ((stiff, controller, bus), (stage, calm, bus), (stage, controller, slow)):
         law_of(*parts, autostart=True)
-    law_of(*PARTS, autostart=False)
+    law_of(*shipped(), autostart=False)
     assert len(designs) == 5
     assert len(list(folder.iterdir())) == 5
 
@@ -67,32 +74,32 @@ def test_a_program_of_other_sources_designs_anew(
     (sources / "a.py").write_text("GAIN = 1.0")
     monkeypatch.setattr(law_store, "__file__", str(sources / "design" / "law_store.py"))
     law_store._program.cache_clear()  # a process looks at its sources once
-    law_of(*PARTS, autostart=True)
-    law_of(*PARTS, autostart=True)
+    law_of(*shipped(), autostart=True)
+    law_of(*shipped(), autostart=True)
     assert len(designs) == 1
     (sources / "a.py").write_text("GAIN = 2.0")
     law_store._program.cache_clear()
-    law_of(*PARTS, autostart=True)
+    law_of(*shipped(), autostart=True)
     assert len(designs) == 2
     law_store._program.cache_clear()
 
 
 @pytest.mark.parametrize("damage", ["one bit", "cut", "longer", "empty"])
 def test_a_file_that_is_not_whole_is_no_file(folder: Path, designs: list[object], damage: str) -> None:
-    law = law_of(*PARTS, autostart=True)
+    law = law_of(*shipped(), autostart=True)
     (path,) = folder.iterdir()
     content = bytearray(path.read_bytes())
     if damage == "one bit":
         content[len(content) // 2] ^= 1
     path.write_bytes({"cut": content[:-1], "longer": content + b"\0", "empty": b""}.get(damage, content))
-    assert law_of(*PARTS, autostart=True).tobytes() == law.tobytes()
+    assert law_of(*shipped(), autostart=True).tobytes() == law.tobytes()
     assert len(designs) == 2
-    law_of(*PARTS, autostart=True)
+    law_of(*shipped(), autostart=True)
     assert len(designs) == 2  # and the file is whole again
 
 
 def test_a_law_that_is_refused_is_not_kept(folder: Path) -> None:
-    stage, controller, bus = PARTS
+    stage, controller, bus = shipped()
     beyond = controller.model_copy(update={"limits": controller.limits.model_copy(update={"voltage_max_v": 900.0})})
     for _ in range(2):
         with pytest.raises(ConfigError, match="voltage_max_v"):
@@ -105,9 +112,9 @@ def test_without_a_folder_it_is_designed_each_time(
 ) -> None:
     (tmp_path / "laws").write_text("a file where the folder should be")
     monkeypatch.setenv("NUMBA_CACHE_DIR", str(tmp_path))
-    laws = [law_of(*PARTS, autostart=True) for _ in range(2)]
+    laws = [law_of(*shipped(), autostart=True) for _ in range(2)]
     monkeypatch.delenv("NUMBA_CACHE_DIR")
-    laws.append(law_of(*PARTS, autostart=True))
+    laws.append(law_of(*shipped(), autostart=True))
     assert len(designs) == 3
     assert all(np.array_equal(law, laws[0]) for law in laws)
 

@@ -1,6 +1,7 @@
 """Ms without the states of the taps against the whole loop's: values to 1e-5, and stability, also close to its end."""
 
 from dataclasses import replace
+from functools import cache
 
 import numpy as np
 import pytest
@@ -19,13 +20,17 @@ from pkxyz_ctrl.design.margins.tolerances import Tolerances
 from pkxyz_ctrl.design.model.discrete_law import LawError, TappedLaw
 from pkxyz_ctrl.design.model.loop_plant import NOMINAL, Perturbation, loop_plant
 
-YOULA = design_law(stage(), load("controllers", "youla", ControllerConfig), bus(), autostart=True)
 WIDE = load("tolerances", "wide", Tolerances)
+
+
+@cache
+def youla():
+    return design_law(stage(), load("controllers", "youla", ControllerConfig), bus(), autostart=True)
 
 
 def loop(strokes_m=MIDDLE, change=NOMINAL, taps=1.0):
     """A plant with the shipped law of taps, these times a factor."""
-    parts = law_in_parts(stage(), YOULA, strokes_m, change)
+    parts = law_in_parts(stage(), youla(), strokes_m, change)
     return loop_plant(stage(), bus(), strokes_m, change), replace(parts, taps=taps * parts.taps)
 
 
@@ -96,6 +101,6 @@ def test_taps_need_a_law_that_is_told_the_force():
 
 
 def test_a_law_in_parts_is_the_law_about_that_point():
-    parts = law_in_parts(stage(), YOULA, MIDDLE)
-    about = law_about(stage(), YOULA, MIDDLE)
+    parts = law_in_parts(stage(), youla(), MIDDLE)
+    about = law_about(stage(), youla(), MIDDLE)
     assert all(np.array_equal(getattr(parts.whole(), name), getattr(about, name)) for name in "abcd")

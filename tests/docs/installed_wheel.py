@@ -2,7 +2,6 @@
 
 import hashlib
 import os
-import shutil
 import subprocess
 import sys
 from pathlib import Path
@@ -25,22 +24,22 @@ def install(folder: Path) -> dict[str, str]:
     run([*pip, "install", *offline, "--target", str(installed), *map(str, built.glob("*.whl"))])
     path = os.pathsep.join((str(installed / "bin"), str(Path(sys.executable).parent), os.environ["PATH"]))
     env = {**os.environ, "PATH": path, "PYTHONPATH": str(installed), "NUMBA_CACHE_DIR": str(folder / "kernels")}
-    take_over_kernels(installed, folder / "kernels")
+    share_kernels(installed, folder / "kernels")
     return env
 
 
-def take_over_kernels(installed: Path, cache: Path) -> None:
-    """Kernels that are compiled for the checkout serve the wheel, too: the sources are the same, and numba compares
-    them. It keeps a folder of its own for each folder of sources, named after its path.
+def share_kernels(installed: Path, cache: Path) -> None:
+    """What is compiled for the checkout serves the wheel, and the other way round: the sources are the same, and numba
+    compares them. It keeps a folder of its own for each folder of sources, named after its path.
     """
     choose_kernel_cache()
     compiled = Path(os.environ["NUMBA_CACHE_DIR"])
+    cache.mkdir()
     for package in PACKAGES:
         for source in {path.parent for path in (ROOT / package).rglob("*.py")}:
             own = compiled / kernels_of(source)
-            if own.is_dir():
-                shutil.copytree(own, cache / kernels_of(installed / source.relative_to(ROOT)))
-    cache.mkdir(exist_ok=True)
+            own.mkdir(exist_ok=True)
+            (cache / kernels_of(installed / source.relative_to(ROOT))).symlink_to(own)
 
 
 def kernels_of(source: Path) -> str:

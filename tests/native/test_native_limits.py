@@ -12,6 +12,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from standalone import loop, written
 from two_processes import assert_ended_by_the_controller, bench, changes
 
 from hil import cli
@@ -138,3 +139,20 @@ def test_what_does_not_go_is_said_in_a_line(bench, capsys, monkeypatch, words, s
     (line,) = [line for line in capsys.readouterr().err.splitlines() if line.startswith("pkxyz: ")]
     assert says in line
     assert not (bench / "refused").exists()
+
+
+def test_a_file_that_is_none_is_refused_in_a_line(bench, tmp_path):
+    file = written(tmp_path, load_scenario(bench / "on_slow.toml"))
+    content = file.read_bytes()
+    for name, damaged, says in (
+        ("nothing", b"", "Invalid argument"),  # an empty file can't be mapped
+        ("rubbish", b"x" * len(content), "is not what this program goes by"),
+        ("other", content[:8] + bytes(8) + content[16:], "was written for another version"),
+        ("cut", content[:-1], "is cut short"),
+    ):
+        (tmp_path / name).write_bytes(damaged)
+        done = loop(tmp_path / name)
+        assert done.returncode == 2, name
+        assert len(done.stderr.splitlines()) == 1
+        assert says in done.stderr
+    assert "No such file" in loop(tmp_path / "missing").stderr

@@ -9,7 +9,7 @@ there is none yet, ``MISSING`` says so, and everything is done again once there 
 from typing import Final, NamedTuple
 
 import numpy as np
-from numba import njit
+from kept import kernel
 from numpy.typing import NDArray
 
 Array = NDArray[np.int64]
@@ -133,12 +133,12 @@ class Rows(NamedTuple):
 SENT_MOST: Final = 12
 
 
-@njit(error_model="numpy")
+@kernel
 def key_of(side: int, state: int, asked: int) -> int:
     return side << 58 | state << 20 | asked
 
 
-@njit(error_model="numpy")
+@kernel
 def place_of(keys: Array, key: int) -> int:
     """Where a key stands in a hash table, or is to stand."""
     mask = len(keys) - 1
@@ -148,7 +148,7 @@ def place_of(keys: Array, key: int) -> int:
     return at
 
 
-@njit(error_model="numpy")
+@kernel
 def refill(keys: Array, places: NDArray[np.int32], was: Array, were: NDArray[np.int32]) -> None:
     """A larger hash table for the same keys."""
     for at in range(len(was)):
@@ -157,7 +157,7 @@ def refill(keys: Array, places: NDArray[np.int32], was: Array, were: NDArray[np.
             keys[to], places[to] = was[at], were[at]
 
 
-@njit(error_model="numpy")
+@kernel
 def row_of(r: Rows, side: int, state: int, asked: int) -> int:
     """The row, or MISSING."""
     key = key_of(side, state, asked)
@@ -176,7 +176,7 @@ def row_of(r: Rows, side: int, state: int, asked: int) -> int:
 # -- what the sides do --------------------------------------------------------------------------------------------
 
 
-@njit(error_model="numpy")
+@kernel
 def controller_does(w: np.void, r: Rows, asked: int) -> int:
     """The bits that it says, or something below 0."""
     row = row_of(r, CONTROLLER, w["controller"], asked)
@@ -194,7 +194,7 @@ def controller_does(w: np.void, r: Rows, asked: int) -> int:
     return _said(w, r, row)
 
 
-@njit(error_model="numpy")
+@kernel
 def node_does(w: np.void, r: Rows, asked: int) -> int:
     row = row_of(r, NODE, w["node"], asked)
     if row < 0:
@@ -211,7 +211,7 @@ def node_does(w: np.void, r: Rows, asked: int) -> int:
     return _said(w, r, row)
 
 
-@njit(error_model="numpy")
+@kernel
 def _said(w: np.void, r: Rows, row: int) -> int:
     told = r.told[row]
     if told < 0:
@@ -226,7 +226,7 @@ def _said(w: np.void, r: Rows, row: int) -> int:
     return told
 
 
-@njit(error_model="numpy")
+@kernel
 def _shift(w: np.void, r: Rows, drive: int, sync: int, sense: int) -> bool:
     """What is on its way was counted from where the counters were."""
     return (
@@ -236,7 +236,7 @@ def _shift(w: np.void, r: Rows, drive: int, sync: int, sense: int) -> bool:
     )
 
 
-@njit(error_model="numpy")
+@kernel
 def _shift_each(r: Rows, frames: NDArray[np.uint16], count: int, drive: int, sync: int, sense: int) -> bool:
     for place in range(count):
         counted, further = r.frame_labels[frames[place]]["counted"], 0
@@ -254,7 +254,7 @@ def _shift_each(r: Rows, frames: NDArray[np.uint16], count: int, drive: int, syn
     return True
 
 
-@njit(error_model="numpy")
+@kernel
 def pass_us(w: np.void, r: Rows, time_us: int) -> int:
     """Time passes on both sides; the node acts in it."""
     told = node_does(w, r, RUN + time_us)
@@ -265,7 +265,7 @@ def pass_us(w: np.void, r: Rows, time_us: int) -> int:
     return told
 
 
-@njit(error_model="numpy")
+@kernel
 def _first(frames: NDArray[np.uint16], count: int, place: int) -> int:
     """Take one out."""
     frame = frames[place]
@@ -275,21 +275,21 @@ def _first(frames: NDArray[np.uint16], count: int, place: int) -> int:
     return int(frame)
 
 
-@njit(error_model="numpy")
+@kernel
 def off_wire(w: np.void) -> int:
     frame = _first(w["wire"], w["on_wire"], 0)
     w["on_wire"] -= 1
     return frame
 
 
-@njit(error_model="numpy")
+@kernel
 def off_port(w: np.void) -> int:
     frame = _first(w["received"], w["in_port"], 0)
     w["in_port"] -= 1
     return frame
 
 
-@njit(error_model="numpy")
+@kernel
 def deliver(w: np.void, r: Rows, frame: int) -> int:
     if r.frame_labels[frame]["from_us"] != 0:
         return node_does(w, r, FRAME + frame)
@@ -301,13 +301,13 @@ def deliver(w: np.void, r: Rows, frame: int) -> int:
     return 0
 
 
-@njit(error_model="numpy")
+@kernel
 def hold(w: np.void, r: Rows, frame: int) -> None:
     w["held"][w["are_held"]], w["left"][w["are_held"]] = frame, r.rules[0]["late_ticks"]
     w["are_held"] += 1
 
 
-@njit(error_model="numpy")
+@kernel
 def let_go(w: np.void, place: int) -> int:
     for later in range(place + 1, w["are_held"]):
         w["left"][later - 1] = w["left"][later]

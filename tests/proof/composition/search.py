@@ -3,7 +3,7 @@
 from typing import Final, NamedTuple
 
 import numpy as np
-from numba import njit
+from kept import kernel
 from numpy.typing import NDArray
 from product import FULL, HELD_MOST, IN_FLIGHT, LATE, LOSE, MEND, SKIP, Array, Rows
 from ticks import options, settle, take
@@ -30,7 +30,7 @@ class Store(NamedTuple):
     tails: NDArray[np.uint32]  # where each leads to
 
 
-@njit(error_model="numpy")
+@kernel
 def _mixed(words: Array) -> int:
     found = np.uint64(0)
     for word in words:
@@ -39,7 +39,7 @@ def _mixed(words: Array) -> int:
     return np.int64(found >> np.uint64(2))
 
 
-@njit(error_model="numpy")
+@kernel
 def find(table: Array, slots: NDArray[np.int32], words: Array) -> int:
     """The slot where words stand, or are to stand."""
     mask = len(slots) - 1
@@ -56,14 +56,14 @@ def find(table: Array, slots: NDArray[np.int32], words: Array) -> int:
     return at
 
 
-@njit(error_model="numpy")
+@kernel
 def fill(table: Array, slots: NDArray[np.int32], count: int) -> None:
     """A larger hash table for the same words."""
     for row in range(count):
         slots[find(table, slots, table[row])] = row
 
 
-@njit(error_model="numpy")
+@kernel
 def _sort_held(w: np.void) -> None:
     """Their order says nothing."""
     held, left = w["held"], w["left"]
@@ -75,14 +75,14 @@ def _sort_held(w: np.void) -> None:
             place -= 1
 
 
-@njit(error_model="numpy")
+@kernel
 def _before(held: NDArray[np.uint16], left: NDArray[np.uint8], place: int) -> bool:
     if held[place] != held[place - 1]:
         return bool(held[place] < held[place - 1])
     return bool(left[place] < left[place - 1])
 
 
-@njit(error_model="numpy")
+@kernel
 def add(w: np.void, words: Array, r: Rows, s: Store, cursor: Array, origin: int, option: int, count: int) -> int:
     """The number of this state, a new one if it is new; FULL if there is no room."""
     if cursor[STATES] == len(s.states) or cursor[FLIGHTS] == len(s.flights):
@@ -114,7 +114,7 @@ def add(w: np.void, words: Array, r: Rows, s: Store, cursor: Array, origin: int,
     return int(number)
 
 
-@njit(error_model="numpy")
+@kernel
 def put(w: np.void, words: Array, s: Store, number: int) -> None:
     """Make the world this state."""
     words[:] = 0
@@ -127,13 +127,13 @@ def put(w: np.void, words: Array, s: Store, number: int) -> None:
     w["landing"] = key[1] >> 45 & 15
 
 
-@njit(error_model="numpy")
+@kernel
 def is_fault(option: int) -> bool:
     kind = option >> 8
     return LATE <= kind <= LOSE or SKIP <= kind < MEND
 
 
-@njit(error_model="numpy")
+@kernel
 def expand(
     world: NDArray[np.void], words: Array, kept: Array, may: NDArray[np.int32], then: NDArray[np.int32],
     r: Rows, s: Store, cursor: Array,
@@ -173,7 +173,7 @@ def expand(
 # -- what is not true of a state but of all ways from it ---------------------------------------------------------
 
 
-@njit(error_model="numpy")
+@kernel
 def first_without_a_way_back(s: Store, count: int) -> int:
     """A state from which nothing leads to a closed loop, or to the end, without another fault; -1: there is none."""
     begins = np.zeros(count + 2, np.int64)  # of the transitions turned round
@@ -207,7 +207,7 @@ def first_without_a_way_back(s: Store, count: int) -> int:
     return -1
 
 
-@njit(error_model="numpy")
+@kernel
 def first_start_without_end(s: Store, count: int) -> int:
     """A state on a circle of states that are all of the start-up, or behind one; -1: there is none."""
     into = np.zeros(count, np.int32)

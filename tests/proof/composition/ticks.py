@@ -3,7 +3,7 @@
 from typing import Final
 
 import numpy as np
-from numba import njit
+from kept import kernel
 from numpy.typing import NDArray
 from product import (
     AFTER,
@@ -62,7 +62,7 @@ _CUTS: Final = 4
 # -- a tick ---------------------------------------------------------------------------------------------------------
 
 
-@njit(error_model="numpy")
+@kernel
 def _go_on(w: np.void, r: Rows) -> int:
     phase, rules = w["phase"], r.rules[0]
     told = 0
@@ -93,7 +93,7 @@ def _go_on(w: np.void, r: Rows) -> int:
     return told
 
 
-@njit(error_model="numpy")
+@kernel
 def _start(w: np.void, r: Rows) -> int:
     """As ``loop.runtime.start``."""
     if w["in_port"] > 0:
@@ -115,7 +115,7 @@ def _start(w: np.void, r: Rows) -> int:
     return told
 
 
-@njit(error_model="numpy")
+@kernel
 def _read(w: np.void, r: Rows) -> int:
     while w["in_port"] > 0:
         told = controller_does(w, r, FRAME + off_port(w))
@@ -129,7 +129,7 @@ def _read(w: np.void, r: Rows) -> int:
     return 0
 
 
-@njit(error_model="numpy")
+@kernel
 def _compute(w: np.void, r: Rows, wish: int) -> int:
     told = controller_does(w, r, COMPUTE + SKIPS * wish + w["skipped"])
     if told < 0:
@@ -143,7 +143,7 @@ def _compute(w: np.void, r: Rows, wish: int) -> int:
     return 0
 
 
-@njit(error_model="numpy")
+@kernel
 def _pass_tick(w: np.void, r: Rows) -> int:
     """The next one begins; what must not last too long has lasted one longer."""
     rules = r.rules[0]
@@ -178,7 +178,7 @@ def _pass_tick(w: np.void, r: Rows) -> int:
     return 0
 
 
-@njit(error_model="numpy")
+@kernel
 def _compare_beliefs(w: np.void, r: Rows, controller: np.void, counts: int) -> bool:
     """Do energised combs hold what the gate takes them to hold? It may be wrong while it can't know better.
 
@@ -200,7 +200,7 @@ def _compare_beliefs(w: np.void, r: Rows, controller: np.void, counts: int) -> b
 # -- what may happen ------------------------------------------------------------------------------------------------
 
 
-@njit(error_model="numpy")
+@kernel
 def options(w: np.void, r: Rows, to: NDArray[np.int32]) -> int:
     """Everything that may happen now, and how much that is; the first is what happens when nothing goes wrong."""
     rules, phase, count = r.rules[0], w["phase"], 1
@@ -232,7 +232,7 @@ def options(w: np.void, r: Rows, to: NDArray[np.int32]) -> int:
     return count
 
 
-@njit(error_model="numpy")
+@kernel
 def _fates(w: np.void, r: Rows, to: NDArray[np.int32]) -> int:
     """What may become of the frame that is on the wire."""
     rules, frame, count = r.rules[0], r.frame_labels[w["wire"][0]], 1
@@ -256,7 +256,7 @@ def _fates(w: np.void, r: Rows, to: NDArray[np.int32]) -> int:
     return count
 
 
-@njit(error_model="numpy")
+@kernel
 def take(w: np.void, r: Rows, option: int) -> int:
     """Let one of `options` happen. Below 0: MISSING or VIOLATED."""
     kind, which = option >> 8, option & 0xFF
@@ -293,7 +293,7 @@ def take(w: np.void, r: Rows, option: int) -> int:
     return 0
 
 
-@njit(error_model="numpy")
+@kernel
 def is_landmark(w: np.void, r: Rows) -> bool:
     """Where ways meet again although nothing is to be decided: before a tick, and now and then in the dialogue."""
     if w["on_wire"] > 0:
@@ -302,7 +302,7 @@ def is_landmark(w: np.void, r: Rows) -> bool:
     return bool(w["phase"] == BEFORE)
 
 
-@njit(error_model="numpy")
+@kernel
 def settle(w: np.void, r: Rows, to: NDArray[np.int32]) -> int:
     """Go on until something has to be decided; returns how much may happen there, or MISSING or VIOLATED."""
     has_moved = False

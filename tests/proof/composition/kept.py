@@ -1,0 +1,33 @@
+"""Kernels of the exploration are kept between runs: a minute of compiling each time if not.
+
+numba asks whether a kernel's own file has changed, not whether those that it calls have: hence a folder that is named
+after all of them, within that of the controller's kernels.
+"""
+
+import hashlib
+import os
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import numba
+
+from pkxyz_ctrl.compiled.kernel_cache import choose_kernel_cache
+
+choose_kernel_cache()
+_SOURCES = sorted(Path(__file__).parent.glob("*.py"))
+_HOME = os.environ.get("NUMBA_CACHE_DIR")
+_FOLDER = (
+    _HOME and Path(_HOME) / f"exploration-{hashlib.sha256(b''.join(p.read_bytes() for p in _SOURCES)).hexdigest()[:16]}"
+)
+
+
+def kernel(function: Callable[..., Any]) -> Any:
+    """``function``, compiled, and kept if there is a place."""
+    if not _FOLDER:
+        return numba.njit(error_model="numpy")(function)
+    before, numba.config.CACHE_DIR = numba.config.CACHE_DIR, str(_FOLDER)
+    try:
+        return numba.njit(error_model="numpy", cache=True)(function)
+    finally:
+        numba.config.CACHE_DIR = before
