@@ -58,7 +58,7 @@ class Adaptation(FrozenModel):
     """most that is learnt of pull, springs, fringe and lift"""
     most_damping: Annotated[float, Field(gt=0, le=10)] = 4.0
     most_delay_s: Annotated[float, Field(gt=0, le=200e-6)] = 100e-6
-    doubt: Annotated[float, Field(ge=0, le=1)] = 0.1
+    doubt: Annotated[float, Field(ge=0, le=1)] = 0.01
     """share of an unexpected innovation's square that counts as noise: what no number here explains teaches less"""
     drift_per_rts: Positive = 2e-3
     """how much these numbers may change by themselves, in standard deviations per root second: more is followed faster,
@@ -73,7 +73,7 @@ class Adaptation(FrozenModel):
     """... and for so long afterwards, or after a comb was at a limit"""
     base_s: Positive = 3.0
     """after learning for so long, what is known is what changes are counted from"""
-    forget_s: Positive = 1.0
+    forget_s: Positive = 0.5
     """time constant with which what speaks for a change is forgotten"""
     warn_relative: Annotated[float, Field(gt=0, le=0.3)] = 0.01
     """change of a comb or of springs from which on there is a warning"""

@@ -43,6 +43,8 @@ CAUSES = 7
 """What may change by itself: each comb, the springs of each chain, the out-of-plane hinges."""
 LEAST_LOSS = 0.1
 """By how much, in variances of the noise, innovations have to be worse with the base before something has changed."""
+MOST_GAIN = 0.5
+"""Pull that a comb which has become stronger need not be asked for: from there on it is told as twice as strong."""
 _PARAMETERS, _CAUSES = np.int32(PARAMETERS), np.int32(CAUSES)  # a processor of 32 bits counts these for less
 AGES = 2
 """Intervals that are remembered: two periods of delay."""
@@ -185,9 +187,10 @@ def _update(adaptation: np.void, state: np.void, axis: int, innovation_m: float)
         told += total * by[i]
         missing += by[i] * (learnt[i] - acting[i])
         since += by[i] * (base[i] - acting[i])
-    noise_m2 = adaptation["variance_m2"][axis] + adaptation["doubt"] * missing * missing
-    if not told > adaptation["least"] * noise_m2:
+    # Not whether the innovation is large: of a device that changes fast only the small ones would be left.
+    if not told > adaptation["least"] * adaptation["variance_m2"][axis]:
         return
+    noise_m2 = adaptation["variance_m2"][axis] + adaptation["doubt"] * missing * missing
     scale = 1.0 / (told + noise_m2)
     for i in range(_PARAMETERS):
         weight = gain[i] * scale
@@ -251,7 +254,8 @@ def _compare(adaptation: np.void, state: np.void, by: Array, since: float, missi
             best, most, change = c + 1, explained / state["answer"][c], state["clue"][c] / state["answer"][c]
     lost = state["left_by_base"] - state["left"]
     if most > adaptation["alone"] * lost and lost > LEAST_LOSS and abs(change) >= adaptation["warn"]:
-        state["cause"], state["change"] = best, change
+        # A comb that has lost a share s has to be asked for s / (1 - s) more: that is what shows.
+        state["cause"], state["change"] = best, change / (1.0 - min(change, MOST_GAIN)) if best <= 3 else change
     else:
         state["cause"], state["change"] = 0, 0.0
 

@@ -50,7 +50,7 @@ def fill_adaptation(
     record["fringe_m"] = FRINGE_M
     record["base_updates"] = max(1, round(config.base_s / bus.period_s))
     record["warn"], record["alone"] = config.warn_relative, config.alone
-    record["forget"] = min(1.0, 3 * bus.period_s / config.forget_s)  # an axis has its turn every third tick
+    record["forget"] = min(1.0, bus.period_s / config.forget_s)
     start = config.start
     record["start"] = 0.0 if start is None else np.array(start.values) / record["spread"]
     record["start_covariance"] = np.eye(learning.PARAMETERS) if start is None else within(start, record["spread"])

@@ -267,16 +267,16 @@ def off_nm(rows, begin_s, end_s):
     return 1e9 * float(np.sqrt((((then["position_m"] - then["reference_m"])[:, :2]) ** 2).sum(axis=1).mean()))
 
 
-@pytest.mark.parametrize("ageing", [{"springs": (-0.02, 0, 0)}, {"combs": (0, 0, -0.02)}])
-def test_a_change_of_two_per_cent_is_followed(ageing):
-    """Within 3 s the circle is as good as before; in the first tenths of a second it was not."""
+@pytest.mark.parametrize(("ageing", "most"), [({"springs": (-0.02, 0, 0)}, 1.2), ({"combs": (0, 0, -0.02)}, 2.5)])
+def test_a_change_of_two_per_cent_is_followed(ageing, most):
+    """In the first tenths of a second the circle is worse by at most so much, and as good as before after 1 s."""
     rows, faults = aged("mild", **ageing)
     assert not faults
     before, at_once, later = (
-        off_nm(rows, AGES_AT_S + begin, AGES_AT_S + end) for begin, end in ((-0.5, 0.0), (0.05, 0.25), (3.0, 3.5))
+        off_nm(rows, AGES_AT_S + begin, AGES_AT_S + end) for begin, end in ((-0.5, 0.0), (0.05, 0.25), (1.0, 1.5))
     )
-    assert at_once > 1.2 * before
-    assert later < 1.2 * before
+    assert 1.05 < at_once / before < most
+    assert 0.9 < later / before < 1.1
 
 
 @pytest.mark.parametrize(("what", "named"), [("springs", 5), ("combs", 3)])
@@ -296,10 +296,8 @@ def test_a_drift_towards_danger_is_told_long_before_it_is_a_fault(what, named, e
     assert 0.01 < lost(told) < most
     assert not faults
     assert lost(later) > 0.06
-    if what == "combs" and end == 0.6:  # of a comb that lost a third, a tenth is told: not understood yet
-        assert 0.09 < -later["warning_share"] < 0.11
-    else:
-        assert (0.85 if end == 0.1 else 0.65) < -later["warning_share"] / lost(later) < 1.1
+    assert 0.85 < -later["warning_share"] / lost(later) < 1.1
+    assert np.abs(rows["position_m"] - rows["reference_m"])[20000:].max() < 0.25e-6
 
 
 @pytest.mark.parametrize("plant", ["nominal", "mild", "harsh"])
