@@ -17,17 +17,16 @@ from two_processes import (
     ROOT,
     assert_0_v_in_the_time_of_drive_frames,
     assert_ended_by_the_controller,
+    assert_ends_without_its_plant,
     assert_led_down_from_outside,
     assert_missed_by_the_node,
     assert_skipped_whole_ticks,
     bench,
-    bench_in,
     changes,
     controller,
     driving,
     is_driving,
     next_with,
-    plant_in,
     stand_still,
 )
 
@@ -166,27 +165,7 @@ def test_a_stopped_controller_goes_on_and_sigterm_ends_it_at_0_v(bench, changes)
 
 
 def test_a_run_whose_plant_is_killed_ends_by_itself_with_a_line_and_is_not_ok(tmp_path):
-    """Nobody is left who could start the amplifier again: half a second after its last heartbeat, by the frames, the
-    run ends. Its scenario has no checks, so it is the fault alone that fails it.
-    """
-    bench_in(tmp_path)
-    words = ("on_slow.toml", "--bus", "slow.toml", "--out", "left", "--replace", "--seconds", "60", "--json")
-    with plant_in(tmp_path) as (plant, changes):
-        changes("pre-operational", False)
-        with UnixBus(f"{tmp_path}/bus") as observer, driving(tmp_path, observer, *words) as run:
-            plant.kill()
-            out, err = run.communicate(timeout=120)
-    assert run.returncode == 1, err
-    assert "the amplifier has fallen silent, so the run ends: start `pkxyz plant` again, then this" in err.splitlines()
-    told = json.loads(out)
-    assert len(told["faults"]) == 1
-    assert not told["ok"]
-    assert not told["interrupted"]
-    assert [(check["name"], check["ok"]) for check in told["checks"]] == [("faults", False)]
-    log = list(can.LogReader(tmp_path / "left" / "frames.log"))
-    heard_s = max(message.timestamp for message in log if message.arbitration_id == HEARTBEAT)
-    assert 0.5 < log[-1].timestamp - heard_s < 0.7
-    assert (tmp_path / "left" / "report.png").is_file()
+    assert_ends_without_its_plant(tmp_path)
 
 
 @pytest.mark.slow

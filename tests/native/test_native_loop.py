@@ -20,6 +20,7 @@ from two_processes import (
     assert_0_v_in_the_time_of_drive_frames,
     assert_damage_was_a_fault,
     assert_ended_by_the_controller,
+    assert_ends_without_its_plant,
     assert_led_down_from_outside,
     assert_missed_by_the_node,
     assert_skipped_whole_ticks,
@@ -249,6 +250,10 @@ def test_a_node_that_is_not_there_is_told_as_by_python_s_loop(bench, tmp_path):
         said.append([line for line in err.splitlines() if not line.startswith("real time")])
     assert said[0] == said[1]
     assert "pkxyz plant" in said[0][-1]
+
+
+def test_a_run_whose_plant_is_killed_ends_by_itself_with_a_line_and_is_not_ok(bench, tmp_path):
+    assert_ends_without_its_plant(tmp_path, "--native")
 
 
 def test_without_a_compiler_a_line_says_what_to_do(bench, tmp_path):

@@ -14,12 +14,13 @@ import numpy as np
 import pytest
 from patience import patient_bus, patient_law
 
+from hil.bus.unix_bus import UnixBus
 from hil.lanes.wall_plant import TRUTH
 from hil.recording.recording import Recording
 from pkxyz_ctrl.safety.modes import Mode
 
 ROOT = Path(__file__).parents[2]
-DRIVE, EMCY = 0x30A, 0x08A
+DRIVE, EMCY, HEARTBEAT = 0x30A, 0x08A, 0x70A
 CRC = 4
 PERIOD_US, DRIVE_TIMEOUT_US = 1000, 20_000
 SCENARIO = """
@@ -150,6 +151,37 @@ def driving(folder, observer, *words):
             run.terminate()
             said.append(run.communicate(timeout=60))
     pytest.fail(f"no voltages came: {said}")
+
+
+def assert_ends_without_its_plant(folder, *words):
+    """A run whose plant is killed ends by itself half a second after its last heartbeat, with a line and not ok: nobody
+    is left who could start the amplifier again. Another node is there all the while. The scenario has no checks, so it
+    is the fault alone that fails it.
+    """
+    bench_in(folder)
+    words = ("on_slow.toml", "--bus", "slow.toml", *words, "--out", "left", "--replace", "--seconds", "60", "--json")
+    with plant_in(folder) as (plant, changes):
+        changes("pre-operational", False)
+        with UnixBus(f"{folder}/bus") as observer, driving(folder, observer, *words) as run:
+            plant.kill()
+            end_s = time.monotonic() + 120
+            while run.poll() is None and time.monotonic() < end_s:
+                observer.send(can.Message(arbitration_id=HEARTBEAT + 1, data=b"\5", is_extended_id=False))
+                time.sleep(0.02)
+            out, err = run.communicate(timeout=1)
+    assert run.returncode == 1, err
+    assert "the amplifier has fallen silent, so the run ends: start `pkxyz plant` again, then this" in err.splitlines()
+    told = json.loads(out)
+    assert len(told["faults"]) == 1
+    assert not told["ok"]
+    assert not told["interrupted"]
+    assert [(check["name"], check["ok"]) for check in told["checks"]] == [("faults", False)]
+    log = list(can.LogReader(folder / "left" / "frames.log"))
+    heard_s = max(message.timestamp for message in log if message.arbitration_id == HEARTBEAT)
+    assert 0.5 < log[-1].timestamp - heard_s < 0.7
+    others = [message for message in log if message.arbitration_id == HEARTBEAT + 1 and message.timestamp > heard_s]
+    assert len(others) > 10
+    assert (folder / "left" / "report.png").is_file()
 
 
 def next_with(bus, can_id):
