@@ -58,8 +58,9 @@ class Adaptation(FrozenModel):
     """most that is learnt of pull, springs, fringe and lift"""
     most_damping: Annotated[float, Field(gt=0, le=10)] = 4.0
     most_delay_s: Annotated[float, Field(gt=0, le=200e-6)] = 100e-6
-    doubt: Annotated[float, Field(ge=0, le=1)] = 0.01
-    """share of an unexpected innovation's square that counts as noise: what no number here explains teaches less"""
+    doubt: Annotated[float, Field(ge=0, le=1)] = 0.1
+    """share of an unexpected innovation's square that counts as noise: what no number here explains teaches less,
+    until a change has been named"""
     drift_per_rts: Positive = 2e-3
     """how much these numbers may change by themselves, in standard deviations per root second: more is followed faster,
     less is less noise"""

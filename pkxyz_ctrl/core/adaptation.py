@@ -190,7 +190,9 @@ def _update(adaptation: np.void, state: np.void, axis: int, innovation_m: float)
     # Not whether the innovation is large: of a device that changes fast only the small ones would be left.
     if not told > adaptation["least"] * adaptation["variance_m2"][axis]:
         return
-    noise_m2 = adaptation["variance_m2"][axis] + adaptation["doubt"] * missing * missing
+    noise_m2 = adaptation["variance_m2"][axis]
+    if state["cause"] == 0:  # what a change explains that has been named is no noise
+        noise_m2 += adaptation["doubt"] * missing * missing
     scale = 1.0 / (told + noise_m2)
     for i in range(_PARAMETERS):
         weight = gain[i] * scale
