@@ -58,6 +58,22 @@ def test_how_well_trajectories_are_followed(scenario: str) -> None:
     assert shown == [float(f"{v:.1f}") for v in rms_nm(scenario)]
 
 
+def test_how_the_laws_follow_a_circle() -> None:
+    """Columns are laws, cells x / y, and of the second row mild; lab."""
+    table = page_lines("docs/understand/laws.md")
+    for start, ways in (
+        ("circle of 4 um, 100 Hz, nominal (nm)", [("circle", "nominal")]),
+        ("the same, mild; lab (nm)", [("circle", "mild"), ("circle_lab", "lab")]),
+    ):
+        row = next(line for line in table.splitlines() if line.startswith(f"| {start}"))
+        for controller, cell in zip(("youla", "lqg", "robust", "open_loop"), row.split("|")[2:], strict=False):
+            for told, (scenario, plant) in zip(cell.split(";"), ways, strict=False):
+                run = hil.run(hil.load_scenario(scenario, plant=plant, controller=controller))
+                x_nm, y_nm, _ = run.summary["rms_error_nm"].values()
+                digits = 1 if "." in told else 0
+                assert f"{x_nm:.{digits}f} / {y_nm:.{digits}f}" == told.strip(), (start, controller)
+
+
 def test_the_tutorial_tells_what_its_commands_print(tmp_path: Path) -> None:
     text = page("docs/learn/index.md")
     assert row_of(text, "`youla`, the default") == [float(f"{v:.1f}") for v in rms_nm("raster_mild")]

@@ -21,7 +21,7 @@ def recorded_frames(setup: Setup) -> tuple[list[Stamped], list[Frame]]:
     """One run in lockstep: the node's frames with their time of arrival in us, and the controller's in order."""
     node_id = setup.gate.node_id
     bases = (cob_id.SENSE_BASE, cob_id.SDO_RESPONSE_BASE, cob_id.HEARTBEAT_BASE, cob_id.EMCY_BASE)
-    of_node = {base + node_id for base in bases}
+    of_node = {base + node_id for base in bases} | {cob_id.sense(node_id, cob_id.SIGNATURE_PDO)}
     came: list[Stamped] = []
     went: list[Frame] = []
 
