@@ -43,8 +43,7 @@ CAUSES = 7
 """What may change by itself: each comb, the springs of each chain, the out-of-plane hinges."""
 LEAST_LOSS = 0.1
 """By how much, in variances of the noise, innovations have to be worse with the base before something has changed."""
-MOST_GAIN = 0.5
-"""Pull that a comb which has become stronger need not be asked for: from there on it is told as twice as strong."""
+_MOST_SPARED = 0.5  # of a comb's pull: one that has become stronger is told as at most twice as strong
 _PARAMETERS, _CAUSES = np.int32(PARAMETERS), np.int32(CAUSES)  # a processor of 32 bits counts these for less
 AGES = 2
 """Intervals that are remembered: two periods of delay."""
@@ -257,7 +256,7 @@ def _compare(adaptation: np.void, state: np.void, by: Array, since: float, missi
     lost = state["left_by_base"] - state["left"]
     if most > adaptation["alone"] * lost and lost > LEAST_LOSS and abs(change) >= adaptation["warn"]:
         # A comb that has lost a share s has to be asked for s / (1 - s) more: that is what shows.
-        state["cause"], state["change"] = best, change / (1.0 - min(change, MOST_GAIN)) if best <= 3 else change
+        state["cause"], state["change"] = best, change / (1.0 - min(change, _MOST_SPARED)) if best <= 3 else change
     else:
         state["cause"], state["change"] = 0, 0.0
 
