@@ -162,8 +162,7 @@ class SimBus(can.BusABC):
 
     @state.setter
     def state(self, new_state: can.BusState) -> None:
-        # what python-can raises for every interface whose state can't be set
-        raise NotImplementedError("the error state follows from what happens on the wire")
+        raise can.CanOperationError("the error state can't be set: it follows from what happens on the wire")
 
     def flush_tx_buffer(self) -> None:
         self.endpoint.flush()

@@ -88,7 +88,7 @@ def _forget_empty(folder: Path) -> None:
     for place in os.scandir(folder):
         if place.is_dir():
             for file in os.scandir(place):
-                if file.stat().st_size == 0:
+                if file.is_file() and file.stat().st_size == 0:
                     os.unlink(file)
 
 

@@ -30,15 +30,17 @@ def calibrated(stage: StageConfig, values: Sequence[float]) -> StageConfig:
     learnt, before = np.asarray(values), stage.calibration or Calibration()
     grown = 1.0 + 0.5 * learnt[learning.FRINGE]
 
-    def each(old: EachChain, first: int, by: float = 1.0) -> EachChain:
-        a, b, c = (float(o * (1.0 + v) * by) for o, v in zip(old, learnt[first : first + 3], strict=True))
+    def each(old: EachChain, by: Array) -> EachChain:
+        a, b, c = (float(o * b) for o, b in zip(old, by, strict=True))
         return a, b, c
+
+    combs, sliders, cranks = (learnt[first : first + 3] for first in (learning.COMB, learning.SLIDER, learning.CRANK))
 
     found = before.model_copy(
         update={
-            "comb_gain": each(before.comb_gain, learning.COMB, float(grown)),
-            "slider_stiffness": each(before.slider_stiffness, learning.SLIDER),
-            "crank_stiffness": each(before.crank_stiffness, learning.CRANK),
+            "comb_gain": each(before.comb_gain, grown / (1.0 - combs)),  # learnt is how much less is asked of it
+            "slider_stiffness": each(before.slider_stiffness, 1.0 + sliders),
+            "crank_stiffness": each(before.crank_stiffness, 1.0 + cranks),
             "link_stiffness": float(before.link_stiffness * (1.0 + learnt[learning.LINK])),
             "lift": float(before.lift + learnt[learning.LIFT]),
         }

@@ -275,7 +275,7 @@ def test_a_change_of_two_per_cent_is_followed(ageing, most):
     before, at_once, later = (
         off_nm(rows, AGES_AT_S + begin, AGES_AT_S + end) for begin, end in ((-0.5, 0.0), (0.05, 0.25), (1.0, 1.5))
     )
-    assert 1.05 < at_once / before < most
+    assert 1.2 < at_once / before < most
     assert 0.9 < later / before < 1.1
 
 
@@ -297,7 +297,8 @@ def test_a_drift_towards_danger_is_told_long_before_it_is_a_fault(what, named, e
     assert not faults
     assert lost(later) > 0.06
     assert 0.85 < -later["warning_share"] / lost(later) < 1.1
-    assert np.abs(rows["position_m"] - rows["reference_m"])[20000:].max() < 0.25e-6
+    ageing = rows[rows["t_us"] > AGES_AT_S * 1e6]
+    assert np.abs(ageing["position_m"] - ageing["reference_m"]).max() < 0.25e-6
 
 
 @pytest.mark.parametrize("plant", ["nominal", "mild", "harsh"])

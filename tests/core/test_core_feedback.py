@@ -43,8 +43,8 @@ def test_ahead_on_the_default_scan():
     first = 2000  # within the scan
     ticks, fine = trajectory.sample(first, 1001, 200), trajectory.sample(first * 200 + 105, 200_000, 1)[::200]
     errors = []
-    for now, after, expected in zip(ticks, ticks[1:], fine, strict=False):
-        feedback.ahead(gains, now, after, out)
+    for begin, end, expected in zip(ticks[:-1], ticks[1:], fine, strict=True):
+        feedback.ahead(gains, begin, end, out)
         errors.append(np.abs(out - expected)[:3].max())
     assert np.median(errors) < 1e-14
     assert np.mean(np.array(errors) > 1e-12) < 0.1

@@ -17,6 +17,8 @@ from pkxyz_ctrl.config.calibration import Calibration
 from pkxyz_ctrl.config.files import CONFIG_DIR, ConfigError, load, plain
 from pkxyz_ctrl.config.stage import StageConfig
 from pkxyz_ctrl.core import tick
+from pkxyz_ctrl.core.adaptation import COMB, PARAMETERS
+from pkxyz_ctrl.design.device_errors import calibrated as learnt_as_calibration
 from pkxyz_ctrl.design.identification.calibrate import SenseGain, calibrate, gains
 from pkxyz_ctrl.design.identification.modal_fit import FitError, ModalFit
 from pkxyz_ctrl.design.law import design_law
@@ -258,3 +260,13 @@ def test_the_section_is_strict(tmp_path, keys, words):
     path.write_text(tomlkit.dumps(plain(DRAWN) | {"calibration": keys}), encoding="utf-8")
     with pytest.raises(ConfigError, match=words):
         Stage.load(path)
+
+
+@given(st.lists(st.floats(-0.35, 0.35), min_size=3, max_size=3))
+def test_a_comb_of_which_less_is_asked_pulls_by_so_much_more(less):
+    """What was learnt scales what is asked of a comb; a device of the calibrated gain then gives what was meant."""
+    values = np.zeros(PARAMETERS)
+    values[COMB : COMB + 3] = less
+    found = learnt_as_calibration(DRAWN, values).calibration
+    assert found is not None
+    assert np.array(found.comb_gain) * (1.0 - np.array(less)) == pytest.approx(np.ones(3), rel=1e-12)

@@ -89,7 +89,7 @@ def test_a_file_that_is_none_is_refused_in_a_line(first, tmp_path, changes, word
 
 def test_a_device_that_could_not_follow_is_refused(first, tmp_path):
     """Combs 35 % weaker and springs 35 % stiffer than drawn: more than 200 V on the way."""
-    weak = {f"comb_gain_{i}": -0.34 for i in (1, 2, 3)}
+    weak = {f"comb_gain_{i}": -0.34 for i in (1, 2, 3)} | {"fringe": -0.34}
     stiff = {f"{kind}_stiffness_{i}": 0.34 for kind in ("slider", "crank") for i in (1, 2, 3)} | {
         "link_stiffness": 0.34
     }

@@ -17,14 +17,13 @@ from pkxyz_ctrl.compiled.kernel_cache import choose_kernel_cache
 choose_kernel_cache()
 _SOURCES = sorted(Path(__file__).parent.glob("*.py"))
 _HOME = os.environ.get("NUMBA_CACHE_DIR")
-_FOLDER = (
-    _HOME and Path(_HOME) / f"exploration-{hashlib.sha256(b''.join(p.read_bytes() for p in _SOURCES)).hexdigest()[:16]}"
-)
+_DIGEST = hashlib.sha256(b"".join(path.read_bytes() for path in _SOURCES)).hexdigest()
+_FOLDER = Path(_HOME) / f"exploration-{_DIGEST[:16]}" if _HOME else None
 
 
 def kernel(function: Callable[..., Any]) -> Any:
     """``function``, compiled, and kept if there is a place."""
-    if not _FOLDER:
+    if _FOLDER is None:
         return numba.njit(error_model="numpy")(function)
     before, numba.config.CACHE_DIR = numba.config.CACHE_DIR, str(_FOLDER)
     try:
