@@ -4,7 +4,7 @@ The names below are the public interface, kept stable by semantic versioning; ev
 
 >>> import hil
 >>> run = hil.run("raster")
->>> run.summary.rows.rms_error_nm
+>>> run.summary["rms_error_nm"]
 >>> run["position_x_m"]
 """
 
@@ -15,6 +15,7 @@ if TYPE_CHECKING:
     from hil.api.design import DesignedLaw as DesignedLaw
     from hil.api.design import design as design
     from hil.api.identify import identify as identify
+    from hil.api.montecarlo import SampledPlants as SampledPlants
     from hil.api.montecarlo import montecarlo as montecarlo
     from hil.api.run import Run as Run
     from hil.api.run import open_run as open_run
@@ -22,16 +23,25 @@ if TYPE_CHECKING:
     from hil.api.tune import tune as tune
     from hil.api.tune import tune_taps as tune_taps
     from hil.lanes.lane import Lane as Lane
+    from hil.recording.journal import RecordingError as RecordingError
     from hil.runs.scenario import Scenario as Scenario
     from hil.runs.scenario import build_scenario as build_scenario
     from hil.runs.scenario import load_scenario as load_scenario
+    from hil.studies.margins.excited import MeasurementError as MeasurementError
     from pkxyz_ctrl.config.files import ConfigError as ConfigError
+    from pkxyz_ctrl.design.identification.modal_fit import FitError as FitError
+    from pkxyz_ctrl.design.model.design_error import DesignError as DesignError
 
 _HOME = {
     "ConfigError": "pkxyz_ctrl.config.files",
+    "DesignError": "pkxyz_ctrl.design.model.design_error",
     "DesignedLaw": "hil.api.design",
+    "FitError": "pkxyz_ctrl.design.identification.modal_fit",
     "Lane": "hil.lanes.lane",
+    "MeasurementError": "hil.studies.margins.excited",
+    "RecordingError": "hil.recording.journal",
     "Run": "hil.api.run",
+    "SampledPlants": "hil.api.montecarlo",
     "Scenario": "hil.runs.scenario",
     "build_scenario": "hil.runs.scenario",
     "design": "hil.api.design",
@@ -46,9 +56,14 @@ _HOME = {
 
 __all__ = [
     "ConfigError",
+    "DesignError",
     "DesignedLaw",
+    "FitError",
     "Lane",
+    "MeasurementError",
+    "RecordingError",
     "Run",
+    "SampledPlants",
     "Scenario",
     "build_scenario",
     "design",

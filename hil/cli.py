@@ -35,6 +35,7 @@ COMMANDS = {
     "emulate": ("hil.commands.emulate:emulate", "The loop with the board emulated."),
     "dbc": ("hil.commands.dbc:dbc", "The DBC of a bus, for CAN tools."),
     "latency": ("hil.commands.latency:latency", "How late this machine wakes up."),
+    "explain": ("hil.commands.explain:explain", "A fault or emergency code in words."),
     "doctor": ("hil.commands.doctor:doctor", "What this machine has and lacks."),
     "paper": ("hil.commands.mechanics:paper", "The paper's numbers beside ours."),
     "workspace": ("hil.commands.mechanics:workspace", "What the platform reaches and can hold."),

@@ -31,6 +31,49 @@ def block(plot: Any, centre: Any, along: Any, length: float, width: float, **col
     plot.add_patch(Polygon(corners, closed=True, **colours))
 
 
+def _lengths(plot: Any, points: tuple[Any, Any, Any, Any], axes: tuple[Any, Any], theme: Theme) -> None:
+    """The lengths and the angle of chain 1: ``points`` base, slider, pin and platform, ``axes`` inward and left."""
+    (base, slider, pin, platform), (e, n) = points, axes
+    for a, b, words, offset in (
+        (base, slider, "$\\lambda_1$", 0.56), (base, np.zeros(2), "$r$", 0.86),
+    ):  # fmt: skip
+        shift = -n * offset
+        arrow(plot, a + shift, b + shift, theme.ink, "<|-|>", 0.9)
+        for end in (a, b):
+            plot.plot(*np.array([end, end + shift * 1.06]).T, color=theme.faint, linewidth=0.5, zorder=1)
+        plot.text(*((a + b) / 2 + shift * 1.0 + [0.07, 0]), words, color=theme.ink, fontsize=12, va="center")
+    plot.text(*(slider * 0.5 + pin * 0.5 + [-0.19, 0.0]), "$L_1$", color=theme.chains[0], fontsize=12, ha="right")
+    plot.text(*(pin * 0.5 + platform * 0.5 + [0.07, -0.06]), "$\\delta$", color=theme.chains[0], fontsize=12)
+    plot.plot(*np.array([slider, slider + e * 0.56]).T, color=theme.ink, linewidth=0.6, linestyle=":", zorder=5)
+    turned = float(np.degrees(np.arctan2(*(pin - slider)[::-1])))
+    plot.add_patch(
+        Arc(tuple(slider), 0.62, 0.62, theta1=min(turned, 90), theta2=max(turned, 90), color=theme.ink, lw=0.9)
+    )
+    x, y = slider
+    plot.text(x + 0.30, y + 0.27, "$\\theta_1$", color=theme.ink, fontsize=11)
+    plot.plot([x + 0.29, x + 0.05], [y + 0.30, y + 0.30], color=theme.ink, linewidth=0.6, zorder=5)
+
+
+def _directions(plot: Any, inward: Any, left: Any, theme: Theme) -> None:
+    """The unit vectors of the chains."""
+    for i, colour in enumerate(theme.chains):
+        at = -inward[i] * 1.2 + left[i] * 0.30
+        arrow(plot, at, at + inward[i] * 0.36, colour)
+        plot.text(
+            *(at + inward[i] * 0.18 + left[i] * 0.14),
+            f"$e_{i + 1}$",
+            color=colour,
+            fontsize=11,
+            ha="center",
+            va="center",
+        )
+    at = -inward[0] * 1.2 + left[0] * 0.30
+    arrow(plot, at, at + left[0] * 0.3, theme.chains[0])
+    plot.text(
+        *(at + left[0] * 0.30 + [-0.1, 0.0]), "$n_1$", color=theme.chains[0], fontsize=11, ha="center", va="center"
+    )
+
+
 def from_above(plot: Any, stage: Stage, theme: Theme) -> None:
     """Plan view in mm about the centre C: sliders, cranks, the links' projections, the platform."""
     g = stage.geometry
@@ -62,43 +105,9 @@ def from_above(plot: Any, stage: Stage, theme: Theme) -> None:
         plot.text(*(base + away), f"comb {i + 1}", color=colour, ha="center", va="center", fontsize=10)
     corners = [p * MM + 0.062 * np.array([np.cos(a), np.sin(a)]) for a in np.deg2rad([30, 150, 270])]
     plot.add_patch(Polygon(corners, closed=True, facecolor=theme.wash, edgecolor=theme.ink, linewidth=1.4, zorder=6))
-    e, n = inward[0], left[0]
-    base, pin = -rest.base_radius_m * e * MM, (p - delta * e) * MM
-    slider = base + lambdas[0] * e * MM
-    for a, b, words, offset in (
-        (base, slider, "$\\lambda_1$", 0.56), (base, np.zeros(2), "$r$", 0.86),
-    ):  # fmt: skip
-        shift = -n * offset
-        arrow(plot, a + shift, b + shift, theme.ink, "<|-|>", 0.9)
-        for end in (a, b):
-            plot.plot(*np.array([end, end + shift * 1.06]).T, color=theme.faint, linewidth=0.5, zorder=1)
-        plot.text(*((a + b) / 2 + shift * 1.0 + [0.07, 0]), words, color=theme.ink, fontsize=12, va="center")
-    plot.text(*(slider * 0.5 + pin * 0.5 + [-0.19, 0.0]), "$L_1$", color=theme.chains[0], fontsize=12, ha="right")
-    plot.text(*(pin * 0.5 + p * MM * 0.5 + [0.07, -0.06]), "$\\delta$", color=theme.chains[0], fontsize=12)
-    plot.plot(*np.array([slider, slider + e * 0.56]).T, color=theme.ink, linewidth=0.6, linestyle=":", zorder=5)
-    turned = float(np.degrees(np.arctan2(*(pin - slider)[::-1])))
-    plot.add_patch(
-        Arc(tuple(slider), 0.62, 0.62, theta1=min(turned, 90), theta2=max(turned, 90), color=theme.ink, lw=0.9)
-    )
-    x, y = slider
-    plot.text(x + 0.30, y + 0.27, "$\\theta_1$", color=theme.ink, fontsize=11)
-    plot.plot([x + 0.29, x + 0.05], [y + 0.30, y + 0.30], color=theme.ink, linewidth=0.6, zorder=5)
-    for i, colour in enumerate(theme.chains):
-        at = -inward[i] * 1.2 + left[i] * 0.30
-        arrow(plot, at, at + inward[i] * 0.36, colour)
-        plot.text(
-            *(at + inward[i] * 0.18 + left[i] * 0.14),
-            f"$e_{i + 1}$",
-            color=colour,
-            fontsize=11,
-            ha="center",
-            va="center",
-        )
-    at = -inward[0] * 1.2 + left[0] * 0.30
-    arrow(plot, at, at + left[0] * 0.3, theme.chains[0])
-    plot.text(
-        *(at + left[0] * 0.30 + [-0.1, 0.0]), "$n_1$", color=theme.chains[0], fontsize=11, ha="center", va="center"
-    )
+    base, pin = -rest.base_radius_m * inward[0] * MM, (p - delta * inward[0]) * MM
+    _lengths(plot, (base, base + lambdas[0] * inward[0] * MM, pin, p * MM), (inward[0], left[0]), theme)
+    _directions(plot, inward, left, theme)
     plot.plot(0, 0, "+", color=theme.ink, markersize=9, zorder=8)
     plot.text(-0.07, -0.05, "$C$", color=theme.ink, fontsize=11, ha="right", va="top", zorder=8)
     plot.text(*(p * MM + [0, 0.47]), "platform, at $p$", color=theme.ink, fontsize=10, ha="center", zorder=8)

@@ -56,8 +56,8 @@ API: dict[str, tuple[str, ...]] = {
 """What a program may rely on, by task."""
 
 _UNITS = {
-    "m": "m", "s": "s", "us": "µs", "ms": "ms", "v": "V", "n": "N", "f": "F", "hz": "Hz", "kg": "kg", "pa": "Pa",
-    "rad": "rad", "a": "A", "nm": "nm", "um": "µm",
+    "m": "m", "s": "s", "us": "us", "ms": "ms", "v": "V", "n": "N", "f": "F", "hz": "Hz", "kg": "kg", "pa": "Pa",
+    "rad": "rad", "a": "A", "nm": "nm", "um": "um",
 }  # fmt: skip
 
 

@@ -196,6 +196,19 @@ def measured(name: str) -> str:
     return str(blocks[name])
 
 
+def made() -> str:
+    """The pages that are made from the code."""
+    return table(
+        ["made from the code", "holds"],
+        [
+            ["[Commands](commands.md)", "every command with its options"],
+            ["[Configuration files](configs.md)", "every key with unit and range"],
+            ["[Columns of a recording](recording.md)", "every column with its unit"],
+            ["[Python](api.md)", "the public interface"],
+        ],
+    )
+
+
 def plan() -> str:
     """What many devices take on many machines."""
     return table(["what", "how known", "value"], cluster_plan.rows())
@@ -203,6 +216,7 @@ def plan() -> str:
 
 BUILT = {
     "rooms": rooms,
+    "made": made,
     "plan": plan,
     **{name: partial(measured, name) for name in ("quality", "beside", "speed", "share", "parts", "floor")},
     "trips": fault_codes.trips_table,

@@ -16,6 +16,7 @@ from hil.recording.recording import COLUMNS, Recording
 from hil.runs.run import run_in_memory, run_into
 from hil.runs.run_folder import RECORDING, SUMMARY, RunFolder
 from hil.runs.scenario import Scenario, load_scenario
+from pkxyz_ctrl.config.files import ConfigError
 from pkxyz_ctrl.loop.row import ROW, columns
 
 if TYPE_CHECKING:
@@ -92,12 +93,21 @@ def run(
     ``on_progress`` is told the ticks done and in all. Raises ``ConfigError`` for what can't be run.
     """
     loaded = scenario if isinstance(scenario, Scenario) else load_scenario(scenario)
+    chosen = _in_process(lane)
     if out is None:
-        summary, rows = run_in_memory(loaded, Lane(lane), on_progress)
+        summary, rows = run_in_memory(loaded, chosen, on_progress)
         return Run(summary.as_json(), rows, None)
     folder = RunFolder(Path(out))
-    draw(folder, run_into(folder, loaded, Lane(lane), on_progress))
+    draw(folder, run_into(folder, loaded, chosen, on_progress))
     return open_run(folder.path)
+
+
+def _in_process(lane: Lane | str) -> Lane:
+    chosen = Lane.named(lane)
+    if chosen not in (Lane.FAST, Lane.LOCKSTEP):
+        other = {Lane.WALL: "pkxyz run", Lane.EMULATED: "pkxyz emulate"}[chosen]
+        raise ConfigError(f"the {chosen} lane takes processes of its own: `{other}`, then hil.open_run")
+    return chosen
 
 
 def open_run(folder: str | Path) -> Run:

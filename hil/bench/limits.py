@@ -52,7 +52,7 @@ def bus_cycle() -> list[Figure]:
     rates = can.nominal_bitrate_bit_per_s, can.data_bitrate_bit_per_s
     frames = ((cob_id.SYNC, 1), (cob_id.SENSE_BASE + node_id, 8), (cob_id.DRIVE_BASE + node_id, 8))
     ranges = [frame_range_us(can_id, length, *rates, is_fd=True) for can_id, length in frames]
-    gap_us = INTERFRAME_BITS * 1e6 / rates[0]  # within which turn-around and computing are free
+    gap_us = INTERFRAME_BITS * 1e6 / rates[0]  # within which response time and computing are free
     waits_us = max(0.0, can.turnaround_us - gap_us) + max(0.0, can.compute_us - gap_us)
     shortest, longest = (sum(r[k] for r in ranges) + waits_us for k in (0, 1))
     return [

@@ -43,7 +43,7 @@ def replay(
         print(f"pkxyz: {error}", file=sys.stderr)
         raise typer.Exit(2) from None
     if as_json:
-        print(json.dumps(_plain(result, folder), allow_nan=False))
+        print(json.dumps(_as_json(result, folder), allow_nan=False))
     else:
         _show(result)
     raise typer.Exit(0 if result.sound else 1)
@@ -56,7 +56,7 @@ def _with_progress(path: Path, controller: "ControllerConfig | None", *, quiet: 
         return played(path, controller, tell)
 
 
-def _plain(result: "Replay", folder: Path) -> dict[str, object]:
+def _as_json(result: "Replay", folder: Path) -> dict[str, object]:
     def number(value: float) -> float | str:
         return value if math.isfinite(value) else str(value)
 

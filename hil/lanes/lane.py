@@ -1,6 +1,7 @@
 """The ways in which a loop is closed, by name."""
 
 from enum import StrEnum
+from typing import Self
 
 
 class Lane(StrEnum):
@@ -12,3 +13,13 @@ class Lane(StrEnum):
     FAST = "fast"
     EMULATED = "emulated"
     WALL = "wall"
+
+    @classmethod
+    def named(cls, name: str) -> Self:
+        """The lane of a name. Raises ``ConfigError`` with those that there are."""
+        try:
+            return cls(name)
+        except ValueError:
+            from pkxyz_ctrl.config.files import ConfigError  # slow to load, and rarely needed
+
+            raise ConfigError(f"no lane {name!r}; there are: {', '.join(cls)}") from None

@@ -218,7 +218,7 @@ class AmplifierNode:
     # -- process data ------------------------------------------------------------------------------------------------
 
     def _on_sync(self, data: bytes, t_us: int) -> None:
-        """Apply the last valid drive PDO, sample, and have the sense PDO sent after the turn-around."""
+        """Apply the last valid drive PDO, sample, and have the sense PDO sent after the response time."""
         if data != self._sync_expected and not self._is_sync(data, t_us):
             self._count_silence(t_us)
             return

@@ -45,7 +45,7 @@ NODE_MEMORY = np.dtype(
         ("good_us", "i8"),  # from here on a good frame ends an error that is present
         ("sync_us", "i8"),  # of the last SYNC
         ("cycle_us", "i8"),  # between the last two
-        ("due_us", "i8"),  # of the frame in the turn-around; NEVER_US: there is none
+        ("due_us", "i8"),  # of the frame that waits for the response time; NEVER_US: none does
         ("output", "i4", (3,)),  # what the converters have
         ("pending", "i4", (3,)),
         ("is_pending", "i4"),

@@ -1,4 +1,4 @@
-"""Transmission of the sense PDO: sampled at the SYNC, sent after the turn-around time."""
+"""Transmission of the sense PDO: sampled at the SYNC, sent after the response time."""
 
 import struct
 from collections.abc import Callable
@@ -61,7 +61,7 @@ class SenseTransmitter:
         self._waits_for: bytes | None = None  # a SYNC with this, before anything is sampled
         self.sync_us = 0
         self.cycle_us = 0  # between the last two SYNCs
-        self.due_us: int | None = None  # of the frame in the turn-around
+        self.due_us: int | None = None  # of the frame that waits for the response time
         self.counts = (0, 0, 0)  # last sample
         self.counter = 0  # alive counter of the last frame
         self.crc = 0
@@ -103,7 +103,7 @@ class SenseTransmitter:
             self._event.set(self._clock.now_us + self._event_us)
 
     def stop(self) -> None:
-        """The node has left operational: what is in the turn-around is not sent."""
+        """The node has left operational: what waits for the response time is not sent."""
         self._running = False
         self.due_us = None
         self._event.cancel()

@@ -3,6 +3,8 @@
 from enum import StrEnum
 from typing import TYPE_CHECKING
 
+from hil.lanes.lane import Lane
+
 if TYPE_CHECKING:
     from pkxyz_ctrl.config.bus import BusConfig
 
@@ -10,8 +12,8 @@ if TYPE_CHECKING:
 class InProcessLane(StrEnum):
     """Those that one process closes by itself, as a choice at the terminal."""
 
-    LOCKSTEP = "lockstep"
-    FAST = "fast"
+    LOCKSTEP = Lane.LOCKSTEP.value
+    FAST = Lane.FAST.value
 
 
 class Tones(StrEnum):

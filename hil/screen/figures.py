@@ -16,7 +16,7 @@ def error_lines(rows: "RowFigures", errors_are_of: str) -> Iterator[str]:
     for measured, words in (
         (rows.rms_error_nm, "rms error while scanning"),
         (rows.hold_rms_nm, "rms error in holds"),
-        (rows.hold_noise_nm, "deviation in holds"),
+        (rows.hold_noise_nm, "noise in holds"),
     ):
         if measured:
             yield f"{words}{by}, x / y / z: {' / '.join(f'{value:.2f}' for value in measured.values())} nm"
@@ -38,8 +38,9 @@ def loss_lines(loop: "LoopFigures") -> Iterator[str]:
 
 
 def where_to_read(faults: Iterable[str]) -> str | None:
-    """A line that leads from the fault codes, which stand in brackets in these texts, to their causes and remedies."""
-    codes = dict.fromkeys(re.findall(r"\(([A-Z]+(?:_[A-Z0-9]+)*)\)", " ".join(faults)))
-    if not codes:
-        return None
-    return "usual causes, and what clears them: docs/do/troubleshooting.md" + ", ".join(f"#{c.lower()}" for c in codes)
+    """A command that leads from the codes in these texts, of faults in brackets and of emergencies, to their causes and
+    remedies.
+    """
+    found = re.findall(r"\(([A-Z]+(?:_[A-Z0-9]+)*)\)|EMCY (0x[0-9A-F]{4})", " ".join(faults))
+    codes = dict.fromkeys(fault or emergency for fault, emergency in found)
+    return f"usual causes, and what clears them: `pkxyz explain {' '.join(codes)}`" if codes else None

@@ -10,7 +10,7 @@ def lane_on(bus: BusConfig, lane: Lane | str | None, plant: str | None) -> Lane:
     lane elsewhere. Raises ``ConfigError`` where bus, lane and the ``plant`` that was named do not go together.
     """
     leads_out = bus.can is not None and bus.can.interface != "pkxyz-sim"
-    chosen = Lane(lane) if lane is not None else Lane.WALL if leads_out else Lane.FAST
+    chosen = Lane.named(lane) if lane is not None else Lane.WALL if leads_out else Lane.FAST
     if (chosen == Lane.WALL) != leads_out:
         simulated = "--bus fd_5k, classic_2k or local_20k is simulated"
         raise ConfigError(

@@ -115,8 +115,8 @@ def _left_alone_us(lane: np.void, memory: np.void) -> int:
 
 @njit(cache=True, error_model="numpy")
 def happen(lane: np.void, node: np.void, memory: np.void, stage: Stage, line: Line, now_us: int) -> bool:
-    """What is due now: a frame has ended, the node's turn-around, or at rest its heartbeat. False for two at once, and
-    for something else.
+    """What is due now: a frame has ended, the node's response time has, or at rest its heartbeat. False for two at
+    once, and for something else.
     """
     wire = lane["wire"][0]
     if wire["end_us"] != now_us:

@@ -16,6 +16,8 @@ from typing import Annotated, Any, TypeVar
 import tomlkit
 from pydantic import AfterValidator, BaseModel, ConfigDict, Field, ValidationError
 
+from pkxyz_ctrl.config.refused import reason
+
 _PACKAGED = Path(__file__).parents[1] / "configs"
 CONFIG_DIR = _PACKAGED if _PACKAGED.is_dir() else Path(__file__).parents[2] / "configs"
 """Where the shipped configuration files live: inside an installed wheel, or beside the packages in a checkout."""
@@ -97,10 +99,12 @@ def read_bounded(path: str | Path, most_bytes: int) -> bytes:
             content = file.read(most_bytes + 1)
     except FileNotFoundError:
         raise ConfigError(f"{path}: no such file") from None
-    except (OSError, ValueError) as error:  # ValueError: a NUL in the path
+    except OSError as error:
+        raise ConfigError(f"{str(path)!r}: cannot be read: {reason(error)}") from None
+    except ValueError as error:  # a NUL in the path
         if isinstance(error, ConfigError):
             raise
-        raise ConfigError(f"{str(path)!r}: cannot be read: {getattr(error, 'strerror', None) or error}") from None
+        raise ConfigError(f"{str(path)!r}: cannot be read: {error}") from None
     if len(content) > most_bytes:
         raise ConfigError(
             f"{path}: is larger than {most_bytes * 1e-6:g} MB, the most that is read; give a smaller file"

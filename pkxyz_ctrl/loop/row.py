@@ -16,7 +16,7 @@ CONTROLLER_FIELDS = [
     ("request", "i4"),  # safety.modes.Event that was asked for from outside
     ("event", "i4"),  # safety.modes.Event that this tick handled last: of the request, by itself, or a trip
     ("output", "i4"),  # bits of triggers for the node's digital outputs, meant for the next SYNC
-    ("trips", "i8"),  # safety.monitors.Trip bits raised in this tick
+    ("trips", "i8"),  # safety.trips.Trip bits raised in this tick
     ("outside_trips", "i8"),  # those of them that came from outside the cycle: the gate, an operator
     ("sense_status", "i4"),  # bits of the driver about the sense frame of this tick
     ("node_events", "i4"),  # bits of the driver: what the supervision of the node saw
@@ -26,9 +26,9 @@ CONTROLLER_FIELDS = [
     ("solver_iterations", "i4"),  # of the predictive law's solver; 0 without one, negative if its answer was not used
     ("quiet", "i4"),  # 1: quiet holds are asked for
     ("warning", "i4"),  # 0, or what has changed since it was learnt: 1 to 3 a comb, 4 to 6 a chain's springs, 7 hinges
-    ("output_acting", "i4"),  # those that the node was sent, as of this SYNC
+    ("output_acting", "i4"),  # bits of triggers that the node was sent, as of this SYNC
     ("output_late_ns", "i4"),  # how long before it acts the position of this tick's trigger is passed
-    ("warning_share", "f8"),  # by how much, relative
+    ("warning_share", "f8"),  # by how much what the warning names has changed, relative
     ("sense_count", "i4", (3,)),  # of the sense frame, as it was believed
     ("drive_count", "i4", (3,)),  # goes to the combs at the next SYNC
     ("reference_m", *_VECTOR),  # set-point at the sample of this tick

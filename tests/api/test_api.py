@@ -1,8 +1,11 @@
 """The public interface of ``hil``: what it promises, without a name that begins with an underscore."""
 
 import ast
+import builtins
+import re
 import subprocess
 import sys
+import tomllib
 from collections.abc import Callable
 from pathlib import Path
 
@@ -13,6 +16,7 @@ import hil
 from pkxyz_ctrl.config.files import ConfigError
 from pkxyz_ctrl.loop.row import ROW
 
+ROOT = Path(__file__).parents[2]
 BRIEF = {
     "name": "brief", "duration_s": 0.4, "seed": 1, "stage": "reconstructed", "plant": "nominal", "controller": "lqg",
     "bus": "fd_5k", "reference": [{"kind": "hold", "duration_s": 0.1}],
@@ -30,6 +34,41 @@ def test_every_public_name_is_there_and_described() -> None:
     assert set(hil.__all__) <= set(dir(hil))
     with pytest.raises(AttributeError, match="no attribute 'nonsense'"):
         hil.nonsense  # noqa: B018
+
+
+def test_its_first_example_runs(capsys: pytest.CaptureFixture[str]) -> None:
+    """Line by line, as somebody types it."""
+    shown = [line.removeprefix(">>> ") for line in (hil.__doc__ or "").splitlines() if line.startswith(">>> ")]
+    names: dict[str, object] = {}
+    for line in shown:
+        exec(compile(line, "<example>", "single"), names)
+    said = capsys.readouterr().out
+    assert len(shown) >= 4
+    assert "'x': " in said
+    assert "array([" in said
+
+
+@pytest.mark.parametrize(("lane", "words"), [("lockstp", "there are: lockstep, fast"), ("wall", "pkxyz run"),
+                                             ("emulated", "pkxyz emulate")])  # fmt: skip
+def test_a_lane_that_is_not_to_be_had_here_is_refused(lane: str, words: str) -> None:
+    with pytest.raises(hil.ConfigError, match=words):
+        hil.run(hil.build_scenario(BRIEF), lane=lane)
+
+
+def test_what_is_raised_can_be_caught_by_its_public_name() -> None:
+    for function in (hil.run, hil.open_run, hil.design, hil.tune, hil.identify, hil.montecarlo):
+        for name in re.findall(r"``(\w+Error)``", function.__doc__ or ""):
+            assert name in hil.__all__ or hasattr(builtins, name), f"{function.__name__}: {name}"
+
+
+def test_versions_are_one() -> None:
+    """Of the package, of what is cited, and of the newest entry of the changelog."""
+    package = tomllib.loads((ROOT / "pyproject.toml").read_text(encoding="utf-8"))["project"]["version"]
+    cited = re.search(r"^version: (.*)$", (ROOT / "CITATION.cff").read_text(encoding="utf-8"), re.MULTILINE)
+    newest = re.search(r"^## ([\d.]+)", (ROOT / "CHANGELOG.md").read_text(encoding="utf-8"), re.MULTILINE)
+    assert cited is not None
+    assert newest is not None
+    assert [cited[1], newest[1]] == [package, package]
 
 
 def test_importing_it_loads_nothing_heavy() -> None:

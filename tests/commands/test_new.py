@@ -102,11 +102,23 @@ def test_the_hint_of_a_monte_carlo_study_is_a_command_that_runs(tmp_path):
     assert (tmp_path / "mc" / "seed-1" / "report.png").is_file()
 
 
-def test_a_fault_leads_to_its_place_on_the_troubleshooting_page():
-    faults = ["at 0.5 s: Sense comb 2 repeats (SENSE_FROZEN_2): ...", "Drive comb 1 pulls (COMB_FORCE_1): ... (x2)"]
+def test_a_fault_leads_to_what_explains_it(tmp_path):
+    faults = [
+        "at 0.5 s: Sense comb 2 repeats (SENSE_FROZEN_2): ...\nEMCY 0x8130: heartbeat",
+        "comb 1 (COMB_FORCE_1): (x2)",
+    ]
     line = where_to_read(faults)
     assert line is not None
-    assert line.endswith("docs/do/troubleshooting.md#sense_frozen_2, #comb_force_1")
+    command = re.search("`pkxyz (.*)`", line)
+    assert command is not None
+    assert command[1] == "explain SENSE_FROZEN_2 0x8130 COMB_FORCE_1"
+    told = pkxyz(*shlex.split(command[1]), cwd=tmp_path)
+    assert told.returncode == 0, told.stderr
+    assert [told.stdout.count(words) for words in ("what clears it: ", "the controller died", "COMB_FORCE_1: ")] == [
+        3,
+        1,
+        1,
+    ]
     assert where_to_read(["the node ended (in the middle)"]) is None
 
 

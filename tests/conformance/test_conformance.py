@@ -307,7 +307,7 @@ def test_over_a_python_can_bus_the_lines_are_the_same() -> None:
 
 
 def test_latency_is_that_of_the_wire() -> None:
-    """SYNC 33 or 34 us, turn-around 2 us, sense PDO about 48 us: nothing is faster, or in between."""
+    """SYNC 33 or 34 us, response time 2 us, sense PDO about 48 us: nothing is faster, or in between."""
     line = next(line for line in run_all(talk_to(AmplifierNode)) if line.name == "latency")
     words = line.got.replace(",", "").split()
     low, high = int(words[words.index("minimum") + 1]), int(words[words.index("maximum") + 1])

@@ -74,6 +74,12 @@ def test_the_blocks_of_a_page_run_in_order(page: Path, env: dict[str, str], tmp_
 
 
 @pytest.mark.parametrize("page", PAGES, ids=IDS)
+def test_a_comment_beside_a_command_fits_a_window(page: Path) -> None:
+    lines = [line for b in blocks(page) for line in b.text.splitlines() if re.search(r"\S\s+# ", line)]
+    assert [line for line in lines if len(line) > 100] == []
+
+
+@pytest.mark.parametrize("page", PAGES, ids=IDS)
 def test_tables_of_configuration_are_toml(page: Path) -> None:
     for block in blocks(page):
         if block.language == "toml" and block.reason is None:

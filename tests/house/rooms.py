@@ -131,8 +131,8 @@ HOUSE: Mapping[str, Room] = MappingProxyType({
         "pkxyz_ctrl.*", "hil.lanes", "hil.conformance", "hil.operate", "hil.server", "hil.screen",
     )),
     "hil": Room((
-        "pkxyz_ctrl.*", "hil.lanes", "hil.runs", "hil.screen", "hil.api", "hil.commands.studies", "hil.commands",
-        "hil.commands.operation",
+        "pkxyz_ctrl.*", "hil.recording", "hil.lanes", "hil.runs", "hil.studies.margins", "hil.screen", "hil.api",
+        "hil.commands.studies", "hil.commands", "hil.commands.operation",
     )),
 })  # fmt: skip
 

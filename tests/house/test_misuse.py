@@ -98,7 +98,7 @@ def test_a_disk_that_refuses_is_one_line_and_other_errors_of_the_system_are_not_
 
 def test_there_is_one_way_from_an_error_of_the_system_to_words():
     """``reason``; beside it stand what has no OSError (errno alone, decoding) and python-can's own errors."""
-    others = {"recording.py", "realtime.py", "files.py", "unix_bus.py", "refused.py", "can_port.py"}
+    others = {"recording.py", "realtime.py", "unix_bus.py", "refused.py", "can_port.py"}
     found = {path.name for top in ("hil", "pkxyz_ctrl", "sim") for path in (ROOT / top).rglob("*.py")
              if "strerror" in path.read_text(encoding="utf-8")}  # fmt: skip
     assert found == others

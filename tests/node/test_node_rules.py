@@ -55,7 +55,7 @@ class Twin:
         return True
 
     def answer(self) -> None:
-        """What surrounds the rules at a SYNC: the plant, and the turn-around."""
+        """What surrounds the rules at a SYNC: the plant, and the response time."""
         work, rig, memory = self.work, self.rigs[0], self.work.memory[0]
         a, b, c = memory["output"].tolist()
         memory["count"] = rig.plant.exchange(rig.now_us, (a, b, c), sample=True)

@@ -38,7 +38,7 @@ class KeptOutcomes(Kept[str, tuple[str, Outcome]]):
 
     def __init__(self, path: Path) -> None:
         """Raises ``ConfigError`` for a file of another kind."""
-        super().__init__(path, {"digest": _SAVED_AS}, lambda value: value[0], _read, _plain)
+        super().__init__(path, {"digest": _SAVED_AS}, lambda value: value[0], _read, _as_json)
 
 
 def break_all(
@@ -105,7 +105,7 @@ def _digest(described: dict[str, Any], case: Case) -> str:
     return config.digest({"scenario": described, "case": repr(case), "version": version})
 
 
-def _plain(value: tuple[str, Outcome]) -> dict[str, Any]:
+def _as_json(value: tuple[str, Outcome]) -> dict[str, Any]:
     return {"run": value[0], **as_json(value[1])}
 
 

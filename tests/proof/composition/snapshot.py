@@ -138,7 +138,7 @@ RULES = {
     # any counter may come first once drive frames are let in again
     ("DriveReceiver", "counter"): f"None if {{x}} is None or {DRIVE_ID} not in node._receivers"
     " else {x} - drive & 255",
-    # measured anew at the next SYNC, read in the turn-around behind it: is the next heartbeat due before the next SYNC?
+    # measured anew at the next SYNC, read at the response behind it: is the next heartbeat due before the next SYNC?
     ("SenseTransmitter", "cycle_us"): f"min({{x}}, {LONG_US}) if node._sense.due_us is not None else 0",
     ("", "_sync_expected"): "{x} and ({x}[0] - sync) % 240",
     ("EmergencyProducer", "_active"): "tuple(sorted(map(int, {x})))",
