@@ -7,25 +7,9 @@ import numpy as np
 from matplotlib.figure import Figure
 from numpy.typing import NDArray
 
-from hil.pictures.style import (
-    BLUE,
-    FAINT,
-    GREEN,
-    INK,
-    LABEL_PT,
-    ORANGE,
-    PINK,
-    SKY,
-    SMALL_PT,
-    TINY_PT,
-    VERMILION,
-    dress,
-    save,
-    sheet,
-)
+from hil.pictures.style import BLUE, LABEL_PT, SMALL_PT, TINY_PT, dress, save, sheet
 from hil.studies.compare import Compared
 
-COLOURS = (BLUE, SKY, GREEN, VERMILION, FAINT, PINK, ORANGE, INK)
 _BINS = 700
 _SHOWN = {"rms_error_nm": "rms while scanning", "hold_noise_nm": "hold noise"}
 
@@ -42,7 +26,7 @@ def draw(runs: Sequence[Compared], title: str, path: Path) -> None:
         first = first or axes
         size = np.linalg.norm(run.error_nm, axis=1)
         t_s, top = _envelope(run.t_s, size)
-        axes.fill_between(t_s, np.minimum(top, largest), color=COLOURS[n % len(COLOURS)], lw=0)
+        axes.fill_between(t_s, np.minimum(top, largest), color=BLUE, lw=0)
         axes.set_ylim(0, largest)
         axes.set_ylabel(run.controller, rotation=0, ha="right", va="center", fontsize=SMALL_PT)
         dress(axes, "time of the trajectory (s)" if n == len(shown) - 1 else "", grid="y")
@@ -65,9 +49,9 @@ def _bars(figure: Figure, grid: object, shown: Sequence[Compared]) -> None:
         for n, run in enumerate(shown):
             if not run.figures.get(name):
                 continue
-            value, colour = max(run.figures[name].values()), COLOURS[n % len(COLOURS)]
+            value = max(run.figures[name].values())
             row = rows[n] - 0.17 + 0.34 * k
-            axes.plot(value, row, "os"[k], color=colour, markerfacecolor=colour if k == 0 else "white", markersize=6)
+            axes.plot(value, row, "os"[k], color=BLUE, markerfacecolor=BLUE if k == 0 else "white", markersize=6)
             text = f"{value:.3g} {words}" if value < 1000.0 else f"{value:.0f} {words}"
             axes.annotate(text, (value, row), (7, 0), textcoords="offset points", va="center", fontsize=TINY_PT)
     axes.set_yticks(rows, [run.controller for run in shown], fontsize=SMALL_PT)
