@@ -3,8 +3,8 @@
     python benchmarks/endurance.py [--minutes 10] [--bus unix_2k] [--out docs/figures/endurance.json]
 
 Circles all the while, over Unix sockets, with the garbage collector off, as ever in a run at rate. Once a second:
-resident memory of controller, plant and the recording's writer; blocks that Python has allocated; bytes that
-tracemalloc counts, which slows the loop a little. Writes JSON and, beside it, a picture; exit code 1 if something grew.
+memory of controller, plant and the recording's writer that is their own, not that of files which they have touched;
+blocks that Python has allocated; bytes that tracemalloc counts, which slows the loop a little. Writes JSON and, beside it, a picture; exit code 1 if something grew.
 Monitors of punctuality are off, and the node is patient; where a busy machine loses frames all the same, the fault is
 cleared a second later, since a loop in FAULT would show nothing. What a fault and its clear leave behind, a sentence,
 the emergencies, the garbage of a start-up, is counted apart.
@@ -89,7 +89,7 @@ class Witness(WallRecorder):
         self.clears = 0
         self.closed_ticks = self.skipped_ticks = self.ticks = self.count = 0
         self.notes = np.zeros((ticks // self._every + 1, 6), np.int64)
-        """three resident kB, blocks, traced bytes, clears"""
+        """three own kB, blocks, traced bytes, clears"""
 
     def watch(self, plant_pid: int, rig: WallRig) -> None:
         """Whose memory to look at, besides that of the two processes that are known here; whose faults to clear."""
@@ -106,7 +106,8 @@ class Witness(WallRecorder):
             self._left = self._every
             note = self.notes[self.count]
             for place, file in enumerate(self._files):
-                note[place] = 4 * int(os.pread(file, 100, 0).split()[1])
+                resident, of_files = map(int, os.pread(file, 100, 0).split()[1:3])
+                note[place] = 4 * (resident - of_files)
             note[3], note[4] = sys.getallocatedblocks(), tracemalloc.get_traced_memory()[0]
             self.count += 1
             if self._rig is not None and self._rig.controller.mode in (Mode.FAULT, Mode.BOOT):
@@ -168,7 +169,7 @@ def run(minutes: float, bus: str) -> dict[str, Any]:
         "clears": recorder.clears,
         "cleared_s": np.flatnonzero(notes[:, 5]).tolist(),
         "machine": machine,
-        "resident_kb": {name: notes[:, place].tolist() for place, name in enumerate(WHO)},
+        "own_kb": {name: notes[:, place].tolist() for place, name in enumerate(WHO)},
         "allocated_blocks": notes[:, 3].tolist(),
         "traced_bytes": notes[:, 4].tolist(),
     }
@@ -208,7 +209,7 @@ def judged(result: dict[str, Any]) -> dict[str, Any]:
         half = len(kept) // 2
         return float(np.median(kept[half:]) - np.median(kept[:half])) if half else float("nan")
 
-    growth = {f"{name}_kb": grown(values) for name, values in result["resident_kb"].items()}
+    growth = {f"{name}_kb": grown(values) for name, values in result["own_kb"].items()}
     growth |= {"blocks": grown(result["allocated_blocks"]), "traced_kb": grown(result["traced_bytes"]) / 1000}
     limits = dict.fromkeys((f"{name}_kb" for name in WHO), GROWTH_MAX_KB)
     limits |= {"blocks": GROWTH_MAX_BLOCKS, "traced_kb": GROWTH_MAX_TRACED_KB}
@@ -236,8 +237,8 @@ def draw(result: dict[str, Any], path: Path) -> None:
     above, middle, below = figure.subplots(3, 1, sharex=True)
     t_min = np.arange(1, len(result["allocated_blocks"]) + 1) / 60.0
     for name, colour in zip(WHO, (BLUE, VERMILION, FAINT), strict=True):
-        above.plot(t_min, np.array(result["resident_kb"][name]) / 1000, color=colour, label=name)
-    dress(above, "", "resident memory (MB)")
+        above.plot(t_min, np.array(result["own_kb"][name]) / 1000, color=colour, label=name)
+    dress(above, "", "own memory (MB)")
     legend(above, columns=3)
     middle.plot(t_min, np.array(result["traced_bytes"]) / 1000, color=BLUE, label="what Python has allocated")
     dress(middle, "", "tracemalloc (kB)")
