@@ -4,10 +4,10 @@
 
 Circles all the while, over Unix sockets, with the garbage collector off, as ever in a run at rate. Once a second:
 memory of controller, plant and the recording's writer that is their own, not that of files which they have touched;
-blocks that Python has allocated; bytes that tracemalloc counts, which slows the loop a little. Writes JSON and, beside it, a picture; exit code 1 if something grew.
-Monitors of punctuality are off, and the node is patient; where a busy machine loses frames all the same, the fault is
-cleared a second later, since a loop in FAULT would show nothing. What a fault and its clear leave behind, a sentence,
-the emergencies, the garbage of a start-up, is counted apart.
+blocks that Python has allocated; bytes that tracemalloc counts, which slows the loop a little. Writes JSON and, beside
+it, a picture; exit code 1 if something grew. Monitors of punctuality are off, and the node is patient; where a busy
+machine loses frames all the same, the fault is cleared a second later, since a loop in FAULT would show nothing. What a
+fault and its clear leave behind, a sentence, the emergencies, the garbage of a start-up, is counted apart.
 """
 
 import argparse
