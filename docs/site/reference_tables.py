@@ -38,6 +38,10 @@ EXPLORED = {
     "three": "three of any kind, without cuts",
     "slow drive time-out": "one, with a drive time-out longer than that of heartbeats",
     "whole dialogue": "one, with all SDO steps of the start-up",
+    "outputs": "one, with digital outputs",
+    "signature": "one, with the node's signature",
+    "outputs, two losses": "two lost frames, with digital outputs",
+    "outputs and signature": "one, with both",
 }
 """The configurations that are explored, and what may go wrong in each."""
 _MARK = re.compile(r"<!-- built: (\w+) -->")

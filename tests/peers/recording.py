@@ -11,7 +11,7 @@ from hil.bus.clock import Lockstep
 from pkxyz_ctrl.can.frame import Frame
 
 RECORDED = Path(__file__).parent / "recorded"
-NMT, REQUEST, REPLY = 0x000, 0x60A, 0x58A
+NMT, REQUEST, REPLY, HEARTBEAT = 0x000, 0x60A, 0x58A, 0x77F
 _LINE = re.compile(r"\((\d+\.\d+)\) \S+ ([0-9A-F]{3})#([0-9A-F]*)")
 
 
@@ -65,10 +65,48 @@ class RecordedNode:
         return ready
 
 
+class FollowedNode:
+    """A node whose log is followed from its beginning: what a master sends is looked for from there to the next reset,
+    and what the node said behind it is said again. So it is asked in the order of the log, and ``misses`` counts what
+    is not there.
+    """
+
+    def __init__(self, name: str, own: frozenset[int]) -> None:
+        self._frames, self._own, self._at = frames_of(name), own, 0
+        self.waiting: list[tuple[int, Frame]] = []
+        self.misses = 0
+
+    def receive(self, frame: Frame, t_us: int) -> None:
+        """What a master sends."""
+        if frame.can_id == HEARTBEAT:  # at times of its own
+            return
+        if _is_reset(frame):
+            self.waiting.clear()
+        for at in range(self._at, len(self._frames)):
+            sent_us, sent = self._frames[at]
+            if (sent.can_id, sent.data) == (frame.can_id, frame.data):
+                self._answer(at + 1, t_us - sent_us)
+                return
+            if _is_reset(sent) and not _is_reset(frame):
+                break
+        self.misses += 1
+
+    def _answer(self, at: int, later_us: int) -> None:
+        while at < len(self._frames) and self._frames[at][1].can_id in self._own:
+            said_us, said = self._frames[at]
+            self.waiting.append((said_us + later_us, said))
+            at += 1
+        self._at = at
+
+
+def _is_reset(frame: Frame) -> bool:
+    return frame.can_id == NMT and frame.data[0] in (0x81, 0x82)
+
+
 class RecordedPort:
     """A port with such a node at the other end, on the clock of lockstep."""
 
-    def __init__(self, node: RecordedNode, clock: Lockstep) -> None:
+    def __init__(self, node: RecordedNode | FollowedNode, clock: Lockstep) -> None:
         self._node, self._clock = node, clock
 
     def send(self, frame: Frame) -> None:

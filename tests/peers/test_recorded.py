@@ -2,10 +2,10 @@
 
 import pytest
 from node_rig import EDS, RecordingPlant
-from recording import NMT, REPLY, REQUEST, RecordedNode, RecordedPort, frames_of
+from recording import NMT, REPLY, REQUEST, FollowedNode, RecordedNode, RecordedPort, frames_of
 
 from hil.bus.clock import Lockstep
-from hil.conformance import network, objects
+from hil.conformance import network, objects, outputs, process
 from hil.conformance.eds import read_eds
 from hil.conformance.run import conformance
 from hil.conformance.talker import Talker
@@ -33,6 +33,17 @@ SLOW = DriverConfig(  # as in the guest
     sdo_timeout_us=5_000_000,
 )
 FROM_THE_NODE = frozenset({0x08A, 0x28A, 0x70A})
+OF_LELY = {
+    "SYNC: SYNC length": (Verdict.AGAINST_CIA, "SYNC with no data: taken for a SYNC"),
+    "SYNC: SYNC counter": (Verdict.OTHER_CONTRACT, "SYNC with 00: taken for a SYNC"),
+    "drive PDO: too short": (Verdict.UNSAFE, "2 bytes: applied, 0x6411 (328, 328, 492)"),
+    "drive PDO: too long": (Verdict.OTHER_CONTRACT, "8 bytes: applied"),
+    "EMCY: register and end": (Verdict.AGAINST_CIA, "no EMCY 0x0000"),
+    "outputs, with voltage: leaving operational": (Verdict.MEASURE, "after stop 0x6411 reads (164, 328, 492)"),
+    "outputs, with voltage: error value": (Verdict.MEASURE, "error modes and values say (328, 328, 0)"),
+    "outputs, with voltage: applied at SYNC": (Verdict.PASS, "applied at the SYNC, not before"),
+}
+"""Beyond objects, SDO and NMT, in the order of the recording."""
 
 
 @pytest.mark.parametrize("name", ["canopennode_amplifier.log", "lely_amplifier.log"])
@@ -95,6 +106,29 @@ def test_what_the_check_says_of_canopennode():
     assert list(deviating) == ["SDO: out of range", "boot-up and NMT: communication reset"]
     assert "0x1029:01 = 3: accepted" in deviating["SDO: out of range"]
     assert deviating["boot-up and NMT: communication reset"] == "0x1017:00 64 00, default 00 00"
+
+
+def test_what_the_check_says_of_lely():
+    """Objects, SDO and NMT are right. A SYNC of a wrong length is told (0x8240) and obeyed all the same, and of a PDO
+    that is too short the front is put out before it is told (0x8210): its sources say so. Error values are left to the
+    application, which this one has not.
+    """
+    shipped, clock = load("buses", "socketcan_classic", BusConfig), Lockstep()
+    driver = SLOW.model_copy(update={"digital_outputs": True})
+    can = shipped.can.model_copy(update={"driver": driver, "sense_deadline_us": 8000, "heartbeat_deadline_us": 9900})
+    bus = shipped.model_copy(update={"period_us": 10_000, "can": can})
+    node = FollowedNode("lely_check.log", FROM_THE_NODE | {REPLY})
+    talker = Talker(clock, RecordedPort(node, clock), bus, read_eds(EDS, 10), allow_voltage=True)
+    others = tuple(check for check in (*process.CHECKS, *outputs.CHECKS) if f"{check.group}: {check.name}" in OF_LELY)
+    checks = (objects.ANSWERS, *objects.CHECKS, *network.CHECKS[:5], *others)
+    lines = {f"{line.group}: {line.name}": line for line in conformance(talker, checks)}
+    assert node.misses == 0
+    assert list(lines)[-len(OF_LELY) :] == list(OF_LELY)
+    assert len(lines) == 22 + len(OF_LELY)
+    for name, line in lines.items():
+        verdict, words = OF_LELY.get(name, (Verdict.PASS, ""))
+        assert line.verdict is verdict, line
+        assert words in line.got
 
 
 def test_frames_are_read_as_candump_writes_them():

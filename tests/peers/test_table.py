@@ -8,7 +8,11 @@ PAGE = (TESTS.parent / "docs" / "lookup" / "wire.md").read_text(encoding="utf-8"
 HELD_BY = {
     "durand": ["peers/test_durand.py"],
     "CANopenNode with our EDS": ["peers/recorded/canopennode_amplifier.log", "peers/recorded/canopenlinux_master.log"],
-    "lely-core with our EDS": ["peers/recorded/lely_amplifier.log", "peers/recorded/lely_master.log"],
+    "lely-core with our EDS": [
+        "peers/recorded/lely_amplifier.log",
+        "peers/recorded/lely_check.log",
+        "peers/recorded/lely_master.log",
+    ],
     "python-canopen": ["can/test_can_driver_canopen.py", "peers/test_local_node.py", "node/test_node_sdo.py"],
     "can-utils, cantools": ["socketcan/on_vcan_peers.py", "bus/test_bus_tools.py"],
 }

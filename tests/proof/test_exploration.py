@@ -10,8 +10,17 @@ from collections.abc import Callable
 
 import numpy as np
 import pytest
-from configurations import CONFIGURATIONS, LEVELS, Configuration
-from defective.kernels import drives_always, without_gate
+from configurations import CONFIGURATIONS, LEVELS, SIGNATURE, Configuration
+from defective.kernels import (
+    drives_always,
+    drives_behind_outputs,
+    drives_nothing,
+    looks_at_bits_alone,
+    planted,
+    without_gate,
+    without_output_rules,
+    without_release,
+)
 from explore import Explored, explore
 from numpy.typing import NDArray
 from product import SHIFT, TICK
@@ -19,14 +28,20 @@ from sides import ControllerSide, NodeSide
 from story import as_text, from_text, tell
 from world import Composition, World
 
+from hil.node import signature as signature_module
 from hil.node.amplifier import AmplifierNode
+from hil.node.digital import DigitalOutputs
 from hil.node.drive import DriveReceiver
 from hil.node.heartbeat import HeartbeatConsumer
+from hil.node.signature import SignatureTransmitter
 from pkxyz_ctrl.can import driver as driver_module
 from pkxyz_ctrl.can import start_plan
+from pkxyz_ctrl.can.driver import AmplifierDriver
 from pkxyz_ctrl.can.driver_config import DriverConfig
-from pkxyz_ctrl.can.driver_rules import DriverState
+from pkxyz_ctrl.can.driver_rules import SAFETY_OBJECTS, DriverState
+from pkxyz_ctrl.can.frame import Frame
 from pkxyz_ctrl.can.startup import Setting
+from pkxyz_ctrl.loop import exchange
 from pkxyz_ctrl.loop.controller import Controller
 from pkxyz_ctrl.safety.gate import TransmitGate
 from pkxyz_ctrl.safety.modes import Event, Mode
@@ -57,17 +72,28 @@ def test_with_one_fault_every_state_is_sound() -> None:
     assert set(combs) == set(LEVELS)
 
 
-def test_a_state_with_one_key_has_one_future() -> None:
+@pytest.mark.parametrize("name", ["outputs, well", "signature, well"])
+def test_with_what_is_not_in_every_tick_every_state_is_sound(name: str) -> None:
+    found = explore(CONFIGURATIONS[name])
+    assert not found.violation, tell(CONFIGURATIONS[name], found.story)
+    assert found.is_complete
+    assert {Mode.ENABLED, Mode.LANDING, Mode.FAULT} <= {mode for mode, _, _ in found.met}
+    assert found.has_put_out == CONFIGURATIONS[name].has_outputs
+    assert found.has_signed == CONFIGURATIONS[name].has_signature
+
+
+@pytest.mark.parametrize("configuration", [FRAMES, CONFIGURATIONS["outputs"], CONFIGURATIONS["signature"]])
+def test_a_state_with_one_key_has_one_future(configuration: Configuration) -> None:
     """The abstraction, tried: both sides live, never put back, answer all along each way as the rows say, although
     their counters, times and histories are others than those of the states by which the rows were made.
     """
     generator = random.Random(2)
-    composition = Composition(FRAMES)
+    composition = Composition(configuration)
     rows_by = composition.controller, composition.node
     compared = 0
     for walk in range(40):
         world = World(composition)
-        live = ControllerSide(FRAMES, composition.known), NodeSide(FRAMES, composition.known)
+        live = ControllerSide(configuration, composition.known), NodeSide(configuration, composition.known)
         for side, of in zip(live, rows_by, strict=True):
             side.kept = of.kept
         composition.rows.looks[:] = 1, 0
@@ -189,6 +215,84 @@ def _no_gate(patch: pytest.MonkeyPatch) -> None:
     _no_step_limit(patch)
 
 
+def _puts_out_at_once(patch: pytest.MonkeyPatch) -> None:
+    """A node that waits for no SYNC with its digital outputs."""
+    shipped = DigitalOutputs.receive
+
+    def receive(outputs: DigitalOutputs, data: bytes, t_us: int) -> None:
+        shipped(outputs, data, t_us)
+        outputs.on_sync(t_us)
+
+    patch.setattr(DigitalOutputs, "receive", receive)
+
+
+def _keeps_its_outputs(patch: pytest.MonkeyPatch) -> None:
+    """A node that is stopped and leaves its digital outputs where they are."""
+    patch.setattr(DigitalOutputs, "to_error_value", lambda outputs, t_us: None)
+
+
+def _outputs_first(patch: pytest.MonkeyPatch) -> None:
+    """A controller whose voltages wait behind its digital outputs."""
+    patch.setattr(exchange, "finish", planted(exchange.finish, drive=drives_behind_outputs))
+
+
+def _no_voltages(patch: pytest.MonkeyPatch) -> None:
+    """A controller that leaves out its drive frames."""
+    patch.setattr(exchange, "finish", planted(exchange.finish, drive=drives_nothing))
+
+
+def _outputs_in_fault(patch: pytest.MonkeyPatch) -> None:
+    """A controller that knows no FAULT when it sends digital outputs, and a gate that does not either."""
+    without_output_rules(patch, looks_at_bits_alone, _FAULT=-1)
+
+
+def _signs_wrong(patch: pytest.MonkeyPatch) -> None:
+    """A node that signs something else at work."""
+    signed = signature_module.signature
+    patch.setattr(signature_module, "signature", lambda od: signed(od) ^ 1)
+
+
+def _heedless_of_signatures(patch: pytest.MonkeyPatch) -> None:
+    """A controller in which nobody is told of them."""
+    _signs_wrong(patch)
+    shipped = Controller.compute
+
+    def compute(controller: Controller, reference: NDArray[np.void], overrun: int) -> None:
+        events = controller.driver.memory["node_events"]
+        told = events.copy()
+        events &= ~SAFETY_OBJECTS
+        shipped(controller, reference, overrun)
+        events |= told
+
+    patch.setattr(Controller, "compute", compute)
+
+
+def _deaf_to_wrong_signatures(patch: pytest.MonkeyPatch) -> None:
+    """A controller that hears only the signature that it expects."""
+    _signs_wrong(patch)
+    shipped = Controller.receive
+
+    def receive(controller: Controller, frame: Frame, t_us: int) -> bool:
+        expected = int(controller.driver.memory["signature"][0])
+        if frame.can_id == SIGNATURE and int.from_bytes(frame.data, "little") != expected:
+            return False
+        return shipped(controller, frame, t_us)
+
+    patch.setattr(Controller, "receive", receive)
+
+
+def _patient_without_signature(patch: pytest.MonkeyPatch) -> None:
+    """A node that says it signs and does not, and a controller that waits for a hundred SYNCs."""
+    shipped = AmplifierDriver._configure
+
+    def configure(driver: AmplifierDriver) -> None:
+        shipped(driver)
+        driver.record["signature_syncs"] = 100
+
+    patch.setattr(AmplifierDriver, "_configure", configure)
+    patch.setattr(SignatureTransmitter, "ride", lambda transmitter, has_heartbeat: None)
+
+
 def _keeps_its_voltage(patch: pytest.MonkeyPatch) -> None:
     """A node that is stopped and leaves its combs where they are."""
     patch.setattr(AmplifierNode, "_outputs_to_error_value", lambda node: None)
@@ -203,7 +307,32 @@ PLANTED: dict[str, tuple[Plant, str]] = {
     "nobody can clear": (_no_way_back, "no way leads back"),
     "no gate": (_no_gate, "a step from|beyond 0"),
     "node that keeps its voltage": (_keeps_its_voltage, "ticks after the decision|gate takes combs"),
+    "node that waits for no SYNC": (_puts_out_at_once, "without a SYNC"),
+    "node that keeps its outputs": (_keeps_its_outputs, "digital outputs stay"),
+    "outputs ahead of voltages": (_outputs_first, "right behind the voltages"),
+    "no voltages": (_no_voltages, "not what it sends first"),
+    "outputs in FAULT": (_outputs_in_fault, "digital outputs are sent in FAULT"),
+    "any bits": (without_output_rules, "which nobody may set"),
+    "node left operational in FAULT": (without_release, "digital outputs are still"),
+    "signature without effect": (_heedless_of_signatures, "the signature is wrong or missing, and"),
+    "wrong signature": (_deaf_to_wrong_signatures, "a wrong signature is taken"),
+    "no signature": (_patient_without_signature, "ticks without a signature"),
 }
+
+
+EXPLORED_WITH = {
+    "node that waits for no SYNC": ("outputs, well",),
+    "node that keeps its outputs": ("outputs, well",),
+    "outputs ahead of voltages": ("outputs, well",),
+    "no voltages": ("well",),
+    "outputs in FAULT": ("outputs, well",),
+    "any bits": ("outputs, well",),
+    "node left operational in FAULT": ("outputs, well",),
+    "signature without effect": ("signature, well",),
+    "wrong signature": ("signature, well",),
+    "no signature": ("signature, well",),
+}
+"""Where it shows; elsewhere without a fault, or with one."""
 
 
 def test_a_node_without_time_outs_never_has_a_voltage(monkeypatch: pytest.MonkeyPatch) -> None:
@@ -220,7 +349,7 @@ def test_a_node_without_time_outs_never_has_a_voltage(monkeypatch: pytest.Monkey
 @pytest.mark.parametrize("name", PLANTED)
 def test_each_planted_defect_is_found(name: str, monkeypatch: pytest.MonkeyPatch) -> None:
     plant, expected = PLANTED[name]
-    configurations = CONFIGURATIONS["well"], ONE
+    configurations = [CONFIGURATIONS[named] for named in EXPLORED_WITH.get(name, ("well", "one"))]
     plant(monkeypatch)
     found: Explored | None = None
     for configuration in configurations:

@@ -211,23 +211,40 @@ def test_lely_as_master_of_our_node(bench):
     assert "06020000" in said.upper()
 
 
-def test_lely_with_our_eds_is_started_and_tried(bench):
-    """Its sense values stay 0, so the run ends in a fault at 0 V; what counts is the start-up before it."""
+@contextmanager
+def lely(bench):
+    """Its control tool, as an amplifier by our EDS; NMT resets it does by itself."""
     if shutil.which("coctl") is None:
         pytest.skip("coctl is not built")
     (bench / "amplifier.dcf").write_text(EDS.read_text(encoding="utf-8") + "\n[DeviceComissioning]\nNodeID=10\n")
     words = ["coctl", "--no-wait", "can0", "amplifier.dcf"]
     with (
-        recorded("lely_amplifier.log"),
         (bench / "coctl.out").open("w") as out,
         subprocess.Popen(words, cwd=bench, text=True, stdin=subprocess.PIPE, stdout=out, stderr=out) as node,
     ):
-        node.stdin.write("set network 1\nset id 10\ninit 0\n")
-        node.stdin.flush()
-        time.sleep(3)
+        try:
+            node.stdin.write("set network 1\nset id 10\ninit 0\n")
+            node.stdin.flush()
+            time.sleep(3)
+            yield
+        finally:
+            node.kill()
+
+
+def test_lely_with_our_eds_is_started_and_tried(bench):
+    """Its sense values stay 0, so the run ends in a fault at 0 V; what counts is the start-up before it."""
+    with recorded("lely_amplifier.log"), lely(bench):
         words = ("run", "slow_scan.toml", "--bus", "plain.toml", "--out", "lely", "--seconds", "3", "--json")
         with Command(bench, *words) as run:
             _, told, err = run.wait()
-        node.kill()
     (LOGS / "lely_amplifier.txt").write_text(told + err + (bench / "coctl.out").read_text())
     assert json.loads(told)["ticks"] > 0, err
+
+
+def test_what_the_check_says_of_lely(bench):
+    with recorded("lely_check.log"), lely(bench):
+        words = ("--bus", "plain.toml", "--allow-voltage", "--out", "report_lely")
+        with Command(bench, "check-amplifier", *words) as check:
+            code, out, err = check.wait(600)
+    (LOGS / "lely_check.txt").write_text(f"{code}\n{out}\n{err}\n{(bench / 'coctl.out').read_text()}")
+    assert out, err

@@ -4,7 +4,8 @@ Nothing of the loop is replaced. Elasticity, filter and gains are zero, so the d
 acceleration, the allocation takes it back to the combs, and the voltage law makes the wanted counts of it. Its own
 limits are those of the wire, so that whatever exceeds the gate's is asked for, too. The monitors of the loop are
 switched off, since whether they trip is a choice of the explorer (a trip from outside, in any tick); those of frames
-and node keep their shipped rules with small counts.
+and node keep their shipped rules with small counts. What ``loop.outputs`` decides of the digital outputs is replaced by
+what the explorer chooses, in every mode; whether it is sent is up to the shipped code.
 """
 
 from typing import Any

@@ -4,7 +4,7 @@ from collections.abc import Callable
 from typing import Any
 
 from any_law import sense_counts_at_rest
-from configurations import HARD, LEVELS, MAXIMUM, SOFT, STEP, TOO_FAR
+from configurations import HARD, LEVELS, MAXIMUM, SOFT, STEP, Configuration
 
 from hil.node.amplifier import NmtState
 from pkxyz_ctrl.can.codec import Counts
@@ -25,6 +25,10 @@ def damaged(frame: Frame) -> list[Frame]:
             made = [bytes(((data[0] + 6) % 240 + 1,)), b""] if data else []
         case 0x30A | 0x28A:
             made = [bytes((data[0] ^ 1, *data[1:])), data[:-1]] if data else []
+        case 0x20A:
+            made = [bytes((data[0] ^ 1,)), b""]
+        case 0x38A:
+            made = [bytes((data[0] ^ 1, *data[1:])), data[:-1]]
         case 0x77F:
             made = [b"\x00"]
         case 0x70A:
@@ -40,8 +44,21 @@ def damaged(frame: Frame) -> list[Frame]:
     return [Frame._make((can_id, payload, flags)) for payload in made]
 
 
-def wishes_of(controller: Controller) -> list[Option]:
-    """What an operator, a monitor and a law may want in this tick."""
+def wishes_of(controller: Controller, configuration: Configuration) -> list[Option]:
+    """What an operator, a monitor and a law may want in this tick; of the digital outputs anything in every mode in
+    which they are sent at all.
+    """
+    wishes = _of_combs(controller, configuration.levels)
+    bits = configuration.outputs if may_put_out(controller.mode) else configuration.outputs[:1]
+    return [(*wish, wanted) for wish in wishes for wanted in bits]
+
+
+def may_put_out(mode: int) -> bool:
+    """Whether digital outputs may be asked of the node."""
+    return mode >= Mode.IDLE and mode != Mode.FAULT
+
+
+def _of_combs(controller: Controller, levels: tuple[Counts, ...]) -> list[Option]:
     mode = Mode(controller.mode)
     match mode:
         case Mode.IDLE:
@@ -49,11 +66,11 @@ def wishes_of(controller: Controller) -> list[Option]:
         case Mode.HOMING:
             wishes = [("tick", event, LEVELS[0], 0) for event in (Event.NONE, Event.DISABLE)]
         case Mode.ENABLED | Mode.TRACKING:
-            wishes = [("tick", Event.NONE, counts, 0) for counts in (*LEVELS, *TOO_FAR)]
+            wishes = [("tick", Event.NONE, counts, 0) for counts in levels]
             wishes += [("tick", Event.DISABLE, LEVELS[0], 0)]
             wishes += [("tick", Event.NONE, LEVELS[0], int(trip)) for trip in (SOFT, HARD)]
         case Mode.LANDING:
-            wishes = [("tick", Event.NONE, counts, 0) for counts in (*LEVELS, *TOO_FAR)]
+            wishes = [("tick", Event.NONE, counts, 0) for counts in levels]
             wishes += [("tick", Event.NONE, LEVELS[0], int(trip)) for trip in (SOFT, HARD)]
         case Mode.FAULT:
             wishes = [("tick", event, LEVELS[0], 0) for event in (Event.NONE, Event.CLEAR)]

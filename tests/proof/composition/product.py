@@ -45,6 +45,7 @@ FULL: Final = -3
 
 # what never may be
 STARTED_WITH_VOLTAGE, CLOSED_TOO_SOON, LANDING_FOR_EVER, TOO_LATE_AT_0_V, APART_TOO_LONG, NO_ROOM = range(1000, 1006)
+TOO_LATE_LOW, UNSIGNED_TOO_LONG = range(1006, 1008)
 
 CONTROLLER: Final = 0
 NODE: Final = 1
@@ -76,6 +77,8 @@ WORLD = np.dtype(
         ("believed", "i1"),  # by the gate, before its last frame
         ("cut", "i1"),  # what no longer gets through
         ("landing", "i1"),  # ticks in a row in which the stage was led down
+        ("high", "i1"),  # ticks since digital outputs were to go low, while one is not
+        ("unsigned", "i1"),  # ticks with a closed loop since a right signature came, where one is waited for
     ],
     align=True,
 )
@@ -84,15 +87,16 @@ IN_FLIGHT: Final = 10  # words of it, which hold the frames
 CONTROLLER_LABEL = np.dtype(
     [
         ("mode", "i4"), ("driver", "i4"), ("may_energise", "i4"), ("believes", "i4"), ("counts", "i4"),
-        ("choice", "i4"), ("is_landmark", "i4"), ("is_starting", "i4"),
+        ("choice", "i4"), ("is_landmark", "i4"), ("is_starting", "i4"), ("may_put_out", "i4"),
+        ("goes_by_signature", "i4"),
     ],
     align=True,
 )  # fmt: skip
-NODE_LABEL = np.dtype([("counts", "i4"), ("next_us", "i4")], align=True)
+NODE_LABEL = np.dtype([("counts", "i4"), ("next_us", "i4"), ("bits", "i4")], align=True)
 FRAME_LABEL = np.dtype(
     [
-        ("from_us", "i4"), ("counted", "i4"), ("is_request", "i4"), ("cuts", "i4"), ("damages", "i4"),
-        ("damaged", "i4", (4,)),
+        ("from_us", "i4"), ("counted", "i4"), ("is_request", "i4"), ("is_signature", "i4"), ("cuts", "i4"),
+        ("damages", "i4"), ("damaged", "i4", (4,)),
     ],
     align=True,
 )  # fmt: skip
@@ -102,6 +106,7 @@ RULES = np.dtype(
         ("late_ticks", "i4"), ("settle_ticks", "i4"), ("agree_ticks", "i4"), ("landing_ticks", "i4"),
         ("settled", "i4"), ("period_us", "i4"), ("poll_us", "i4"), ("turnaround_us", "i4"),
         ("mode_landing", "i4"), ("mode_enabled", "i4"), ("longest", "i4"), ("longest_apart", "i4"),
+        ("unsigned_ticks", "i4"), ("longest_high", "i4"), ("longest_unsigned", "i4"),
     ],
     align=True,
 )  # fmt: skip

@@ -98,7 +98,7 @@ def add(w: np.void, words: Array, r: Rows, s: Store, cursor: Array, origin: int,
     key[1] = np.int64(w["age_us"]) | np.int64(w["phase"]) << 15 | np.int64(w["faults_left"]) << 19
     key[1] |= np.int64(w["skipped"]) << 22 | np.int64(w["since_decision"]) << 25 | np.int64(w["quiet"]) << 29
     key[1] |= np.int64(w["apart"]) << 31 | np.int64(w["believed"]) << 35 | np.int64(w["cut"]) << 42
-    key[1] |= np.int64(w["landing"]) << 45
+    key[1] |= np.int64(w["landing"]) << 45 | np.int64(w["high"]) << 49 | np.int64(w["unsigned"]) << 53
     at = find(s.states, s.slots, key)
     if s.slots[at] >= 0:
         return int(s.slots[at])
@@ -124,7 +124,7 @@ def put(w: np.void, words: Array, s: Store, number: int) -> None:
     w["age_us"], w["phase"], w["faults_left"] = key[1] & 0x7FFF, key[1] >> 15 & 15, key[1] >> 19 & 7
     w["skipped"], w["since_decision"], w["quiet"] = key[1] >> 22 & 7, key[1] >> 25 & 15, key[1] >> 29 & 3
     w["apart"], w["believed"], w["cut"] = key[1] >> 31 & 15, key[1] >> 35 & 127, key[1] >> 42 & 7
-    w["landing"] = key[1] >> 45 & 15
+    w["landing"], w["high"], w["unsigned"] = key[1] >> 45 & 15, key[1] >> 49 & 15, key[1] >> 53 & 31
 
 
 @kernel

@@ -1,6 +1,6 @@
 """Shipped controller and shipped node, each by itself: what it does in each of its states, run once and kept.
 
-A state has a number, and so has a frame (`Frames`). Asked what a side does, it is put into that state, does it, and
+A state has a number, and so has a frame. Asked what a side does, it is put into that state, does it, and
 the answer becomes a row of `Rows`: the state behind it, what it said, the frames that it sent. The composition
 (`product`) goes by these rows. They are asked for when they are needed, so nothing is run that can't happen.
 """
@@ -13,13 +13,14 @@ from any_law import any_law, bend, reference_for
 from configurations import (
     CONTROLLER_ID,
     DRIVE,
-    EMCY,
     LEVELS,
     MAXIMUM,
     NMT,
     NODE_ID,
+    OUTPUTS,
     PERIOD_US,
-    SENSE,
+    PERMITTED_BITS,
+    SIGNATURE,
     STEP,
     SYNC,
     TOO_FAR,
@@ -28,7 +29,8 @@ from configurations import (
     bus_of,
     few_settings,
 )
-from fates import Plant, ViolationError, wishes_of
+from fates import Plant, ViolationError, may_put_out, wishes_of
+from frames import SYNCS, absolute, relative
 from node_rig import EDS
 from product import (
     BEGIN,
@@ -51,21 +53,19 @@ from snapshot import attributes_of
 from states import Bases, ControllerState, NodeState
 
 from hil.bus.clock import Lockstep
-from hil.node.amplifier import AmplifierNode
-from pkxyz_ctrl.can.codec import Counts, ProcessCodec
-from pkxyz_ctrl.can.driver_rules import DriverState
+from hil.node.amplifier import AmplifierNode, NmtState
+from pkxyz_ctrl.can.codec import Counts
+from pkxyz_ctrl.can.driver_rules import SAFETY_OBJECTS, DriverState
 from pkxyz_ctrl.can.frame import Frame
 from pkxyz_ctrl.loop import controller as controller_module
 from pkxyz_ctrl.loop.controller import Controller, StartUpError
 from pkxyz_ctrl.safety.gate import GateConfig
 from pkxyz_ctrl.safety.modes import MAY_ENERGISE, Event, Mode
 
-_CODECS: Final = {DRIVE: ProcessCodec(DRIVE, True), SENSE: ProcessCodec(SENSE, True)}
-_SYNCS: Final = 240
 controller_module.explain = cache(controller_module.explain)  # a sentence for each fault, which nobody reads
 FAR_US: Final = 1 << 20
 _RESET: Final = 0x81
-_ANEW: Final = (0x80, _SYNCS // 2)
+_ANEW: Final = (0x80, SYNCS // 2)
 """Where counters start anew, at a reset of the node: far from all that was on its way or is remembered."""
 
 
@@ -82,39 +82,6 @@ class Numbered:
             found = self._numbers[thing] = len(self.things)
             self.things.append(thing)
         return found
-
-
-class Relative(NamedTuple):
-    """A frame without its history: its payload, or what a process PDO or a SYNC holds, counted from `Bases`."""
-
-    can_id: int
-    flags: int
-    payload: tuple[Any, ...] | bytes
-
-
-def relative(frame: Frame, bases: Bases) -> Relative:
-    can_id, data, flags = frame
-    if can_id in _CODECS and len(data) == 8:
-        a, b, c, counter, is_right = _CODECS[can_id].decode(data)
-        base = bases.drive if can_id == DRIVE else bases.sense
-        return Relative(can_id, flags, (a, b, c, (counter - base) & 0xFF, is_right))
-    if can_id == SYNC and len(data) == 1:
-        return Relative(can_id, flags, ((data[0] - bases.sync) % _SYNCS,))
-    if can_id == EMCY:  # its code decides, the rest is words
-        return Relative(can_id, flags, data[:2] + bytes(len(data) - 2))
-    return Relative(can_id, flags, data)
-
-
-def absolute(frame: Relative, bases: Bases) -> Frame:
-    can_id, flags, payload = frame
-    if isinstance(payload, bytes):
-        return Frame._make((can_id, payload, flags))
-    if can_id == SYNC:
-        return Frame._make((can_id, bytes(((payload[0] + bases.sync - 1) % _SYNCS + 1,)), flags))
-    a, b, c, counter, is_right = payload
-    base = bases.drive if can_id == DRIVE else bases.sense
-    data = _CODECS[can_id].encode((a, b, c), (counter + base) & 0xFF)
-    return Frame._make((can_id, data if is_right else data[:7] + bytes((data[7] ^ 1,)), flags))
 
 
 class Answer(NamedTuple):
@@ -161,7 +128,7 @@ class ControllerSide:
         law = any_law(PERIOD_US, homing_ticks=2)
         gate = GateConfig(
             count_max=MAXIMUM, count_slew_max=STEP, period_us=PERIOD_US, node_id=NODE_ID,
-            controller_node_id=CONTROLLER_ID, fd=driver.fd,
+            controller_node_id=CONTROLLER_ID, fd=driver.fd, digital_outputs=driver.digital_outputs,
         )  # fmt: skip
         settings = () if configuration.whole_dialogue else few_settings(driver, STEP)
         self.live = Controller(law, bus, gate, self._on_sent, settings=settings)
@@ -169,7 +136,8 @@ class ControllerSide:
         self.labels: list[tuple[int, ...]] = []
         self.kept = Kept()
         self._references = {counts: reference_for(law, counts) for counts in (*LEVELS, *TOO_FAR)}
-        self._known = known
+        self._known, self._configuration = known, configuration
+        self._room_us = bus.can.short_frame_us if configuration.has_room else 0
         self._sent: list[Frame] = []
         self.bases = Bases()
         self.live.start(0)
@@ -201,18 +169,41 @@ class ControllerSide:
         if asked == BEGIN:
             live.begin(now_us)
         elif asked == FINISH:
-            live.finish(now_us, now_us)
+            self._finish(now_us)
         elif asked >= FRAME:
             frame = absolute(self._known.frames.things[(asked - FRAME) % DIALOGUE], bases)
             if asked - FRAME < DIALOGUE:
-                return FRESH if live.receive(frame, now_us) else 0
+                return self._receive(frame, now_us)
             return self._dialogue(frame, now_us)
         elif asked == WAIT:
             return self._dialogue(None, now_us)
         else:
-            event, counts, trips = self._known.wishes.things[(asked - COMPUTE) // SKIPS]
-            return self._compute(event, counts, trips, (asked - COMPUTE) % SKIPS)
+            event, counts, trips, bits = self._known.wishes.things[(asked - COMPUTE) // SKIPS]
+            told = self._compute(event, counts, trips, (asked - COMPUTE) % SKIPS)
+            live.outputs["bits"] = bits  # in place of what `loop.outputs` has decided
+            return told
         return 0
+
+    def _finish(self, now_us: int) -> None:
+        live = self.live
+        live.finish(now_us, now_us + self._room_us)
+        live.outputs["bits"] = 0  # nobody reads it before the next is decided
+        if [frame.can_id for frame in self._sent].count(DRIVE) != 1 or self._sent[0].can_id != DRIVE:
+            raise ViolationError("the voltages of a tick are not what it sends first")
+
+    def _receive(self, frame: Frame, now_us: int) -> int:
+        driver: Any = self.live.driver.memory[0]
+        told = FRESH if self.live.receive(frame, now_us) else 0
+        if frame.can_id == SIGNATURE and self._goes_by_signature:
+            is_right = frame.data == int(driver["signature"]).to_bytes(2, "little")
+            if not is_right and not driver["node_events"] & SAFETY_OBJECTS:
+                raise ViolationError("a wrong signature is taken")
+        return told
+
+    @property
+    def _goes_by_signature(self) -> bool:
+        driver = self.live.driver
+        return driver.state is DriverState.OPERATIONAL and bool(driver.memory["signature"][0] >= 0)
 
     def _dialogue(self, frame: Frame | None, now_us: int) -> int:
         try:
@@ -234,6 +225,8 @@ class ControllerSide:
         memory["input"]["trips"] |= trips
         was, fresh = live.mode, live.driver.sense.fresh
         live.compute(reference, skipped)
+        if live.driver.node_events & SAFETY_OBJECTS and MAY_ENERGISE[live.mode]:
+            raise ViolationError(f"the signature is wrong or missing, and the mode is {Mode(live.mode).name}")
         told = CLOSES if MAY_ENERGISE[live.mode] and not MAY_ENERGISE[was] else 0
         return told | QUIET if fresh and not live.memory["tick"]["count"][0, 0].any() else told
 
@@ -245,7 +238,18 @@ class ControllerSide:
                 raise ViolationError(f"a voltage is sent in {Mode(live.mode).name}, homed {live.memory['homed'][0]}")
             if live.driver.state is not DriverState.OPERATIONAL:
                 raise ViolationError(f"a voltage is sent while the driver is {live.driver.state.name}")
+        if frame.can_id == OUTPUTS:
+            self._look_at_outputs(frame)
         self._sent.append(frame)
+
+    def _look_at_outputs(self, frame: Frame) -> None:
+        """One frame in a tick, behind that with the voltages; in a mode and with bits that are permitted."""
+        if not self._sent or self._sent[-1].can_id != DRIVE:
+            raise ViolationError("digital outputs are sent, but not right behind the voltages")
+        if not may_put_out(self.live.mode) or self.live.driver.state is not DriverState.OPERATIONAL:
+            raise ViolationError(f"digital outputs are sent in {Mode(self.live.mode).name}")
+        if len(frame.data) != 1 or frame.data[0] & ~PERMITTED_BITS:
+            raise ViolationError(f"digital outputs {frame.data.hex()} are sent, which nobody may set")
 
     def _answer(self, was: Bases, now_us: int, told: int, asked: int) -> Answer:
         driver: Any = self.live.driver.memory[0]
@@ -257,7 +261,7 @@ class ControllerSide:
         if is_new:
             self.labels.append(self._label())
         frames = tuple(self._known.frames.number(relative(frame, bases)) for frame in self._sent)
-        further = (bases.drive - was.drive) & 0xFF, (bases.sync - was.sync) % _SYNCS
+        further = (bases.drive - was.drive) & 0xFF, (bases.sync - was.sync) % SYNCS
         if asked == BEGIN and bases.sync == 1 and any(f.can_id == NMT and f.data[0] == _RESET for f in self._sent):
             further = _ANEW
         self._sent.clear()
@@ -267,7 +271,7 @@ class ControllerSide:
         live = self.live
         gate: Any = live.gate.memory[0]
         state, may_energise = live.driver.state, bool(MAY_ENERGISE[live.mode])
-        wishes = tuple(self._known.wishes.number(wish[1:]) for wish in wishes_of(live))
+        wishes = tuple(self._known.wishes.number(wish[1:]) for wish in wishes_of(live, self._configuration))
         return (
             int(live.mode), state.value, may_energise,
             bool(gate["known"]) and not gate["latched"] and may_energise,
@@ -275,6 +279,7 @@ class ControllerSide:
             self._known.choices.number(wishes),
             live.driver.memory["start"]["position"][0, 0] % 6 == 0,
             live.mode < Mode.IDLE and state not in (DriverState.FAILED, DriverState.OFF),
+            may_put_out(live.mode), self._goes_by_signature,
         )  # fmt: skip
 
 
@@ -288,9 +293,11 @@ class NodeSide:
         self.clock = Lockstep()
         self.plant = Plant(lambda: self.live.state)
         self._sent: list[Frame] = []
+        self._bits, self._is_sync = 0, False
         self.live = AmplifierNode(
             NODE_ID, self.clock, self._sent.append, self.plant, EDS,
             turnaround_us=TURNAROUND_US, fd=driver.fd, protection=driver.protection, error_hold_us=30_000,
+            switch=self._on_switch,
         )  # fmt: skip
         self.labels: list[tuple[int, ...]] = []
         self.kept = Kept()
@@ -313,15 +320,28 @@ class NodeSide:
         was, told = self.bases, 0
         try:
             if asked >= SHIFT:
-                drive, sync = divmod(asked - SHIFT, _SYNCS)
-                self.bases = was._replace(drive=was.drive + drive & 0xFF, sync=(was.sync + sync) % _SYNCS)
+                drive, sync = divmod(asked - SHIFT, SYNCS)
+                self.bases = was._replace(drive=was.drive + drive & 0xFF, sync=(was.sync + sync) % SYNCS)
             elif asked >= FRAME:
-                self.live.on_frame(absolute(self._known.frames.things[asked - FRAME], was), was.now_us)
+                frame = absolute(self._known.frames.things[asked - FRAME], was)
+                self._bits, self._is_sync = self.live.digital.bits, frame.can_id == SYNC
+                self.live.on_frame(frame, was.now_us)
             else:
+                self._bits, self._is_sync = self.live.digital.bits, False
                 self.clock.run_until(was.now_us + asked - RUN)
+            self._look_at_outputs()
         except ViolationError as violation:
             told = self._known.violation(violation)
         return self._answer(was, told)
+
+    def _on_switch(self, bits: int, t_us: int) -> None:
+        if bits & ~self._bits and not self._is_sync:
+            raise ViolationError(f"digital outputs go from {self._bits:#04x} to {bits:#04x} without a SYNC")
+
+    def _look_at_outputs(self) -> None:
+        node = self.live
+        if node.digital.bits and (node.state is not NmtState.OPERATIONAL or node._holds):
+            raise ViolationError(f"digital outputs stay {node.digital.bits:#04x} in {node.state.name}")
 
     def _answer(self, was: Bases, told: int) -> Answer:
         counts = self.plant.counts
@@ -329,7 +349,8 @@ class NodeSide:
         key = self._state.key(bases, counts)
         number, is_new = self.kept.number(key, lambda: (self._state.take(), counts), bases)
         if is_new:
-            self.labels.append((self._known.counts.number(counts), self._next_us() - bases.now_us))
+            next_us = self._next_us() - bases.now_us
+            self.labels.append((self._known.counts.number(counts), next_us, self.live.digital.bits))
         frames = tuple(self._known.frames.number(relative(frame, bases)) for frame in self._sent)
         self._sent.clear()
         return Answer(number, told, sense=(bases.sense - was.sense) & 0xFF, frames=frames)

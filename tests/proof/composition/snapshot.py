@@ -11,6 +11,9 @@ future. It leaves out what nothing in the composition reads (texts, histories, r
   limit; of a deadline that is over, only that it is; of an age (`AGES`), what is longer than three ticks is alike;
 - counts that only ever are compared with a limit (`SATURATED`) up to that limit.
 
+Digital outputs, those that wait for a SYNC and those that are owed are no counts: they are in the key as they are, as
+is the signature, with the SYNCs until it is due.
+
 An attribute that none of these tables names enters the key as it is. So a forgotten one can only keep states apart
 that are alike (the exploration would not come to an end), never merge two that differ.
 """
@@ -22,6 +25,7 @@ from enum import Enum
 from typing import Any
 
 import numpy as np
+from configurations import SIGNATURE_SYNCS
 
 from hil.node.object_dictionary import ObjectDictionary
 
@@ -62,13 +66,13 @@ TEXTS = {
 }
 INSTANTS = {("TransmitGate", "memory.time_us"), ("Alarm", "due_us")}
 AGES = {("TransmitGate", "memory.time_us"), ("SenseTransmitter", "sync_us")}
-AGES.add(("AmplifierDriver", "memory.node_heartbeat_us"))
 DURATIONS = {"cycle_us", "beat_period_us", "time_us", "_event_us", "_drive_timeout_us"}
 DRIVE_COUNTERS = {("TransmitGate", "memory.counter")}
 SENSE_COUNTERS = {("SenseInput", "memory.counter")}
 SENT_COUNTERS = {("AmplifierDriver", f"memory.{name}") for name in ("drive_counter", "sync_count")}
 SENT_COUNTERS.add(("SenseTransmitter", "counter"))
 SATURATED = {("TransmitGate", "memory.syncs"): 2, ("AmplifierNode", "_silent_syncs"): 4}
+SATURATED["AmplifierDriver", "memory.signature_age"] = 2 * SIGNATURE_SYNCS + 3  # beyond what it is compared with
 CONSTANT_KINDS = {"PdoParameters", "ProcessCodec", "NodeObjects", "ObjectDictionary"}
 CONSTANT = {
     "_w0", "_w1", "_w2", "_heartbeat_frame", "_sense_id", "_drive_id", "_sdo_request_id", "_sdo_response_id",
@@ -126,13 +130,16 @@ def _rule(kind: str, name: str, x: str) -> str | None:
         return f"None if {x} < 0 else {x} - sense & 255"
     if place in SATURATED:
         return f"{x} if {x} < {SATURATED[place]} else {SATURATED[place]}"
-    if place in INSTANTS or (name.endswith("_us") and name not in DURATIONS):
+    is_instant = place in INSTANTS or (name.endswith("_us") and name not in DURATIONS)
+    if is_instant and place not in RULES:
         past = -LONG_US if place in AGES else -1
         return f"{x} if {x} is None or {x} > {_NEVER_US} else {x} - now_us if {x} - now_us > {past} else {past}"
     return RULES.get(place, RULES.get(("", name), "{x} if type({x}) in _PLAIN else plain({x})")).format(x=x)
 
 
 RULES = {
+    # an age, as above; `long_us` is longer than a node may be silent that is still taken for operational
+    ("AmplifierDriver", "memory.node_heartbeat_us"): "max({x} - now_us, -long_us)",
     # any may come next where none was there
     ("TransmitGate", "memory.counter_next"): "None if gate['counter'] < 0 else {x} - drive & 255",
     # any counter may come first once drive frames are let in again

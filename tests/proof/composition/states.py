@@ -11,7 +11,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
-from snapshot import Snapshot, attributes_of
+from snapshot import LONG_US, Snapshot, attributes_of
 
 from hil.bus.clock import Lockstep
 from hil.node.amplifier import AmplifierNode
@@ -49,7 +49,9 @@ class ControllerState:
     """Of the shipped controller."""
 
     def __init__(self, controller: Controller) -> None:
-        self._snapshot = Snapshot(attributes_of([controller]), gate=controller.gate.memory[0])
+        node_period_us = 1000 * controller.driver.config.node_heartbeat_period_ms
+        long_us = LONG_US * -(-node_period_us // controller.period_us)  # longer than it may be silent, and operational
+        self._snapshot = Snapshot(attributes_of([controller]), gate=controller.gate.memory[0], long_us=long_us)
         self._controller, self._memory = controller, controller.memory
         self._safe_cycles = int(controller.law["limits"]["safe_cycles"][0])
         self._words = controller.exchange.view(np.int64)
@@ -74,6 +76,7 @@ class ControllerState:
             self._snapshot.name(*bases),
             int(record["homing_count"]) if record["mode"] == 3 else 0,
             self._asked[0].tolist(),
+            int(self._controller.outputs["bits"][0]),  # asked for, and not sent yet
             _start_up(self._start[0], driver.state, bases.now_us),
             min(int(record["safe_cycles"]), self._safe_cycles),
             self._cycle[self._named].tobytes(),

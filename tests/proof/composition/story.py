@@ -4,7 +4,7 @@ import json
 
 from configurations import DRIVE, LEVELS, NAMES, NODE_BEAT, OUR_BEAT, SENSE, SYNC, Configuration
 from fates import Option, ViolationError
-from sides import Relative
+from frames import Relative
 from world import Composition, World, choice_of, option_of
 
 from pkxyz_ctrl.safety.modes import Event
@@ -55,6 +55,7 @@ def _said(option: Option, frame: Relative | None) -> list[str]:
         case "tick":
             asked = [] if option[1] is Event.NONE else [f"asked: {option[1].name}"]
             asked += [f"the law wants {option[2]}"] if option[2] != LEVELS[0] else []
+            asked += [f"the law wants outputs {option[4]:#04x}"] if option[4] else []
             return asked + (["a monitor trips"] if option[3] else [])
         case "late":
             return [f"{name} is held back"]
@@ -104,6 +105,6 @@ def from_text(text: str) -> tuple[str, list[Option]]:
 
 def _option(option: list[object]) -> Option:
     if option[0] == "tick":
-        _, event, counts, trips = option
-        return "tick", Event(int(str(event))), tuple(counts), trips  # type: ignore[arg-type]
+        _, event, counts, trips, bits = option
+        return "tick", Event(int(str(event))), tuple(counts), trips, bits  # type: ignore[arg-type]
     return tuple(option)

@@ -43,6 +43,8 @@ from product import (
     SYNCED,
     TICK,
     TOO_LATE_AT_0_V,
+    TOO_LATE_LOW,
+    UNSIGNED_TOO_LONG,
     VANISH,
     VIOLATED,
     WAIT,
@@ -56,7 +58,7 @@ from product import (
     pass_us,
 )
 
-_CUTS: Final = 4
+_CUTS: Final = 6
 
 
 # -- a tick ---------------------------------------------------------------------------------------------------------
@@ -118,7 +120,10 @@ def _start(w: np.void, r: Rows) -> int:
 @kernel
 def _read(w: np.void, r: Rows) -> int:
     while w["in_port"] > 0:
-        told = controller_does(w, r, FRAME + off_port(w))
+        frame = off_port(w)
+        told = controller_does(w, r, FRAME + frame)
+        if r.frame_labels[frame]["is_signature"] != 0:
+            w["unsigned"] = 0
         if told < 0:
             return told
         if told & FRESH:
@@ -167,6 +172,8 @@ def _pass_tick(w: np.void, r: Rows) -> int:
         if w["since_decision"] > rules["settle_ticks"]:
             w["violation"] = TOO_LATE_AT_0_V
             return VIOLATED
+    if not _look_at_extras(w, r, controller):
+        return VIOLATED
     place = 0
     while place < w["are_held"]:
         w["left"][place] -= 1
@@ -197,6 +204,29 @@ def _compare_beliefs(w: np.void, r: Rows, controller: np.void, counts: int) -> b
     return True
 
 
+@kernel
+def _look_at_extras(w: np.void, r: Rows, controller: np.void) -> bool:
+    """Digital outputs go low with the combs; without a signature that is right the loop does not stay closed."""
+    rules = r.rules[0]
+    if controller["may_put_out"] != 0 or r.nodes[w["node"]]["bits"] == 0:
+        w["high"] = 0
+    else:
+        w["high"] += 1
+        rules["longest_high"] = max(rules["longest_high"], w["high"])
+        if w["high"] > rules["settle_ticks"]:
+            w["violation"] = TOO_LATE_LOW
+            return False
+    if controller["goes_by_signature"] == 0 or controller["may_energise"] == 0:
+        w["unsigned"] = 0
+    else:
+        w["unsigned"] += 1
+        rules["longest_unsigned"] = max(rules["longest_unsigned"], w["unsigned"])
+        if w["unsigned"] > rules["unsigned_ticks"]:
+            w["violation"] = UNSIGNED_TOO_LONG
+            return False
+    return True
+
+
 # -- what may happen ------------------------------------------------------------------------------------------------
 
 
@@ -220,8 +250,9 @@ def options(w: np.void, r: Rows, to: NDArray[np.int32]) -> int:
             count += 1
         if rules["cut"] != 0 and w["cut"] == 0:
             for cut in range(_CUTS):
-                to[count] = CUT << 8 | cut
-                count += 1
+                if rules["cut"] >> cut & 1:
+                    to[count] = CUT << 8 | cut
+                    count += 1
     if phase == BEFORE and w["cut"] != 0:
         to[count] = MEND << 8
         count += 1

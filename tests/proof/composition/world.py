@@ -8,6 +8,11 @@ SYNCs; node and driver wait for some ticks only; the sense input gives up counti
 errors last 30 ms (100). Each of these is compared with a count or an age and has no other effect, so a longer one
 adds ticks in which the same things happen, and none else; that each order in which they can run out occurs is a
 matter of the sizes in `CONFIGURATIONS`.
+
+Where digital outputs or the signature are explored, the node's heartbeat goes along every other tick (every hundredth),
+the signature is due every other SYNC (every 240th), and behind the voltages there is time for one frame of a byte more.
+So ticks with and without a heartbeat, with and without a signature to be waited for, with and without room follow each
+other in all orders; between two of a kind driver and node only count.
 """
 
 from typing import Any, Final
@@ -26,13 +31,16 @@ from configurations import (
     REQUEST,
     SENSE,
     SETTLED,
+    SIGNATURE,
+    SIGNATURE_SYNCS,
     SYNC,
     TURNAROUND_US,
     Configuration,
 )
 from fates import Option, ViolationError, damaged
+from frames import Relative, absolute, relative
 from product import Rows
-from sides import Answer, ControllerSide, Known, NodeSide, Relative, absolute, relative
+from sides import Answer, ControllerSide, Known, NodeSide
 from states import Bases
 
 from pkxyz_ctrl.can.codec import Counts
@@ -75,6 +83,8 @@ class Composition:
         c, rules = self.configuration, np.zeros(1, product.RULES)
         for kind in _KINDS:
             rules[kind] = kind in c.kinds
+        rules["cut"] = sum(1 << place for place, cut in enumerate(CUTS) if cut in c.cuts)
+        rules["unsigned_ticks"] = 2 * SIGNATURE_SYNCS + 3 + c.faults  # two are lost; it may ride a tick later
         rules["late_ticks"], rules["settled"] = LATE_TICKS, SETTLED
         rules["settle_ticks"], rules["agree_ticks"] = c.settle_ticks, c.agree_ticks
         rules["landing_ticks"] = LANDING_TICKS + 1 + c.faults  # a fault may be a tick that is missed
@@ -134,6 +144,7 @@ class Composition:
             can_id, _, payload = frames[number]
             label = rows.frame_labels[number]
             label["from_us"], label["is_request"] = can_id in FROM_US, can_id == REQUEST
+            label["is_signature"] = can_id == SIGNATURE and number in self._on_wire  # what the node says is right
             label["counted"] = _COUNTED.get(can_id, 0) if isinstance(payload, tuple) else 0
             label["cuts"] = sum(1 << 1 + cut for cut, ids in enumerate(CUTS.values()) if can_id in ids)
         for name, of_side, into in (
@@ -238,7 +249,7 @@ def choice_of(composition: Composition, option: Option) -> int:
     """The other way round."""
     kind, which = _NAMES.index(option[0]) << 8, 0
     if option[0] == "tick":
-        which = composition.known.wishes.number((Event(option[1]), tuple(option[2]), option[3]))
+        which = composition.known.wishes.number((Event(option[1]), tuple(option[2]), option[3], option[4]))
     elif option[0] == "cut":
         which = tuple(CUTS).index(option[1])
     elif len(option) > 1:
@@ -262,6 +273,11 @@ def violation_of(composition: Composition, state: np.ndarray[Any, Any]) -> str:
         case product.APART_TOO_LONG:
             believed = known.counts.things[world["believed"]]
             return f"for {world['apart']} ticks the gate takes combs at {combs} to be at {believed}"
+        case product.TOO_LATE_LOW:
+            bits = composition.rows.nodes[world["node"]]["bits"]
+            return f"{world['high']} ticks after the decision the digital outputs are still {bits:#04x}"
+        case product.UNSIGNED_TOO_LONG:
+            return f"the loop has been closed for {world['unsigned']} ticks without a signature"
         case product.NO_ROOM:
             return "more frames are on their way than there is room for"
     text: str = known.violations.things[number]
