@@ -13,6 +13,7 @@ import pytest
 import hil
 from hil.studies.montecarlo import Study, run_one
 from pkxyz_ctrl import Stage
+from pkxyz_ctrl.config.bus import BusConfig
 from pkxyz_ctrl.config.files import load
 from pkxyz_ctrl.design.margins.tolerances import Tolerances
 from pkxyz_ctrl.mechanics.modes import modes
@@ -100,6 +101,7 @@ def test_the_heights_that_voltages_hold() -> None:
     for volts in (5, 31, 69, 182):
         height_m = row_of(text, f"{volts} ")[0] * 1e-6
         assert stage.holding_voltages([0.0, 0.0, height_m])[0] == pytest.approx(volts, rel=0.04)
+    assert f"shows {stage.holding_voltages([0.0, 0.0, 15e-9])[0]:.1f} V on each comb" in text
 
 
 def test_the_stage_about_rest_and_over_its_workspace() -> None:
@@ -208,6 +210,40 @@ def test_ms_of_sampled_devices_is_that_of_the_last_run() -> None:
     assert f"{value['margins.local_20k_rejection']:.0f} Hz in x and y, 815 in z, Ms {peak}." in page(
         "docs/understand/margins.md"
     )
+
+
+def test_what_sense_counts_cover() -> None:
+    analog = load("buses", "fd_5k", BusConfig).analog
+    step_f = analog.sense_farad_per_count
+    ends = [analog.sense_offset_f + step_f * n for n in (-32768, 32767)]
+    words = "{:.2f}..{:.2f} pF in steps of {:.0f} aF".format(*(1e12 * f for f in ends), 1e18 * step_f)
+    assert words in page("docs/lookup/wire.md")
+
+
+def test_how_far_sampled_devices_are_off_in_a_circle() -> None:
+    """As kept; the worst of them runs again."""
+    kept = json.loads((ROOT / "docs" / "tables" / "montecarlo.json").read_text(encoding="utf-8"))["circle_nm"]
+    told = "{median:.0f}, {p95:.0f} and {max:.0f} nm (median, 95 %, worst)".format(**kept)
+    assert f"the circle errs by {told}" in page("docs/understand/laws.md")
+    study = Study(hil.load_scenario("circle"), load("tolerances", "wide", Tolerances))
+    assert run_one(study, kept["max_seed"]).rms_error_nm == pytest.approx(kept["max"], rel=1e-6)
+
+
+def test_how_far_the_laws_reject_and_what_works_of_a_wafer() -> None:
+    """As the pictures have it that stand beside."""
+    rows = json.loads((ROOT / "docs" / "figures" / "margins.json").read_text(encoding="utf-8"))["rows"]
+    hz = {row[0].strip("`"): row[3] for row in rows}
+    s_at_60_hz = float(np.linalg.norm(hil.design("youla").response([60.0]).s[0], 2))
+    words = f"{hz['youla']} Hz; {s_at_60_hz:.2f} | {hz['lqg']} Hz | {hz['robust']} Hz |"
+    assert f"\\|S\\| < -3 dB; at 60 Hz | {words}" in page("docs/understand/laws.md")
+    own = page("docs/do/own-law.md")
+    assert f"rejection to {hz['youla']} Hz, 1 um jumps" in own
+    assert f"disturbances above {hz['lqg']} Hz matter" in own
+    assert f"rejection to {hz['robust']} Hz, stable on all" in own
+    drawings = json.loads((ROOT / "docs/figures/fabrication/for_yield.json").read_text(encoding="utf-8"))["drawings"]
+    text = page("docs/do/wafer.md")
+    assert f"Of plain `design`'s devices {100 * drawings['design']['works']:.0f} % work" in text
+    assert f"of the paper's {100 * drawings['reconstructed']['works']:.0f} %;" in text
 
 
 def test_what_the_page_says_of_the_paper() -> None:
