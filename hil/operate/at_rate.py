@@ -156,10 +156,8 @@ def rehearse(reach: Reach, settings: Settings) -> None:
     reach.farthest(near_m, 0, 1.0)
     path = PathStream(1, 2, start, reach)
     path.take(1, 0, np.zeros((2, 9)), np.zeros(2, np.int32))
-    motion = setpoints.plan(near_m, settings.limits)
-    reach.motion_refusal(*setpoints.looked_at(motion))
     steps: tuple[Callable[[], object], ...] = (
-        lambda: setpoints.go(motion, near_m), setpoints.stop_on_path, setpoints.go_on, setpoints.leave_path,
+        lambda: setpoints.go(near_m, settings.limits, reach.motion_refusal), setpoints.stop_on_path, setpoints.go_on, setpoints.leave_path,
         lambda: setpoints.brake(settings.limits), lambda: setpoints.follow(path, start),
     )  # fmt: skip
     for step in steps:
