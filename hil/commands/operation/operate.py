@@ -22,7 +22,7 @@ def operate(
     """Run the loop of a stage that `pkxyz serve` operates, until Ctrl-C or SIGTERM; at its end the combs are at 0 V."""
     from hil.conformance.proven import with_report
     from hil.lanes.setup import bare_setup
-    from hil.operate.at_rate import operate as run_loop
+    from hil.operate.running.at_rate import operate as run_loop
     from hil.operate.settings import Settings
     from pkxyz_ctrl.config.bus import BusConfig
     from pkxyz_ctrl.config.controller import ControllerConfig

@@ -65,7 +65,7 @@ void controller_clear(void)
     note(pkxyz_ask_to_clear(memory));
 }
 
-void controller_change_law(const pkxyz_change *change)
+void controller_change_law(const pkxyz_law_change_change *change)
 {
     note(pkxyz_take_over(config->law, memory->cycle, change));
 }

@@ -16,7 +16,7 @@ int controller_is_closed(void); /* whether the loop is closed in this mode */
 int controller_status(void);    /* of the first call that failed; 0: none did */
 void controller_request(int event);
 void controller_clear(void);
-void controller_change_law(const pkxyz_change *change); /* between two ticks */
+void controller_change_law(const pkxyz_law_change_change *change); /* between two ticks */
 
 void controller_start(int64_t t_us);
 

@@ -39,7 +39,7 @@ static int is_in_time(const pkxyz_shared_orders *orders, pkxyz_shared_obeyed *ob
 static void take_outputs(const pkxyz_shared_orders *orders)
 {
     pkxyz_outputs *outputs = shared->memory->outputs;
-    pkxyz_position_trigger *trigger = &outputs->trigger;
+    pkxyz_outputs_position_trigger *trigger = &outputs->trigger;
     if (orders->bits & PKXYZ_ORDER_SETTLE) {
         outputs->window_m = orders->window_m;
         outputs->sigmas = orders->sigmas;
