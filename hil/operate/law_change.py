@@ -4,6 +4,8 @@ A linear law listens for a while, told which force is given in its place: its me
 given this force itself (Hanus, Kinnaert, Henrotte 1987).
 """
 
+from collections.abc import Iterable
+
 import numpy as np
 from numpy.typing import NDArray
 
@@ -58,23 +60,28 @@ class Listening:
     """
 
     def __init__(self, new: Records, memory: Records) -> None:
-        self._linear, self._memory, self._state = new["tick"]["linear"][0], memory, memory["tick"][0]
-        self._begin()
+        self._linear = new["tick"]["linear"][0]
+        self._begin(memory)
 
-    def _begin(self) -> None:
+    def _begin(self, memory: Records) -> None:
         self.x = np.zeros(ORDER_MAX)
-        self._next = int(self._memory["tick_index"][0]) + 1
-        self._expected_m = self._state["set_point_model"]["sample_m"][0].copy()
+        self._next = int(memory["tick_index"][0]) + 1
+        self._expected_m = memory["tick"]["set_point_model"]["sample_m"][0, 0].copy()
         self.ticks = 0
         self._mean_n, self._square_n2, self._off_n = np.zeros(3), np.zeros(3), np.zeros(3)
 
-    def listen(self) -> None:
-        """A tick is over: x+ = A x + B e + U (w - w given), with w = -(C x + D e). Where one was missed it begins anew."""
-        if self._memory["tick_index"][0] != self._next:
-            self._begin()
+    def listen(self, memories: Iterable[Records]) -> None:
+        """So many ticks are over, and left these memories (1,)."""
+        for memory in memories:
+            self._listen(memory)
+
+    def _listen(self, memory: Records) -> None:
+        """x+ = A x + B e + U (w - w given), with w = -(C x + D e). After a missed one it begins anew."""
+        if memory["tick_index"][0] != self._next:
+            self._begin(memory)
             return
         self._next += 1
-        linear, state = self._linear, self._state
+        linear, state = self._linear, memory["tick"][0]
         error = state["seen_m"] - self._expected_m
         self._expected_m[:] = state["set_point_model"]["sample_m"][0]
         w = -(linear["c"] @ self.x + linear["d"] @ error)

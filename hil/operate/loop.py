@@ -1,5 +1,6 @@
 """What a session needs of the loop beside it: Python's controller, or a native loop that is read and given orders."""
 
+from collections.abc import Iterable
 from typing import Protocol
 
 import numpy as np
@@ -44,6 +45,9 @@ class Loop(Protocol):
     @property
     def is_obeyed(self) -> bool:
         """Whether the change of law that was asked for last was not too late."""
+
+    def passed(self) -> Iterable[Records]:
+        """The memory (1,) of each tick since the session's last step, the newest last, as far as they are known."""
 
     def request(self, event: Event) -> None: ...
 

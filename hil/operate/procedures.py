@@ -146,8 +146,9 @@ def move(stage: Operated, target_m: Array, limits: Limits) -> Steps:
     stage.require_holding("a move")
     _set_out(stage, target_m, limits)
     while not stage.setpoints.has_arrived:
+        _require_set_out(stage)
         yield
-    _require_done(stage)
+    _require_set_out(stage)
     for n in stage.ticks(stage.settings.settle_s):
         if stage.is_in_position:
             return f"in position at {stage.where(target_m)}, {n * stage.period_s * 1e3:.1f} ms after the set-point"
@@ -172,8 +173,9 @@ def jog(stage: Operated, direction: Array, limits: Limits, lease: "Lease") -> St
     target = here + stage.reach.turn.way_to_stage(np.sign(direction) * far_m)
     _set_out(stage, target, limits)
     while lease.lasts and not stage.setpoints.has_arrived:
+        _require_set_out(stage)
         yield
-    _require_done(stage)
+    _require_set_out(stage)
     if stage.setpoints.has_arrived:
         return f"at the end of what the combs hold along {_AXES[axis]}"
     stage.setpoints.brake(stage.settings.limits)
@@ -314,13 +316,14 @@ def change_law(stage: Operated, offered: np.void) -> Steps:
     if (why := law_change.objection(controller.law, new)) is not None:
         raise RefusedError(f"{name}: {why}")
     heard = law_change.Listening(new, controller.memory)
+    change = change_to(new, heard.x, adapts_alike=law_change.adapts_alike(controller.law, new))
     for _ in stage.ticks(_CHANGES_S):
         yield from _listened(stage, heard)
-        alike = law_change.adapts_alike(controller.law, new)
-        controller.change_law(change_to(new, heard.x, adapts_alike=alike))
+        change["x"] = heard.x
+        controller.change_law(change)
         if not controller.is_obeyed:
             yield
-            heard.listen()
+            heard.listen(controller.passed())
         if controller.is_obeyed:
             stage.law_name = offered["name"]
             return f"the law is {name}"
@@ -334,13 +337,13 @@ def _listened(stage: Operated, heard: law_change.Listening) -> Generator[None, N
         if heard.ticks >= least and (heard.ticks >= least + calm or heard.is_calm(_CALM_DEVIATIONS)):
             break
         yield
-        heard.listen()
+        heard.listen(stage.controller.passed())
     if stage.mode not in (Mode.IDLE, Mode.TRACKING):
         raise AbortedError("the stage no longer held")
 
 
-def _require_done(stage: Operated) -> None:
-    """Raise ``AbortedError`` where the set-point came to rest, as it could not set out after all."""
+def _require_set_out(stage: Operated) -> None:
+    """Raise ``AbortedError`` where the set-point could not set out after all."""
     if stage.setpoints.objection is not None:
         raise AbortedError(stage.setpoints.objection)
 

@@ -19,7 +19,7 @@ from hil.operate.path_stream import PathStream
 from hil.operate.procedures import AbortedError, Lease, Operated, RefusedError, Steps
 from hil.operate.reach import Reach
 from hil.operate.sample_axes import PLAIN, Turn
-from hil.operate.setpoints import Setpoints
+from hil.operate.setpoints import Setpoints, rows_of
 from hil.operate.settings import Settings
 from pkxyz_ctrl.safety.modes import NODE_EXPECTED, Mode
 from pkxyz_ctrl.trajectory.segments import Limits
@@ -58,7 +58,7 @@ class Session:
         setpoints: Setpoints | None = None,
     ) -> None:  # fmt: skip
         period_us = controller.period_us
-        setpoints = setpoints or Setpoints.of(controller.law, period_us)
+        setpoints = setpoints or Setpoints(period_us, *rows_of(controller.law))
         self.stage = Operated(controller, setpoints, reach, settings, period_us * 1e-6, law_name.encode()[:NAME_BYTES])
         controller.settle(settings.window_m, settings.sigmas, settings.dwell_s)
         self.settings = settings

@@ -6,7 +6,7 @@ row behind them, from the position, velocity and acceleration that are there.
 
 import math
 from collections.abc import Callable
-from typing import Protocol, Self
+from typing import Protocol
 
 import numpy as np
 from numpy.typing import NDArray
@@ -87,7 +87,7 @@ class Going:
 
 class Setpoints:
     """``runtime.Reference`` of a stage in operation. ``target_m`` (3,): where the present motion ends. ``objection``:
-    why what was asked for could not be done after all, if that is so; the set-point has come to rest then.
+    why what was asked for last could not be done after all, if so; then what was asked for before goes on.
     """
 
     def __init__(self, period_us: int, delay_periods: int, ramp_rows: int) -> None:
@@ -99,11 +99,6 @@ class Setpoints:
         self._rows = self._room()
         self._window = np.zeros(2 * PREVIEW_ROWS + 2 * PIECE_ROWS, REFERENCE)
         self.restart(np.zeros(3))
-
-    @classmethod
-    def of(cls, law: NDArray[np.void], period_us: int) -> Self:
-        """As a law (1,) of ``cycle.LAW`` takes them."""
-        return cls(period_us, int(law["tick"]["delay_periods"][0]), int(law["feed_hold_ticks"][0]))
 
     def restart(self, position_m: Array) -> None:
         """Stand at a position (3,), from row 0 on: the loop has just been closed."""
@@ -209,6 +204,7 @@ class Setpoints:
     def _do(self, step: Callable[[], None]) -> None:
         """Do what is asked."""
         step()
+        self.objection = None
 
     def _renew(self, row: int) -> None:
         """Rows from ``row`` on are about to become other ones."""
@@ -273,3 +269,8 @@ class Setpoints:
         out = np.empty((count, 9))
         fed_rows(window, begin, first - feed.origin, feed.phase, feed.direction, feed.ramp, self._period_s, out)
         return out
+
+
+def rows_of(law: NDArray[np.void]) -> tuple[int, int]:
+    """``delay_periods`` and ``ramp_rows`` of a law (1,) of ``cycle.LAW``."""
+    return int(law["tick"]["delay_periods"][0]), int(law["feed_hold_ticks"][0])

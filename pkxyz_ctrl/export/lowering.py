@@ -71,8 +71,11 @@ def _prepared(kernels: Kernels, target: Target, machine: llvm.TargetMachine) -> 
     text = re.sub(r"@(sqrt|llvm\.sqrt\.f64)\(", f"@{root}(", text)
     if own_root:
         text = re.sub(r"^declare .*@pkxyz\.sqrt\(.*$", "", text, flags=re.MULTILINE)
-    return text + runtime.FLOOR + own_root + "".join(
-        _c_entry(entry, kernels) for entry in entries_for(has_loop=target.has_loop)
+    return (
+        text
+        + runtime.FLOOR
+        + own_root
+        + "".join(_c_entry(entry, kernels) for entry in entries_for(has_loop=target.has_loop))
     )
 
 

@@ -25,7 +25,7 @@ BLOCK_ROWS: Final = 1024
 AHEAD_ROWS: Final = 32
 """... and so many of the next one behind them: what a law looks ahead."""
 SHEET_ROWS: Final = 1024
-SNAPSHOTS: Final = 2
+SNAPSHOTS: Final = 64
 LATENESS_MOST_US: Final = 2000
 EVENTS: Final = 64
 _WORDS: Final = 512
@@ -210,7 +210,7 @@ ORDERS = np.dtype(
 
 OBEYED = np.dtype(
     [
-        ("number", "i8"),  # of the orders that were answered; written last
+        ("number", "i8"),  # of the orders that were answered
         ("refused", "i8"),  # bits of these that came too late
         ("late_rows", "i8"),  # by how much a sheet that was refused came too late
         ("refusals", "i8"),  # of sheets, since the beginning
@@ -232,6 +232,7 @@ SNAPSHOT = np.dtype(
     [
         ("begun", "i8"),  # which it is, from 1 on, before it is written, and ...
         ("number", "i8"),  # ... after it
+        ("obeyed", OBEYED, (1,)),
         ("port", PORT, (1,)),
         ("memory", EXCHANGE_MEMORY, (1,)),
     ],
@@ -241,7 +242,6 @@ SNAPSHOT = np.dtype(
 OPERATED = np.dtype(
     [
         ("orders", ORDERS, (1,)),
-        ("obeyed", OBEYED, (1,)),
         ("newest", "i8"),  # snapshot
         ("snapshots", SNAPSHOT, (SNAPSHOTS,)),  # of the ends of the last ticks
         ("change", CHANGE, (1,)),

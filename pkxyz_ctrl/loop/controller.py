@@ -4,7 +4,7 @@ It owns no clock and no bus. ``runtime`` drives it, whoever owns the time. What 
 here are the way to it, and the words.
 """
 
-from collections.abc import Callable
+from collections.abc import Callable, Iterable
 from struct import Struct
 from typing import Any, Final
 
@@ -91,6 +91,8 @@ class Controller:
         self._finish = direct(exchange.finish, config, memory, 0, 0)
         self._start, self._wait = direct(exchange.start, config, memory, 0), direct(exchange.wait, config, memory, 0)
         self._come_up, self._stop = direct(exchange.come_up, memory), direct(exchange.stop, config, memory, 0)
+        self._ask_to_clear = direct(exchange.ask_to_clear, memory)
+        self._change_law = direct(law_change.take_over, self.law, self.memory, np.zeros(1, law_change.CHANGE))
         self._period = self._period_of()
         self._period(config, memory.copy(), self._reference, 0)  # loaded now, not in the first tick
 
@@ -178,7 +180,11 @@ class Controller:
 
     def change_law(self, change: Records) -> None:
         """Another law, (1,) of ``law_change.CHANGE``, takes over before the next tick."""
-        law_change.take_over(self.law, self.memory, change)
+        self._change_law(self.law, self.memory, change)
+
+    def passed(self) -> Iterable[Records]:
+        """The memory of the ticks since somebody looked last: of one."""
+        return (self.memory,)
 
     @property
     def is_obeyed(self) -> bool:
@@ -194,7 +200,7 @@ class Controller:
         """Ask to forget the fault. Once the combs have been at 0 V for long enough, gate, driver and node start anew,
         tick by tick, while the loop goes on; where that failed, it is tried again. Without a fault nothing happens.
         """
-        exchange.ask_to_clear(self.exchange)
+        self._ask_to_clear(self.exchange)
 
     # -- one tick ---------------------------------------------------------------------------------------------------
 

@@ -12,6 +12,7 @@ enum { LOOKED_AHEAD = 2 }; /* rows, behind the delay */
 
 static pkxyz_shared *shared;
 static const pkxyz_shared_sheet *sheet;
+static pkxyz_shared_obeyed obeyed;
 static int wake_descriptor = -1;
 
 void orders_begin(pkxyz_shared *with, int wake)
@@ -26,13 +27,13 @@ static int64_t free_row(void)
     return shared->memory->cycle->reference_tick + shared->config->law->tick.delay_periods + LOOKED_AHEAD;
 }
 
-static int is_in_time(const pkxyz_shared_orders *orders, pkxyz_shared_obeyed *obeyed)
+static int is_in_time(const pkxyz_shared_orders *orders)
 {
     const int64_t late = free_row() - orders->changed_from;
     if (late <= 0 || controller_mode() != PKXYZ_MODE_TRACKING)
         return 1;
-    obeyed->late_rows = late;
-    obeyed->refusals++;
+    obeyed.late_rows = late;
+    obeyed.refusals++;
     return 0;
 }
 
@@ -55,21 +56,21 @@ static void take_outputs(const pkxyz_shared_orders *orders)
     }
 }
 
-static void obey(const pkxyz_shared_orders *orders, pkxyz_shared_obeyed *obeyed)
+static void obey(const pkxyz_shared_orders *orders)
 {
     pkxyz_exchange_memory *memory = shared->memory;
-    obeyed->refused = 0;
+    obeyed.refused = 0;
     if (orders->bits & PKXYZ_ORDER_SHEET) {
-        if (is_in_time(orders, obeyed))
+        if (is_in_time(orders))
             sheet = &shared->operated->sheets[orders->sheet & 1];
         else
-            obeyed->refused |= PKXYZ_ORDER_SHEET;
+            obeyed.refused |= PKXYZ_ORDER_SHEET;
     }
     if (orders->bits & PKXYZ_ORDER_LAW) {
         if (memory->cycle->tick_index <= orders->tick + 1)
             controller_change_law(shared->operated->change);
         else
-            obeyed->refused |= PKXYZ_ORDER_LAW;
+            obeyed.refused |= PKXYZ_ORDER_LAW;
     }
     if (orders->bits & PKXYZ_ORDER_REQUEST && memory->event == 0) /* what the loop asks for itself goes first */
         controller_request(orders->event);
@@ -92,11 +93,10 @@ static int reaches(int64_t count)
 void orders_take(const pkxyz_reference **rows, int32_t *count)
 {
     const pkxyz_shared_orders *orders = shared->operated->orders;
-    pkxyz_shared_obeyed *obeyed = shared->operated->obeyed;
     const int64_t number = atomic_load_explicit((const _Atomic int64_t *)&orders->number, memory_order_acquire);
-    if (number != obeyed->number) {
-        obey(orders, obeyed);
-        atomic_store_explicit((_Atomic int64_t *)&obeyed->number, number, memory_order_release);
+    if (number != obeyed.number) {
+        obey(orders);
+        obeyed.number = number;
     }
     if (!sheet)
         return;
@@ -117,6 +117,7 @@ void orders_leave(void)
     pkxyz_shared_snapshot *snapshot = &operated->snapshots[number % PKXYZ_SNAPSHOTS];
     atomic_store_explicit((_Atomic int64_t *)&snapshot->begun, number, memory_order_relaxed);
     atomic_thread_fence(memory_order_release); /* whoever sees any of what follows sees that it was begun */
+    *snapshot->obeyed = obeyed; /* with the tick that they acted in, and not before */
     *snapshot->port = *shared->state->port;
     memcpy(snapshot->memory, shared->memory, sizeof *snapshot->memory);
     atomic_store_explicit((_Atomic int64_t *)&snapshot->number, number, memory_order_release);
