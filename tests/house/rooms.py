@@ -84,7 +84,7 @@ HOUSE: Mapping[str, Room] = MappingProxyType({
     )),
     "hil.emulator": Room(("pkxyz_ctrl.*", "hil.faults", "hil.lanes")),
     "hil.conformance": Room(("sim.config", "sim", "pkxyz_ctrl.*", "hil.bus", "hil.node", "hil.plant", "hil.lanes")),
-    "hil.operate": Room(("pkxyz_ctrl.*", "hil.bus", "hil.lanes")),
+    "hil.operate": Room(("pkxyz_ctrl.*", "hil.lanes")),
     "hil.native": Room(("pkxyz_ctrl.*", "hil.bus", "hil.recording", "hil.lanes")),
     "hil.operate.running": Room((
         "pkxyz_ctrl.*", "hil.bus", "hil.recording", "hil.lanes", "hil.operate", "hil.native",
@@ -131,8 +131,8 @@ HOUSE: Mapping[str, Room] = MappingProxyType({
         "hil.runs", "hil.studies", "hil.pictures", "hil.screen", "hil.bench.rigs", "hil.bench", "hil.commands.studies",
     )),
     "hil.commands.operation": Room((
-        "pkxyz_ctrl.*", "hil.lanes", "hil.conformance", "hil.operate", "hil.native", "hil.operate.running", "hil.server",
-        "hil.screen",
+        "pkxyz_ctrl.*", "hil.lanes", "hil.conformance", "hil.operate", "hil.native", "hil.operate.running",
+        "hil.server", "hil.screen",
     )),
     "hil": Room((
         "pkxyz_ctrl.*", "hil.lanes", "hil.runs", "hil.screen", "hil.api", "hil.commands.studies", "hil.commands",

@@ -19,6 +19,8 @@ void orders_begin(pkxyz_shared *with, int wake)
 {
     shared = with;
     wake_descriptor = wake;
+    sheet = 0;
+    obeyed = (pkxyz_shared_obeyed){0};
 }
 
 /* The first row of the set-points that the law has not seen. */
