@@ -20,6 +20,7 @@ from hil.native.program import compiled, compiler
 from hil.operate.commands import Activity, State, Verb
 from hil.operate.law_change import OFFER
 from hil.runs.scenario import load_scenario
+from pkxyz_ctrl.client import place
 from pkxyz_ctrl.compiled.kernel_cache import choose_kernel_cache
 from pkxyz_ctrl.config.controller import ControllerConfig
 from pkxyz_ctrl.config.files import load
@@ -145,17 +146,17 @@ def test_a_session_that_stands_still_while_the_stage_holds_is_not_noticed(bench,
 def test_a_session_that_is_killed_leaves_a_stage_that_is_led_down(bench, changes):
     changes("pre-operational", False)
     path, start = raster_rows(1000)
-    with UnixBus(f"{bench}/bus") as observer, operating(bench) as operator:
+    with operating(bench) as operator:
         operator.switched_on()
         operator.follow(4, path, start)
-        while observer.recv(0) is not None:  # what went before
-            pass
-        loop = operator.loop
-        os.kill(operator.session, signal.SIGKILL)
-        seen, end_s = [], time.monotonic() + 20
-        while os.path.exists(f"/proc/{loop}") and time.monotonic() < end_s:
-            if (message := observer.recv(0.05)) is not None:
-                seen.append(message)
+        with UnixBus(f"{bench}/bus") as observer:
+            loop = operator.loop
+            next_with(observer, DRIVE)
+            os.kill(operator.session, signal.SIGKILL)
+            seen, end_s = [], time.monotonic() + 20
+            while place._is_alive(loop) and time.monotonic() < end_s:
+                if (message := observer.recv(0.05)) is not None:
+                    seen.append(message)
         assert changes("pre-operational", False)[-2]["driven"]
     assert not any(message.arbitration_id == EMCY and any(message.data) for message in seen)
     most = [max(np.frombuffer(m.data[:6], "<i2").tolist()) for m in seen if m.arbitration_id == DRIVE]
@@ -167,10 +168,9 @@ def test_a_session_that_is_killed_leaves_a_stage_that_is_led_down(bench, changes
 def test_a_loop_that_is_killed_is_missed_by_the_node_and_told(bench, changes):
     changes("pre-operational", False)
     words = ("--bus", "quick.toml", "--native")
-    with UnixBus(f"{bench}/bus") as observer, operating(bench, *words) as operator:
+    with operating(bench, *words) as operator, UnixBus(f"{bench}/bus") as observer:
         operator.switched_on()
-        next_with(observer, DRIVE)
-        while observer.recv(0) is not None:
+        while next_with(observer, DRIVE).timestamp < time.time() - 0.1:  # what went before
             pass
         os.kill(operator.loop, signal.SIGKILL)
         assert_missed_by_the_node(observer, time.time())
