@@ -196,6 +196,8 @@ class Setpoints:
 
     _reach_rows = PREVIEW_ROWS
     """for which there is always room ahead"""
+    _first_rows = PREVIEW_ROWS
+    """made at once where something is asked for"""
 
     def _room(self) -> NDArray[np.void]:
         """Where rows stand, (BLOCK_ROWS,) of ``REFERENCE``."""
@@ -238,7 +240,7 @@ class Setpoints:
 
     def _anew(self) -> None:
         self._filled = self.free_row
-        self._sample(PREVIEW_ROWS)
+        self._sample(self._first_rows)
 
     def _begin(self, row: int) -> None:
         self._base = self._filled = row

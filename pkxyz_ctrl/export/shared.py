@@ -212,7 +212,7 @@ OBEYED = np.dtype(
     [
         ("number", "i8"),  # of the orders that were answered
         ("refused", "i8"),  # bits of these that came too late
-        ("late_rows", "i8"),  # by how much a sheet that was refused came too late
+        ("late_rows", "i8"),  # by how much the last sheet came too late; negative: it had so much time left
         ("refusals", "i8"),  # of sheets, since the beginning
     ],
     align=True,

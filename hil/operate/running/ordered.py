@@ -68,7 +68,7 @@ class Ordered(Teller):
         if refused & Order.SHEET:
             setpoints.refused(int(self.memory["reference_tick"][0]), int(self._obeyed["late_rows"]))
             return False
-        setpoints.answered()
+        setpoints.answered(int(self._obeyed["late_rows"]))
         self._before, self._stepped = self._stepped, self.seen
         return True
 

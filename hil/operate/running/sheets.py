@@ -21,7 +21,13 @@ Array = NDArray[np.float64]
 
 _AHEAD_S, _AHEAD_LEAST_ROWS = 0.03, 128
 """So far ahead there are rows, and at least so many: for a session that stands still."""
-_MARGIN_ROWS, _MARGIN_MOST_ROWS = 1, 64
+_FIRST_ROWS = 12
+"""Made before the loop is told; the others follow."""
+_MARGIN_LEAST, _MARGIN_KEPT, _MARGIN_MOST = 1, 6, 64
+"""How many rows behind those that the law has seen something begins: at least; at most once the loop has taken it; and
+where it was refused.
+"""
+_IN_TIME = 16  # sheets in a row with a tick to spare, until the margin is a row less
 _NEVER = np.iinfo(np.int64).max
 
 assert SHEET_ROWS == BLOCK_ROWS
@@ -50,10 +56,11 @@ class Sheets(Setpoints):
         self._before: _Before | None = None
         self._steps: list[Callable[[], None]] = []
         self._source, self._feed, self.target_m = Standing(np.zeros(3)), Feed(0), np.zeros(3)
+        self._first_rows = _FIRST_ROWS
         self._reach_rows = max(_AHEAD_LEAST_ROWS, math.ceil(_AHEAD_S * 1e6 / period_us))
         super().__init__(period_us, delay_periods, ramp_rows)
-        self._seen_rows = self._kept
-        self._plan_ahead(_MARGIN_ROWS)
+        self._seen_rows, self._in_time = self._kept, 0
+        self._plan_ahead(_MARGIN_LEAST)
 
     def extend(self) -> None:
         """Make rows as far ahead as they are to be, where the path has them; to be called once the loop knows of all
@@ -65,11 +72,16 @@ class Sheets(Setpoints):
                 break
             self._sample(PIECE_ROWS)
 
-    def answered(self) -> None:
-        """The loop has taken the sheet, if there was another."""
+    def answered(self, late_rows: int) -> None:
+        """The loop has taken the sheet, if there was another: it came ``late_rows`` too late, which is 0 or less."""
+        if self._steps:
+            margin = min(self._kept - self._seen_rows, _MARGIN_KEPT)
+            self._in_time = self._in_time + 1 if late_rows < 0 else 0
+            if self._in_time == _IN_TIME:
+                margin, self._in_time = max(_MARGIN_LEAST, margin - 1), 0
+            self._plan_ahead(margin)
         self.changed_from = self._before = None
         self._steps.clear()
-        self._plan_ahead(_MARGIN_ROWS)
 
     def refused(self, row: int, late_rows: int) -> None:
         """The loop has come to ``row`` with the sheet before, as this one was ``late_rows`` too late: again."""
@@ -77,10 +89,10 @@ class Sheets(Setpoints):
         self._source, self._feed, self.target_m, self.page, self._base, self._filled = self._before
         self._rows, steps = self._pages[self.page]["rows"], self._steps
         self.changed_from, self._before, self._steps = None, None, []
-        margin = 2 * (self._kept - self._seen_rows) + late_rows
+        margin, self._in_time = self._kept - self._seen_rows + late_rows, 0
         self.advance(row)
         self.extend()
-        self._plan_ahead(max(_MARGIN_ROWS, min(margin, self._filled - row - self._seen_rows)))
+        self._plan_ahead(max(_MARGIN_LEAST, min(margin, self._filled - row - self._seen_rows, _MARGIN_MOST)))
         for step in steps:
             try:
                 self._do(step)

@@ -31,10 +31,9 @@ static int64_t free_row(void)
 
 static int is_in_time(const pkxyz_shared_orders *orders)
 {
-    const int64_t late = free_row() - orders->changed_from;
-    if (late <= 0 || controller_mode() != PKXYZ_MODE_TRACKING)
+    obeyed.late_rows = free_row() - orders->changed_from;
+    if (obeyed.late_rows <= 0 || controller_mode() != PKXYZ_MODE_TRACKING)
         return 1;
-    obeyed.late_rows = late;
     obeyed.refusals++;
     return 0;
 }
