@@ -29,7 +29,7 @@ class Ordered(Teller):
         """``shared``: a record of ``SHARED``, mapped."""
         self._events, self._operated = shared["events"][0], shared["operated"][0]
         self._orders, self._obeyed = self._operated["orders"][0], np.zeros(1, OBEYED)[0]
-        self._bits = self._given = self._number = 0
+        self._bits = self._handed_in = self._number = 0
         self._change: Records | None = None
         self._wanted = np.zeros(1, outputs.OUTPUTS)
         self._is_law_refused = False
@@ -60,8 +60,8 @@ class Ordered(Teller):
         """Whether the loop has answered all orders, and none of them has to be given again."""
         if int(self._obeyed["number"]) != self._number:
             return False
-        given, refused, self._given = self._given, int(self._obeyed["refused"]) & self._given, 0
-        if given & Order.LAW:
+        handed_in, refused, self._handed_in = self._handed_in, int(self._obeyed["refused"]) & self._handed_in, 0
+        if handed_in & Order.LAW:
             self._is_law_refused = bool(refused & Order.LAW)
             if not self._is_law_refused and self._change is not None:
                 self.law[0] = self._change["law"][0]
@@ -81,7 +81,7 @@ class Ordered(Teller):
 
     @property
     def is_obeyed(self) -> bool:
-        return not ((self._bits | self._given) & Order.LAW or self._is_law_refused)
+        return not ((self._bits | self._handed_in) & Order.LAW or self._is_law_refused)
 
     # -- what is asked for --------------------------------------------------------------------------------------------
 
@@ -124,7 +124,7 @@ class Ordered(Teller):
             orders["changed_from"], orders["sheet"] = setpoints.changed_from, setpoints.page
             self._bits |= Order.SHEET
         if self._bits:
-            orders["bits"] = self._given = self._bits
+            orders["bits"] = self._handed_in = self._bits
             self._bits = 0
             self._number += 1
             orders["number"] = self._number
