@@ -33,7 +33,7 @@ COMPANY_S = 30.0
 _LOOK_S = 0.02
 GUARDS_PER_PERIOD = 8
 SILENT_US = 500_000  # after a fault, for so long without its heartbeat, the amplifier is gone
-_NO_END = 1 << 60  # ticks
+NO_END = 1 << 60  # ticks
 _LANDED_TICKS = 2  # that begin and end a way down
 _LAST_FRAMES_S = 0.02  # 0 V and pre-operational leave even a slow adapter before it is closed
 
@@ -234,7 +234,7 @@ class WallRig:
         """Run until somebody ends it: set-points are handed in, and ``after`` is called after each tick. Raises
         ``Ended``.
         """
-        run(self.ticks, self.port, self.controller, reference, _NO_END, after)
+        run(self.ticks, self.port, self.controller, reference, NO_END, after)
 
     def close(self) -> None:
         """0 V, pre-operational, off the bus, and an ordinary process again."""

@@ -29,7 +29,7 @@ class RingRecorder:
 
         def begin() -> Read:
             os.close(self.pipe)
-            return _RingReader(mapped, alive)
+            return _reader(RingBytes(mapped), alive)
 
         self._writer = WriterProcess(recording, frames, metadata, channel, watch, begin)
         self.writer_pid = self._writer.pid
@@ -52,24 +52,32 @@ class RingRecorder:
         self._writer.wait()
 
 
-class _RingReader:
-    """``writer_process.Read`` of the ring."""
+class RingBytes:
+    """What the loop has put into the ring; one alone may take it."""
 
-    def __init__(self, mapped: Mapped, alive: int) -> None:
+    def __init__(self, mapped: Mapped) -> None:
         self._ring, self._bytes = mapped.shared["ring"][0, 0], mapped.ring
-        self._alive = alive
 
-    def __call__(self) -> bytes:
-        is_alive = True
-        while True:
-            tail = int(self._ring["tail"])
-            count = min(int(self._ring["head"]) - tail, _READ_MOST_BYTES)
-            if count or not is_alive:
-                part = self._at(tail % len(self._bytes), count)
-                self._ring["tail"] = tail + count
-                return part
-            is_alive = not select.select((self._alive,), (), (), _LOOK_S)[0]
+    def take(self) -> bytes:
+        """What there is, as whole ticks unless it is very much; nothing if there is nothing."""
+        tail = int(self._ring["tail"])
+        count = min(int(self._ring["head"]) - tail, _READ_MOST_BYTES)
+        part = self._at(tail % len(self._bytes), count)
+        self._ring["tail"] = tail + count
+        return part
 
     def _at(self, begin: int, count: int) -> bytes:
         first = bytes(self._bytes[begin : begin + count])
         return first + bytes(self._bytes[: count - len(first)])
+
+
+def _reader(ring: RingBytes, alive: int) -> Read:
+    def read() -> bytes:
+        is_alive = True
+        while True:
+            part = ring.take()
+            if part or not is_alive:
+                return part
+            is_alive = not select.select((alive,), (), (), _LOOK_S)[0]
+
+    return read

@@ -5,7 +5,7 @@ from numpy.typing import NDArray
 
 from hil.bus.unix_folder import folder_of
 from hil.lanes.setup import Setup
-from hil.lanes.wall import GUARDS_PER_PERIOD, SILENT_US
+from hil.lanes.wall import GUARDS_PER_PERIOD, NO_END, SILENT_US
 from pkxyz_ctrl.can import cob_id
 from pkxyz_ctrl.config.bus import CanConfig
 from pkxyz_ctrl.config.files import ConfigError
@@ -45,10 +45,15 @@ def require_native(setup: Setup, can: CanConfig) -> None:
         raise ConfigError(f"{error}, or {_LEAVE}") from None
 
 
-def fill(settings: NDArray[np.void], setup: Setup, can: CanConfig, company_s: float) -> None:
-    """Write (1,) of ``SETTINGS``; what is said of the file itself stands there already."""
+def fill(
+    settings: NDArray[np.void], setup: Setup, can: CanConfig, company_s: float, *, is_operated: bool = False
+) -> None:
+    """Write (1,) of ``SETTINGS``; what is said of the file itself stands there already. A stage that is operated has no
+    last tick.
+    """
     to, period_us, channel = settings[0], setup.bus.period_us, _channel(can)
-    to["period_us"], to["ticks"], to["landing_ticks"] = period_us, setup.ticks, setup.law["landing_ticks"][0]
+    to["is_operated"], to["ticks"] = is_operated, NO_END if is_operated else setup.ticks
+    to["period_us"], to["landing_ticks"] = period_us, setup.law["landing_ticks"][0]
     to["sense_deadline_us"], to["heartbeat_deadline_us"] = can.sense_deadline_us, can.heartbeat_deadline_us
     to["guard_us"], to["latest_start_us"] = period_us // GUARDS_PER_PERIOD, can.sense_deadline_us // 2
     to["spin_us"], to["company_us"], to["silent_us"] = SPIN_US, round(company_s * 1e6), SILENT_US

@@ -2,17 +2,16 @@
 
 import numpy as np
 
+from hil.operate.loop import Loop
 from hil.operate.procedures import RefusedError
 from pkxyz_ctrl.config.files import ConfigError, parse
 from pkxyz_ctrl.config.triggers import PositionTrigger
-from pkxyz_ctrl.loop import outputs
-from pkxyz_ctrl.loop.controller import Controller
 
 
-def aim(controller: Controller, command: np.void) -> str:
+def aim(controller: Loop, command: np.void) -> str:
     """Do as a record of ``COMMAND`` says; returns words. Raises ``RefusedError``."""
     if command["count"] == 0:
-        outputs.aim(controller.outputs, 0, 0, 0.0, 0.0, 0)
+        controller.aim(0, 0, 0.0, 0.0, 0)
         return "no position is told"
     asked = {
         "axis": "xyz"[int(command["axis"]) % 3], "direction": int(command["direction"]),
@@ -23,7 +22,6 @@ def aim(controller: Controller, command: np.void) -> str:
     except ConfigError as error:
         raise RefusedError(str(error).replace("\n", "; ")) from None
     axis = "xyz".index(wanted.axis)
-    outputs.aim(controller.outputs, axis, wanted.direction, wanted.start_m, wanted.pitch_m, wanted.count)
-    is_there = controller.exchange["driver"]["has_outputs"][0, 0]
+    controller.aim(axis, wanted.direction, wanted.start_m, wanted.pitch_m, wanted.count)
     told = f"{wanted.count} positions along the stage's {wanted.axis}, every {wanted.pitch_m * 1e9:g} nm"
-    return told if is_there else f"{told}; recorded only: this amplifier has no digital outputs"
+    return told if controller.has_outputs else f"{told}; recorded only: this amplifier has no digital outputs"

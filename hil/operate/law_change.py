@@ -1,15 +1,14 @@
-"""Another law for a stage that holds: its numbers take the place of the present one's between two ticks, and its memory
-begins where the force at the platform stays what it is.
+"""What comes before another law takes over (``pkxyz_ctrl.loop.law_change``) from the one by which a stage holds.
 
-Filter and model of the set-points go on. What the adaptation had added becomes disturbance in the filter where the new
-law does not adapt likewise. A linear law listens for a while before, told which force is given in its place: its memory
-is then that of a law which has given this force itself (Hanus, Kinnaert, Henrotte 1987).
+A linear law listens for a while, told which force is given in its place: its memory is then that of a law which has
+given this force itself (Hanus, Kinnaert, Henrotte 1987).
 """
+
+from collections.abc import Iterable
 
 import numpy as np
 from numpy.typing import NDArray
 
-from pkxyz_ctrl.core import youla
 from pkxyz_ctrl.core.demand import LINEAR, OPEN_LOOP, PREDICTIVE
 from pkxyz_ctrl.core.linear_law import ORDER_MAX
 from pkxyz_ctrl.loop import cycle as cycling
@@ -43,25 +42,9 @@ def objection(present: Records, new: Records) -> str | None:
     return None
 
 
-def take_over(present: Records, memory: Records, new: Records, heard: Array | None = None) -> None:
-    """Write the numbers of ``new`` into ``present``, which the loop reads, and its memory (1,) of ``cycle.MEMORY``
-    likewise; ``heard`` is what a linear law begins with. Both as ``objection`` accepts them, between two ticks, the
-    stage at rest or its loop open.
-    """
-    before, after, state = present["tick"][0].copy(), new["tick"][0], memory["tick"][0]
-    added = state["adaptation"]["added_n"].copy() if before["adaptation"]["on"] else np.zeros(3)
-    adapts_alike = _alike(present["tick"]["adaptation"], new["tick"]["adaptation"])
-    present[:] = new
-    _move_origin(before, after, state)
-    if not adapts_alike:
-        state["adaptation"] = np.zeros((), state["adaptation"].dtype)
-        for estimate in ("predicted", "filtered", "ahead"):
-            state["estimate"][estimate][6:9] -= added
-        added = np.zeros(3)
-    state["held_n"] = state["feedforward_n"] + added  # not every law keeps it
-    youla.clear(state["youla"])
-    state["youla"]["faded"] = 0
-    state["linear"]["x"] = 0.0 if heard is None else heard
+def adapts_alike(present: Records, new: Records) -> bool:
+    """Whether two laws (1,) learn in the same way, so that what was learnt goes on."""
+    return _alike(present["tick"]["adaptation"], new["tick"]["adaptation"])
 
 
 def _alike(one: Records, other: Records) -> bool:
@@ -70,43 +53,48 @@ def _alike(one: Records, other: Records) -> bool:
 
 
 class Listening:
-    """A linear law of ``new`` (1,) that does not act yet. ``x`` (ORDER_MAX,) is its memory.
+    """A linear law of ``new`` (1,) that does not act yet. ``x`` (ORDER_MAX,) is its memory, after ``ticks`` in a row.
 
     What holds the stage is the mean of the force that is fed back. A law that answers to noise from tick to tick does
     not hand that on, nor is it to end in the middle of it.
     """
 
     def __init__(self, new: Records, memory: Records) -> None:
-        self._linear, self._state = new["tick"]["linear"][0], memory["tick"][0]
+        self._linear = new["tick"]["linear"][0]
+        self._begin(memory)
+
+    def _begin(self, memory: Records) -> None:
         self.x = np.zeros(ORDER_MAX)
-        self._expected_m = self._state["set_point_model"]["sample_m"][0].copy()
-        self._ticks = 0
+        self._next = int(memory["tick_index"][0]) + 1
+        self._expected_m = memory["tick"]["set_point_model"]["sample_m"][0, 0].copy()
+        self.ticks = 0
         self._mean_n, self._square_n2, self._off_n = np.zeros(3), np.zeros(3), np.zeros(3)
 
-    def listen(self) -> None:
-        """A tick is over: x+ = A x + B e + U (w - w given), with w = -(C x + D e)."""
-        linear, state = self._linear, self._state
+    def listen(self, memories: Iterable[Records]) -> None:
+        """So many ticks are over, and left these memories (1,)."""
+        for memory in memories:
+            self._listen(memory)
+
+    def _listen(self, memory: Records) -> None:
+        """x+ = A x + B e + U (w - w given), with w = -(C x + D e). After a missed one it begins anew."""
+        if memory["tick_index"][0] != self._next:
+            self._begin(memory)
+            return
+        self._next += 1
+        linear, state = self._linear, memory["tick"][0]
         error = state["seen_m"] - self._expected_m
         self._expected_m[:] = state["set_point_model"]["sample_m"][0]
         w = -(linear["c"] @ self.x + linear["d"] @ error)
-        self._ticks += 1
+        self.ticks += 1
         fed_back_n = state["set_point_model"]["fed_back_n"]
-        self._mean_n += (fed_back_n - self._mean_n) / self._ticks
+        self._mean_n += (fed_back_n - self._mean_n) / self.ticks
         self._off_n = fed_back_n - self._mean_n
-        self._square_n2 += (self._off_n**2 - self._square_n2) / self._ticks
+        self._square_n2 += (self._off_n**2 - self._square_n2) / self.ticks
         self.x = linear["a"] @ self.x + linear["b"] @ error + linear["unwind"] @ (w - self._mean_n)
 
     def is_calm(self, deviations: float) -> bool:
         """Whether the force of this tick is within so many of its standard deviations of its mean, in each axis."""
         return bool(np.all(self._off_n**2 <= deviations**2 * self._square_n2))
-
-
-def _move_origin(before: np.void, after: np.void, state: np.void) -> None:
-    """The filter's states are about an operating point, which may be another one."""
-    moved = before["estimator"]["operating_point_m"] - after["estimator"]["operating_point_m"]
-    for estimate in ("predicted", "filtered", "ahead"):
-        state["estimate"][estimate][0:3] += moved
-    state["set_point_model"]["state"][0:3] += moved
 
 
 def _gives_at_rest(linear: np.void) -> float:

@@ -1,16 +1,18 @@
 """The verbs that take time, each as a generator that is resumed once a tick and returns what was reached, in words."""
 
-from collections.abc import Generator
+from collections.abc import Generator, Iterator
 from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
 
+from hil.operate import law_change
+from hil.operate.loop import Loop
 from hil.operate.path_stream import PathStream
 from hil.operate.reach import Reach
 from hil.operate.setpoints import Setpoints
 from hil.operate.settings import Settings
-from pkxyz_ctrl.loop.controller import Controller
+from pkxyz_ctrl.loop.law_change import change_to
 from pkxyz_ctrl.safety.modes import LOOP_CLOSED, MODE_FACTS, Event, Mode, refusal
 from pkxyz_ctrl.trajectory import TrajectoryError
 from pkxyz_ctrl.trajectory.segments import Limits
@@ -24,6 +26,9 @@ _NEAR_M = 1e-12
 _SETTLES_S, _STARTS_S = 2.0, 10.0
 _BUFFERED_ROWS = 512  # of a path, before it is begun
 _AXES = "xyz"
+_LISTENS_S = 0.05  # a new law, before it acts
+_CALM_S, _CALM_DEVIATIONS = 0.2, 0.25  # for so long at most it waits for a tick whose force is as near to its mean
+_CHANGES_S = 2.0  # a law that comes too late for so long is not changed
 
 
 class RefusedError(Exception):
@@ -38,15 +43,18 @@ class AbortedError(Exception):
 class Operated:
     """What procedures work on."""
 
-    controller: Controller
+    controller: Loop
     setpoints: Setpoints
     reach: Reach
     settings: Settings
     period_s: float
+    law_name: bytes = b""
     path: PathStream | None = None
     """that is being followed"""
     said: str = ""
     """what a procedure has to tell before its end"""
+    passed: int = 0
+    """ticks, since the beginning"""
 
     @property
     def mode(self) -> int:
@@ -73,9 +81,11 @@ class Operated:
         """A position (3,) of the stage in words: where on the sample."""
         return _um(self.reach.turn.to_sample(position_m))
 
-    def ticks(self, seconds: float) -> range:
-        """As many as there are in a time."""
-        return range(round(seconds / self.period_s))
+    def ticks(self, seconds: float) -> Iterator[int]:
+        """Ticks from now on, as they pass, for a time: 0, and at each step how many it were."""
+        begin, most = self.passed, round(seconds / self.period_s)
+        while (age := self.passed - begin) < most:
+            yield age
 
     def require_holding(self, what: str) -> None:
         """Raise ``RefusedError`` unless the loop is closed and follows."""
@@ -136,7 +146,9 @@ def move(stage: Operated, target_m: Array, limits: Limits) -> Steps:
     stage.require_holding("a move")
     _set_out(stage, target_m, limits)
     while not stage.setpoints.has_arrived:
+        _require_set_out(stage)
         yield
+    _require_set_out(stage)
     for n in stage.ticks(stage.settings.settle_s):
         if stage.is_in_position:
             return f"in position at {stage.where(target_m)}, {n * stage.period_s * 1e3:.1f} ms after the set-point"
@@ -161,7 +173,9 @@ def jog(stage: Operated, direction: Array, limits: Limits, lease: "Lease") -> St
     target = here + stage.reach.turn.way_to_stage(np.sign(direction) * far_m)
     _set_out(stage, target, limits)
     while lease.lasts and not stage.setpoints.has_arrived:
+        _require_set_out(stage)
         yield
+    _require_set_out(stage)
     if stage.setpoints.has_arrived:
         return f"at the end of what the combs hold along {_AXES[axis]}"
     stage.setpoints.brake(stage.settings.limits)
@@ -294,17 +308,54 @@ def clear(stage: Operated) -> Steps:
     raise AbortedError(f"the amplifier did not come back in {_STARTS_S:g} s: {stage.controller.faults[-1:]}")
 
 
+def change_law(stage: Operated, offered: np.void) -> Steps:
+    """To a law, a record of ``law_change.OFFER``, without a jump."""
+    controller, name = stage.controller, offered["name"].decode()
+    new = np.array([offered["law"]])
+    new["autostart"] = controller.law["autostart"]
+    if (why := law_change.objection(controller.law, new)) is not None:
+        raise RefusedError(f"{name}: {why}")
+    heard = law_change.Listening(new, controller.memory)
+    change = change_to(new, heard.x, adapts_alike=law_change.adapts_alike(controller.law, new))
+    for _ in stage.ticks(_CHANGES_S):
+        yield from _listened(stage, heard)
+        change["x"] = heard.x
+        controller.change_law(change)
+        if not controller.is_obeyed:
+            yield
+            heard.listen(controller.passed())
+        if controller.is_obeyed:
+            stage.law_name = offered["name"]
+            return f"the law is {name}"
+    raise AbortedError("the law came too late again and again, and is as it was: free the machine, and ask again")
+
+
+def _listened(stage: Operated, heard: law_change.Listening) -> Generator[None, None, None]:
+    """Until the law that listens may act."""
+    least, calm = (round(s / stage.period_s) if stage.is_driven else 0 for s in (_LISTENS_S, _CALM_S))
+    for _ in stage.ticks(_CHANGES_S):
+        if heard.ticks >= least and (heard.ticks >= least + calm or heard.is_calm(_CALM_DEVIATIONS)):
+            break
+        yield
+        heard.listen(stage.controller.passed())
+    if stage.mode not in (Mode.IDLE, Mode.TRACKING):
+        raise AbortedError("the stage no longer held")
+
+
+def _require_set_out(stage: Operated) -> None:
+    """Raise ``AbortedError`` where the set-point could not set out after all."""
+    if stage.setpoints.objection is not None:
+        raise AbortedError(stage.setpoints.objection)
+
+
 def _set_out(stage: Operated, target_m: Array, limits: Limits) -> None:
     """Raise ``RefusedError`` where the combs can't hold the target or follow on the way, before anything moves."""
     if (why := stage.reach.target_refusal(target_m)) is not None:
         raise RefusedError(why)
     try:
-        motion = stage.setpoints.plan(target_m, limits)
+        stage.setpoints.go(target_m, limits, stage.reach.motion_refusal)
     except TrajectoryError as error:
         raise RefusedError(str(error)) from None
-    if (why := stage.reach.motion_refusal(*stage.setpoints.looked_at(motion))) is not None:
-        raise RefusedError(why)
-    stage.setpoints.go(motion, target_m)
 
 
 def _not_now(mode: int, event: Event, remedy: str) -> str:

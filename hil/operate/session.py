@@ -10,19 +10,18 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from hil.operate import law_change, procedures
+from hil.operate import procedures
 from hil.operate.aiming import aim
 from hil.operate.commands import ANSWER, SESSION, Activity, State, Verb
+from hil.operate.law_change import NAME_BYTES
+from hil.operate.loop import Loop
 from hil.operate.path_stream import PathStream
 from hil.operate.procedures import AbortedError, Lease, Operated, RefusedError, Steps
 from hil.operate.reach import Reach
 from hil.operate.sample_axes import PLAIN, Turn
-from hil.operate.setpoints import Setpoints
+from hil.operate.setpoints import Setpoints, rows_of
 from hil.operate.settings import Settings
-from pkxyz_ctrl.loop import outputs
-from pkxyz_ctrl.loop.controller import Controller
 from pkxyz_ctrl.safety.modes import NODE_EXPECTED, Mode
-from pkxyz_ctrl.safety.trips import Trip
 from pkxyz_ctrl.trajectory.segments import Limits
 
 Array = NDArray[np.float64]
@@ -36,8 +35,6 @@ _AT_ONCE = frozenset({Verb.SETTLE, Verb.LIMITS, Verb.SAMPLE, Verb.QUIET, Verb.TR
 """Done within a tick."""
 _LEAST, _MOST = 1e-12, 1e6
 _SIGMAS_MOST = 10.0
-_LISTENS_S = 0.05  # a new law, before it acts
-_CALM_S, _CALM_DEVIATIONS = 0.2, 0.25  # for so long at most it waits for a tick whose force is as near to its mean
 
 
 class _Job(NamedTuple):
@@ -49,21 +46,24 @@ class _Job(NamedTuple):
 
 
 class Session:
-    """``stage`` is what it works on, ``say`` where answers go.
+    """``stage`` is what it works on, ``say`` where answers go, ``setpoints`` those that the loop reads; its own if not
+    given.
 
     Targets and directions of commands, and positions in answers, are of the sample; paths, rows and ``state`` of the
     stage.
     """
 
-    def __init__(self, controller: Controller, reach: Reach, settings: Settings, say: Say, law_name: str = "") -> None:
-        law, period_us = controller.law, controller.period_us
-        delay = int(law["tick"]["delay_periods"][0])
-        setpoints = Setpoints(period_us, delay, int(law["feed_hold_ticks"][0]))
-        self.stage = Operated(controller, setpoints, reach, settings, period_us * 1e-6)
-        outputs.settle(controller.outputs, settings.window_m, settings.sigmas, settings.dwell_s, period_us * 1e-6)
+    def __init__(
+        self, controller: Loop, reach: Reach, settings: Settings, say: Say, law_name: str = "",
+        setpoints: Setpoints | None = None,
+    ) -> None:  # fmt: skip
+        period_us = controller.period_us
+        setpoints = setpoints or Setpoints(period_us, *rows_of(controller.law))
+        self.stage = Operated(controller, setpoints, reach, settings, period_us * 1e-6, law_name.encode()[:NAME_BYTES])
+        controller.settle(settings.window_m, settings.sigmas, settings.dwell_s)
         self.settings = settings
         self.state = np.zeros(1, SESSION)
-        self.state["matrix"], self.state["law"] = PLAIN, law_name.encode()[: law_change.NAME_BYTES]
+        self.state["matrix"] = PLAIN
         self.now_us = 0
         self._say = say
         self._period_us = period_us
@@ -113,12 +113,14 @@ class Session:
 
     # -- once a tick ---------------------------------------------------------------------------------------------------
 
-    def after(self, row: np.void, commands: Iterable[np.void] = ()) -> None:
+    def after(self, row: np.void, commands: Iterable[np.void] = (), missed: int = 0) -> None:
         """A tick is over, and this is its row of ``ROW``; ``commands``, records of ``COMMAND``, have come since the
-        last. On return the set-points of the next tick are ready.
+        last call, and so many more periods have passed that nobody said so of. On return the set-points of the next
+        tick are ready.
         """
         stage, controller = self.stage, self.stage.controller
-        self.now_us += self._period_us * (1 + int(row["overrun"]))
+        self.now_us += self._period_us * (1 + int(row["overrun"]) + missed)
+        stage.passed += 1 + missed
         if len(controller.faults) > self._known_faults:
             self._note_fault("\n".join(controller.faults[self._known_faults :]))
         self._look_at_leases()
@@ -135,7 +137,7 @@ class Session:
     def _take(self, command_id: int, verb: Verb, command: np.void) -> None:
         running = self._job
         if verb is Verb.RELEASE:
-            self.stage.controller.memory["input"]["trips"] |= int(Trip.OPERATOR)
+            self.stage.controller.release()
             self._answer(
                 command_id, verb, State.DONE, "the stage is led down and the combs go to 0 V; clear when ready"
             )
@@ -217,7 +219,7 @@ class Session:
         if not 0.1e-9 <= window_m <= 10e-6 or not 0.0 <= dwell_s <= 10.0:
             raise RefusedError(f"window {window_m:g} m, limits 1e-10 to 1e-05 m; dwell {dwell_s:g} s, limits 0 to 10 s")
         self.settings.window_m, self.settings.dwell_s, self.settings.sigmas = window_m, dwell_s, sigmas
-        outputs.settle(self.stage.controller.outputs, window_m, sigmas, dwell_s, self.stage.period_s)
+        self.stage.controller.settle(window_m, sigmas, dwell_s)
         of_it = f", {sigmas:g} standard deviations of the estimate included" if sigmas else ""
         return f"in position within {window_m * 1e9:g} nm for {dwell_s * 1e3:g} ms{of_it}"
 
@@ -236,24 +238,7 @@ class Session:
             raise RefusedError("that law did not come: ask again")
         if not (stage.mode == Mode.IDLE or self._activity() is Activity.HOLDING):
             raise RefusedError(f"a law is changed while the stage holds or is off, and it is {self._activity().name}")
-        new = np.array([offered["law"]])
-        new["autostart"] = stage.controller.law["autostart"]
-        if (why := law_change.objection(stage.controller.law, new)) is not None:
-            raise RefusedError(f"{offered['name'].decode()}: {why}")
-        heard = law_change.Listening(new, stage.controller.memory)
-        for _ in stage.ticks(_LISTENS_S if stage.is_driven else 0.0):
-            yield
-            heard.listen()
-        for _ in stage.ticks(_CALM_S if stage.is_driven else 0.0):
-            if heard.is_calm(_CALM_DEVIATIONS):
-                break
-            yield
-            heard.listen()
-        if stage.mode not in (Mode.IDLE, Mode.TRACKING):
-            raise AbortedError("the stage no longer held")
-        law_change.take_over(stage.controller.law, stage.controller.memory, new, heard.x)
-        self.state["law"] = offered["name"]
-        return f"the law is {offered['name'].decode()}"
+        return procedures.change_law(self.stage, offered)
 
     def _renewed(self, command: np.void) -> bool:
         """Whether this only says again, or ends, the jog that runs."""
@@ -365,6 +350,7 @@ class Session:
         state["in_position"] = stage.is_in_position and stage.is_driven
         state["homed"] = stage.is_homed
         state["running_id"] = self._job.id if self._job is not None else 0
+        state["law"] = stage.law_name
         state["target_m"], state["uncertainty_m"] = setpoints.target_m, position["uncertainty_m"]
         on_path = setpoints.follows(path)
         state["path_row"] = setpoints.path_row if on_path else np.nan

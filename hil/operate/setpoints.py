@@ -5,6 +5,7 @@ row behind them, from the position, velocity and acceleration that are there.
 """
 
 import math
+from collections.abc import Callable
 from typing import Protocol
 
 import numpy as np
@@ -14,15 +15,20 @@ from hil.lanes.blocks import PREVIEW_ROWS
 from hil.operate.feed import Feed, fed_rows
 from pkxyz_ctrl.core import feed_hold
 from pkxyz_ctrl.loop.reference import REFERENCE, write_rows
+from pkxyz_ctrl.trajectory import TrajectoryError
 from pkxyz_ctrl.trajectory.in_flight import InFlight, to_rest, towards
 from pkxyz_ctrl.trajectory.segments import Limits
 
 Array = NDArray[np.float64]
 
-_BLOCK_ROWS = 1024
-_PIECE_ROWS = 16
+BLOCK_ROWS = 1024
+PIECE_ROWS = 16
 """Sampled at once, some 30 us, so that no tick has much to do."""
 _LOOKED_AT_ROWS = 128
+
+
+Judge = Callable[[Array, int], str | None]
+"""Why rows (n, 9) that are so many periods apart can't be followed, if they can't."""
 
 
 class Source(Protocol):
@@ -80,23 +86,27 @@ class Going:
 
 
 class Setpoints:
-    """``runtime.Reference`` of a stage in operation. ``target_m`` (3,): where the present motion ends."""
+    """``runtime.Reference`` of a stage in operation. ``target_m`` (3,): where the present motion ends. ``objection``:
+    why what was asked for last could not be done after all, if so; then what was asked for before goes on.
+    """
 
     def __init__(self, period_us: int, delay_periods: int, ramp_rows: int) -> None:
         """``ramp_rows``: how long a path takes to stop and to be taken up again, an even number."""
         self._period_s = period_us * 1e-6
         self._kept = delay_periods + 2  # rows that the law has looked at past that of the next tick, and the next tick
         self._ramp = ramp_rows
-        self._rows = np.zeros(_BLOCK_ROWS, REFERENCE)
-        self._window = np.zeros(2 * PREVIEW_ROWS + 2 * _PIECE_ROWS, REFERENCE)
+        self.objection: str | None = None
+        self._rows = self._room()
+        self._window = np.zeros(2 * PREVIEW_ROWS + 2 * PIECE_ROWS, REFERENCE)
         self.restart(np.zeros(3))
 
     def restart(self, position_m: Array) -> None:
         """Stand at a position (3,), from row 0 on: the loop has just been closed."""
+        self.row = 0
+        self._renew(0)
         self._source: Source = Standing(position_m)
         self._feed = Feed(0, ramp=self._ramp)
         self.target_m = position_m.copy()
-        self.row = 0
         self._begin(0)
 
     def __call__(self, tick: int) -> NDArray[np.void]:
@@ -105,41 +115,31 @@ class Setpoints:
 
     # -- what is asked ------------------------------------------------------------------------------------------------
 
-    def plan(self, target_m: Array, limits: Limits) -> InFlight:
-        """The motion to a target (3,) from where the set-point will be. Raises ``TrajectoryError``."""
-        return towards(self.state(), target_m, limits)
-
-    def looked_at(self, motion: InFlight) -> tuple[Array, int]:
-        """Rows (n, 9) of a motion to be judged, and how many periods they are apart."""
-        rows = math.ceil(motion.total_s / self._period_s)
-        step = -(-rows // _LOOKED_AT_ROWS) or 1
-        return motion.sample(np.arange(0, rows + step, step) * self._period_s), step
-
-    def go(self, motion: InFlight, target_m: Array) -> None:
-        """Set out on a motion that ``plan`` has just made."""
-        self._set_out(Going(motion, self._period_s), target_m, self.free_row - 1)
+    def go(self, target_m: Array, limits: Limits, judge: Judge) -> None:
+        """Set out to a target (3,), from where the set-point will be. Raises ``TrajectoryError``, also with the words
+        of ``judge``; then nothing has changed.
+        """
+        self._do(lambda: self._go(target_m, limits, judge))
 
     def brake(self, limits: Limits) -> None:
         """Come to rest by the shortest way, off the path if there is one."""
-        motion = to_rest(self.state(), limits)
-        self.go(motion, motion.end_m)
+        self._do(lambda: self._brake(limits))
 
     def follow(self, path: Source, end_m: Array) -> None:
         """Set out on a path that begins, at rest, where the set-point stands."""
-        self._set_out(path, end_m, self.free_row)
+        self._do(lambda: self._set_out(path, end_m, self.free_row))
 
     def stop_on_path(self) -> None:
         """Slow down to a stop without leaving the path."""
-        self._turn(feed_hold.SLOWING)
+        self._do(lambda: self._turn(feed_hold.SLOWING))
 
     def go_on(self) -> None:
         """Go on along the path."""
-        self._turn(feed_hold.STARTING)
+        self._do(lambda: self._turn(feed_hold.STARTING))
 
     def leave_path(self) -> None:
         """Where the path has come to a stop, stand: it is not gone on with."""
-        position = self.state()[0]
-        self._set_out(Standing(position), position, self.row)
+        self._do(self._leave)
 
     # -- what is so ---------------------------------------------------------------------------------------------------
 
@@ -180,7 +180,7 @@ class Setpoints:
     @property
     def runs_short(self) -> bool:
         """Whether the rows that are there will soon only suffice to stop on the path."""
-        needed = math.ceil(self._feed.at(self.row)) + self._ramp // 2 + PREVIEW_ROWS + 2 * _PIECE_ROWS
+        needed = math.ceil(self._feed.at(self.row)) + self._ramp // 2 + PREVIEW_ROWS + 2 * PIECE_ROWS
         return not self._source.has(min(needed, self._source.rows))
 
     # -- from tick to tick --------------------------------------------------------------------------------------------
@@ -188,28 +188,63 @@ class Setpoints:
     def advance(self, row: int) -> None:
         """The next tick is that of ``row``; make sure of its rows, and sample a few more."""
         self.row = row
-        if row - self._base > _BLOCK_ROWS - PREVIEW_ROWS - 2 * _PIECE_ROWS:
+        if row - self._base > BLOCK_ROWS - self._reach_rows - 2 * PIECE_ROWS:
             self._move_block()
         ahead = self._filled - row
-        if ahead < PREVIEW_ROWS + _PIECE_ROWS:
-            self._sample(max(_PIECE_ROWS, PREVIEW_ROWS - ahead))
+        if ahead < PREVIEW_ROWS + PIECE_ROWS:
+            self._sample(max(PIECE_ROWS, PREVIEW_ROWS - ahead))
+
+    _reach_rows = PREVIEW_ROWS
+    """for which there is always room ahead"""
+    _first_rows = PREVIEW_ROWS
+    """made at once where something is asked for"""
+
+    def _room(self) -> NDArray[np.void]:
+        """Where rows stand, (BLOCK_ROWS,) of ``REFERENCE``."""
+        return np.zeros(BLOCK_ROWS, REFERENCE)
+
+    def _do(self, step: Callable[[], None]) -> None:
+        """Do what is asked."""
+        step()
+        self.objection = None
+
+    def _renew(self, row: int) -> None:
+        """Rows from ``row`` on are about to become other ones."""
+
+    def _go(self, target_m: Array, limits: Limits, judge: Judge) -> None:
+        motion = towards(self.state(), target_m, limits)
+        rows = math.ceil(motion.total_s / self._period_s)
+        step = -(-rows // _LOOKED_AT_ROWS) or 1
+        if (why := judge(motion.sample(np.arange(0, rows + step, step) * self._period_s), step)) is not None:
+            raise TrajectoryError(why)
+        self._set_out(Going(motion, self._period_s), target_m, self.free_row - 1)
+
+    def _brake(self, limits: Limits) -> None:
+        motion = to_rest(self.state(), limits)
+        self._set_out(Going(motion, self._period_s), motion.end_m, self.free_row - 1)
+
+    def _leave(self) -> None:
+        position = self.state()[0]
+        self._set_out(Standing(position), position, self.row)
 
     def _set_out(self, source: Source, target_m: Array, origin: int) -> None:
+        self._renew(self.free_row)
         self._source, self.target_m = source, target_m.copy()
         self._feed = Feed(origin, ramp=self._ramp)
         self._anew()
 
     def _turn(self, direction: int) -> None:
+        self._renew(self.free_row)
         self._feed = self._feed.turned(direction, self.free_row - 1)
         self._anew()
 
     def _anew(self) -> None:
         self._filled = self.free_row
-        self._sample(PREVIEW_ROWS)
+        self._sample(self._first_rows)
 
     def _begin(self, row: int) -> None:
         self._base = self._filled = row
-        self._sample(PREVIEW_ROWS + _PIECE_ROWS)
+        self._sample(PREVIEW_ROWS + PIECE_ROWS)
 
     def _move_block(self) -> None:
         """What is still needed goes to the front, in place: the loop goes on reading the same rows."""
@@ -236,3 +271,8 @@ class Setpoints:
         out = np.empty((count, 9))
         fed_rows(window, begin, first - feed.origin, feed.phase, feed.direction, feed.ramp, self._period_s, out)
         return out
+
+
+def rows_of(law: NDArray[np.void]) -> tuple[int, int]:
+    """``delay_periods`` and ``ramp_rows`` of a law (1,) of ``cycle.LAW``."""
+    return int(law["tick"]["delay_periods"][0]), int(law["feed_hold_ticks"][0])

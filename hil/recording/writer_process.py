@@ -8,7 +8,7 @@ import os
 import signal
 import struct
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import Any
 
@@ -21,7 +21,7 @@ from pkxyz_ctrl.can.frame import Frame
 from pkxyz_ctrl.loop.row import ROW
 
 HEAD = struct.Struct("<BBqI")
-FRAME, ROW_KIND, _END = 0, 1, 3  # a frame's kind is a bit set of its flags, shifted past the kind
+FRAME, ROW_KIND, END_KIND = 0, 1, 3  # a frame's kind is a bit set of its flags, shifted past the kind
 END_ENTRY = struct.Struct("<BQ")
 READ_BYTES = 1 << 16
 _SAFE_AFTER_S = 0.05  # rows and frames are with the operating system, whatever becomes of the writer
@@ -35,7 +35,7 @@ Read = Callable[[], bytes]
 
 def end_entry(lost_bytes: int) -> bytes:
     """The last one."""
-    return END_ENTRY.pack(_END, lost_bytes)
+    return END_ENTRY.pack(END_KIND, lost_bytes)
 
 
 class WriterProcess:
@@ -98,9 +98,24 @@ def _length_at(entries: bytes, at: int) -> int:
     """Of the entry that begins there; as much as is needed to know it, if it isn't all there yet."""
     if entries[at] == ROW_KIND:
         return 1 + ROW.itemsize
-    if entries[at] == _END:
+    if entries[at] == END_KIND:
         return END_ENTRY.size
     return HEAD.size + (entries[at + 1] if at + 1 < len(entries) else 0)
+
+
+def entries_of(pending: bytes) -> Iterator[tuple[int, int]]:
+    """Where each whole entry begins and ends; the first byte is its kind."""
+    at = 0
+    while at < len(pending) and len(pending) - at >= _length_at(pending, at):
+        end = at + _length_at(pending, at)
+        yield at, end
+        at = end
+
+
+def frame_at(pending: bytes, at: int, end: int) -> tuple[Frame, int]:
+    """The frame of an entry, and its time in us."""
+    kind, _, t_us, can_id = HEAD.unpack_from(pending, at)
+    return Frame._make((can_id, pending[at + HEAD.size : end], kind >> 1)), t_us
 
 
 def _be_the_writer(
@@ -132,20 +147,17 @@ def _write_down(read: Read, recording: RecordingWriter, log: FrameLog, watch: Wa
     row_bytes = row.view(np.uint8).data
     while part := read():
         pending += part
-        at = 0
-        while at < len(pending) and len(pending) - at >= _length_at(pending, at):
-            end = at + _length_at(pending, at)
+        end = 0
+        for at, end in entries_of(pending):
             if pending[at] == ROW_KIND:
                 row_bytes[:] = pending[at + 1 : end]
                 recording.write(row)
                 watch(row)
-            elif pending[at] == _END:
+            elif pending[at] == END_KIND:
                 whole = END_ENTRY.unpack_from(pending, at)[1] == 0
             else:
-                kind, _, t_us, can_id = HEAD.unpack_from(pending, at)
-                log.record(Frame._make((can_id, pending[at + HEAD.size : end], kind >> 1)), t_us)
-            at = end
-        pending = pending[at:]
+                log.record(*frame_at(pending, at, end))
+        pending = pending[end:]
         if (now_s := time.monotonic()) >= flush_s:
             flush_s = now_s + _SAFE_AFTER_S
             recording.flush()

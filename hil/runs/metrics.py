@@ -13,8 +13,8 @@ from typing import TYPE_CHECKING, Any, Protocol
 import numpy as np
 from numpy.typing import NDArray
 
+from hil.runs.warnings import Warnings
 from pkxyz_ctrl.loop.row import ROW
-from pkxyz_ctrl.loop.warnings import Warnings
 from pkxyz_ctrl.safety.modes import Mode
 
 if TYPE_CHECKING:

@@ -6,7 +6,7 @@ from typing import TextIO
 import numpy as np
 from numpy.typing import NDArray
 
-from pkxyz_ctrl.loop.warnings import in_words
+from hil.runs.warnings import in_words
 from pkxyz_ctrl.safety.modes import Mode
 from pkxyz_ctrl.safety.trips import explain
 

@@ -79,3 +79,9 @@ OnSilence = Annotated[
 SilentFor = Annotated[
     float, typer.Option(help="After how long a silent server is taken to be gone.", min=0.03, max=10.0)
 ]
+NativeLoop = Annotated[
+    bool | None,
+    typer.Option(
+        "--native/--no-native", help="The loop in C, or Python's; if not given, the one in C where it can be."
+    ),
+]

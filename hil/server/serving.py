@@ -54,6 +54,8 @@ class Served:
     """folder in which they are kept; None: the user's"""
     report: Path | None = None
     """on the amplifier"""
+    native: bool | None = None
+    """whether the loop is the one in C; None: where it can be"""
 
 
 class _Children:
@@ -169,6 +171,7 @@ def _start(children: _Children, served: Served) -> None:
         "loop", "operate", *common, "--controller", served.controller, "--name", served.name, "--on-silence",
         served.on_silence, "--silence-s", str(served.silence_s),
         *(("--report", str(served.report)) if served.report is not None else ()),
+        *(("--native" if served.native else "--no-native",) if served.native is not None else ()),
     )  # fmt: skip
 
 

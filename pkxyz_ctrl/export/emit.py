@@ -12,13 +12,13 @@ import llvmlite.binding as llvm
 import numpy as np
 from numba import from_dtype, types
 
-from pkxyz_ctrl.export.entries import ENTRIES, FIELD, RECORD, Argument, Entry
+from pkxyz_ctrl.export.entries import FIELD, RECORD, Argument, Entry, entries_for
 
 
 def main(out: Path) -> None:
     """Compile every entry and write one module."""
     module, symbols = None, {}
-    for entry in ENTRIES:
+    for entry in entries_for(has_loop=True):
         overload = _compiled(entry)
         symbols[entry.name] = overload.fndesc.llvm_func_name
         part = llvm.parse_assembly(overload.library.get_llvm_str())

@@ -5,7 +5,7 @@ from typing import Any, Final, NamedTuple
 import numpy as np
 
 from pkxyz_ctrl.loop import cycle as cycling
-from pkxyz_ctrl.loop import exchange
+from pkxyz_ctrl.loop import exchange, law_change
 from pkxyz_ctrl.loop.reference import REFERENCE
 
 ONE, MANY, FIELD, RECORD = range(4)
@@ -110,3 +110,24 @@ ENTRIES = (
         told=False,
     ),
 )
+
+OF_LOOP = (
+    Entry("pkxyz_ask_to_clear", exchange.ask_to_clear, (_MEMORY,), "The fault is to be forgotten.", told=False),
+    Entry(
+        "pkxyz_take_over",
+        law_change.take_over,
+        (
+            Argument("law", cycling.LAW),
+            Argument("memory", cycling.MEMORY),
+            Argument("change", law_change.CHANGE, is_const=True),
+        ),
+        "Between two periods, the stage at rest or its loop open: another law takes over.",
+        told=False,
+    ),
+)
+"""What the native loop calls besides; no board has it."""
+
+
+def entries_for(*, has_loop: bool) -> tuple[Entry, ...]:
+    """Those that a target has, with the native loop or without."""
+    return ENTRIES + OF_LOOP if has_loop else ENTRIES

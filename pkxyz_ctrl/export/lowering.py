@@ -7,7 +7,7 @@ import llvmlite.binding as llvm
 
 from pkxyz_ctrl.export import runtime
 from pkxyz_ctrl.export.elf import undefined
-from pkxyz_ctrl.export.entries import ENTRIES, MANY, RECORD, Argument, Entry
+from pkxyz_ctrl.export.entries import MANY, RECORD, Argument, Entry, entries_for
 from pkxyz_ctrl.export.kernels import ExportError, Kernels
 from pkxyz_ctrl.export.targets import Target
 
@@ -35,9 +35,10 @@ def lower(kernels: Kernels, target: Target) -> Lowered:
     """Compile for a target. Raises ``ExportError`` if a kernel needs what no bare machine has: a heap, an exception."""
     machine = target.machine
     text = _prepared(kernels, target, machine)
-    module = _optimised(text, machine)
+    public = {entry.name for entry in entries_for(has_loop=target.has_loop)}
+    module = _optimised(text, machine, public)
     if not target.is_wide:
-        module = _optimised(_without_wide_divisions(_without_wide_conversions(str(module))), machine)
+        module = _optimised(_without_wide_divisions(_without_wide_conversions(str(module))), machine, public)
     _name_plainly(module, kernels)
     if not target.is_hosted:
         module = _with_memory_functions(module, target, machine)
@@ -70,7 +71,12 @@ def _prepared(kernels: Kernels, target: Target, machine: llvm.TargetMachine) -> 
     text = re.sub(r"@(sqrt|llvm\.sqrt\.f64)\(", f"@{root}(", text)
     if own_root:
         text = re.sub(r"^declare .*@pkxyz\.sqrt\(.*$", "", text, flags=re.MULTILINE)
-    return text + runtime.FLOOR + own_root + "".join(_c_entry(entry, kernels) for entry in ENTRIES)
+    return (
+        text
+        + runtime.FLOOR
+        + own_root
+        + "".join(_c_entry(entry, kernels) for entry in entries_for(has_loop=target.has_loop))
+    )
 
 
 def _replaced(text: str, name: str, definition: str) -> str:
@@ -120,11 +126,10 @@ def _handed(argument: Argument) -> tuple[list[str], str, list[str]]:
     return taken, before, handed
 
 
-def _optimised(text: str, machine: llvm.TargetMachine) -> llvm.ModuleRef:
+def _optimised(text: str, machine: llvm.TargetMachine, public: set[str]) -> llvm.ModuleRef:
     """The module with nothing left that no entry calls, and nothing vectorised: order of operations is the source's."""
     module = llvm.parse_assembly(text)
     module.verify()
-    public = {entry.name for entry in ENTRIES}
     for function in module.functions:
         if not function.is_declaration:
             function.linkage = "external" if function.name in public else "internal"

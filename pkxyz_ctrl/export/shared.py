@@ -1,11 +1,12 @@
 """What the native loop shares with whoever starts it: one mapped file. It never waits for anything that stands in it.
 
 ``SHARED`` is the file's beginning. Behind it come ``settings["blocks"]`` blocks of the path, ``PATH``, then the ring's
-bytes. Each number that crosses has one writer: the loop reads settings, config and path, and writes all else but
-``ring["tail"]`` and ``events["tail"]``.
+bytes. Each number that crosses has one writer: the loop reads settings, config, path, orders, change and sheets, and
+writes all else but ``ring["tail"]`` and ``events["tail"]``. What ``operated`` holds is for a stage in operation: then
+set-points come in sheets, not in blocks.
 """
 
-from enum import IntEnum
+from enum import IntEnum, IntFlag
 from typing import Final
 
 import numpy as np
@@ -13,6 +14,7 @@ from numpy.typing import NDArray
 
 from pkxyz_ctrl.can.driver_rules import OUTGOING
 from pkxyz_ctrl.loop.exchange import EXCHANGE, EXCHANGE_MEMORY
+from pkxyz_ctrl.loop.law_change import CHANGE
 from pkxyz_ctrl.loop.reference import REFERENCE
 
 Records = NDArray[np.void]
@@ -22,6 +24,8 @@ BLOCK_ROWS: Final = 1024
 """Rows of the path from one block to the next."""
 AHEAD_ROWS: Final = 32
 """... and so many of the next one behind them: what a law looks ahead."""
+SHEET_ROWS: Final = 1024
+SNAPSHOTS: Final = 64
 LATENESS_MOST_US: Final = 2000
 EVENTS: Final = 64
 _WORDS: Final = 512
@@ -57,6 +61,8 @@ class LoopEnd(IntEnum):
     RECORDER_GONE = 6
     PATH_LATE = 7
     KERNEL = 8
+    SESSION_GONE = 9
+    SET_POINTS_LATE = 10
 
 
 class Told(IntEnum):
@@ -65,6 +71,19 @@ class Told(IntEnum):
     FRAMES = 0
     EMERGENCY = 1
     FAULT = 2
+
+
+class Order(IntFlag):
+    """What ``ORDERS`` have; of a sheet and a change of law also what was refused, as it came too late."""
+
+    REQUEST = 1
+    CLEAR = 2
+    RELEASE = 4
+    QUIET = 8
+    SETTLE = 16
+    AIM = 32
+    LAW = 64
+    SHEET = 128
 
 
 SETTINGS = np.dtype(
@@ -88,6 +107,7 @@ SETTINGS = np.dtype(
         ("loop_closed", "i4"),  # a bit a mode
         ("interface", "i4"),
         ("fd", "i4"),
+        ("is_operated", "i4"),  # 1: by orders and sheets
         ("is_named", "i4"),  # 1: the channel's folder stands for a name, and goes with the last one out
         ("channel", "u1", (_CHANNEL,)),  # a folder, or an interface's name; zeros behind it
     ],
@@ -167,6 +187,69 @@ PATH = np.dtype(
     align=True,
 )
 
+ORDERS = np.dtype(
+    [
+        ("number", "i8"),  # written last; nothing of this is written again before the loop has answered it
+        ("tick", "i8"),  # of a change of law: the one that it is meant for, or the next
+        ("changed_from", "i8"),  # reference tick of the sheet's first row that is another one than in the sheet before
+        ("count", "i8"),  # position trigger, as ``outputs.aim``
+        ("start_m", "f8"),
+        ("pitch_m", "f8"),
+        ("window_m", "f8"),  # in position, as ``outputs.settle``
+        ("sigmas", "f8"),
+        ("dwell_ticks", "i4"),
+        ("axis", "i4"),
+        ("direction", "i4"),
+        ("bits", "i4"),  # which of these are meant
+        ("event", "i4"),
+        ("quiet", "i4"),
+        ("sheet", "i4"),  # which of the two
+    ],
+    align=True,
+)
+
+OBEYED = np.dtype(
+    [
+        ("number", "i8"),  # of the orders that were answered
+        ("refused", "i8"),  # bits of these that came too late
+        ("late_rows", "i8"),  # by how much the last sheet came too late; negative: it had so much time left
+        ("refusals", "i8"),  # of sheets, since the beginning
+    ],
+    align=True,
+)
+
+SHEET = np.dtype(
+    [
+        ("first", "i8"),  # reference tick of the first row
+        ("count", "i8"),  # of rows; grows behind them
+        ("rests_from", "i8"),  # reference tick from which on the set-point stands, if that is one of these rows
+        ("rows", REFERENCE, (SHEET_ROWS,)),
+    ],
+    align=True,
+)
+
+SNAPSHOT = np.dtype(
+    [
+        ("begun", "i8"),  # which it is, from 1 on, before it is written, and ...
+        ("number", "i8"),  # ... after it
+        ("obeyed", OBEYED, (1,)),
+        ("port", PORT, (1,)),
+        ("memory", EXCHANGE_MEMORY, (1,)),
+    ],
+    align=True,
+)
+
+OPERATED = np.dtype(
+    [
+        ("orders", ORDERS, (1,)),
+        ("newest", "i8"),  # snapshot
+        ("snapshots", SNAPSHOT, (SNAPSHOTS,)),  # of the ends of the last ticks
+        ("change", CHANGE, (1,)),
+        ("sheets", SHEET, (2,)),
+    ],
+    align=True,
+)
+
 SHARED = np.dtype(
     [
         ("settings", SETTINGS, (1,)),
@@ -175,6 +258,7 @@ SHARED = np.dtype(
         ("config", EXCHANGE, (1,)),
         ("memory", EXCHANGE_MEMORY, (1,)),
         ("events", EVENTS_RING, (1,)),
+        ("operated", OPERATED, (1,)),
     ],
     align=True,
 )

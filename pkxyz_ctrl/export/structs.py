@@ -20,7 +20,7 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from pkxyz_ctrl.export.calls import CALL, Call
-from pkxyz_ctrl.export.entries import ENTRIES, MANY, Entry
+from pkxyz_ctrl.export.entries import ENTRIES, MANY, OF_LOOP, Entry
 from pkxyz_ctrl.export.shared import (
     BLOCK_ROWS,
     EVENTS,
@@ -28,8 +28,10 @@ from pkxyz_ctrl.export.shared import (
     MAGIC,
     PATH,
     SHARED,
+    SNAPSHOTS,
     Interface,
     LoopEnd,
+    Order,
     Phase,
     Told,
 )
@@ -45,7 +47,9 @@ _NUMBERS = (
     ("MODE", Mode), ("EVENT", Event), ("SENSE", SenseStatus), ("NODE", NodeEvent), ("TRIP", Trip), ("CALL", Call),
     ("REFUSED", Reason),
 )  # fmt: skip
-_NUMBERS_SHARED = (("INTERFACE", Interface), ("PHASE", Phase), ("OUTCOME", LoopEnd), ("TOLD", Told))
+_NUMBERS_SHARED = (
+    ("INTERFACE", Interface), ("PHASE", Phase), ("OUTCOME", LoopEnd), ("TOLD", Told), ("ORDER", Order),
+)  # fmt: skip
 _C_TYPE = MappingProxyType(
     {"f8": "double", "i8": "int64_t", "i4": "int32_t", "i2": "int16_t", "i1": "int8_t", "u8": "uint64_t"}
     | {"u4": "uint32_t", "u2": "uint16_t", "u1": "uint8_t"}
@@ -87,7 +91,7 @@ def loop_header(period_us: int = 0, held: Stored | None = None) -> str:
     held = held or Stored(EXCHANGE.itemsize, EXCHANGE_MEMORY.itemsize)
     law = _LAW.format(period_us=period_us, settings=held.settings, memory=held.memory)
     numbers = {"MAGIC": f"{MAGIC:#x}", "LAYOUT": f"{layout():#x}", "BLOCK_ROWS": BLOCK_ROWS, "EVENTS": EVENTS}
-    numbers["LATENESS_MOST_US"] = LATENESS_MOST_US
+    numbers["LATENESS_MOST_US"], numbers["SNAPSHOTS"] = LATENESS_MOST_US, SNAPSHOTS
     defined = "".join(f"#define PKXYZ_{name} {value}\n" for name, value in numbers.items())
     return _HEAD + law + defined + _body() + _shared_body() + _TAIL
 
@@ -104,8 +108,7 @@ def _body() -> str:
     records, names = _in_order([*taken, CALL]), _names()
     parts = [_enumeration(prefix, kind) for prefix, kind in _NUMBERS]
     parts += [_struct(dtype, names) for dtype in records]
-    for entry in ENTRIES:
-        parts.append(f"/* {entry.about}\n   Returns 0; anything else: 0 V, at once. */\n{_prototype(entry, names)};\n")
+    parts += [_declared(entry, names) for entry in ENTRIES]
     return "\n".join(["", *parts, ""])
 
 
@@ -114,6 +117,7 @@ def _shared_body() -> str:
     known = {id(dtype) for dtype in _in_order([EXCHANGE, EXCHANGE_MEMORY, REFERENCE])}
     parts = [_enumeration(prefix, kind) for prefix, kind in _NUMBERS_SHARED]
     parts += [_struct(dtype, _names()) for dtype in _in_order([SHARED, PATH]) if id(dtype) not in known]
+    parts += [_declared(entry, _names()) for entry in OF_LOOP]
     return "\n".join([*parts, ""])
 
 
@@ -174,6 +178,10 @@ def _struct(dtype: Dtype, names: dict[int, str]) -> str:
         asserts.append(f"PKXYZ_ASSERT(offsetof({name}, {c_field}) == {offset});")
     asserts.append(f"PKXYZ_ASSERT(sizeof({name}) == {dtype.itemsize});")
     return "\n".join([*lines, f"}} {name};", *asserts, ""])
+
+
+def _declared(entry: Entry, names: dict[int, str]) -> str:
+    return f"/* {entry.about}\n   Returns 0; anything else: 0 V, at once. */\n{_prototype(entry, names)};\n"
 
 
 def _prototype(entry: Entry, names: dict[int, str]) -> str:

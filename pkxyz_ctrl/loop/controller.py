@@ -4,7 +4,7 @@ It owns no clock and no bus. ``runtime`` drives it, whoever owns the time. What 
 here are the way to it, and the words.
 """
 
-from collections.abc import Callable
+from collections.abc import Callable, Iterable
 from struct import Struct
 from typing import Any, Final
 
@@ -12,25 +12,24 @@ import numpy as np
 from numpy.typing import NDArray
 
 from pkxyz_ctrl.can.driver import AmplifierDriver, word_of
-from pkxyz_ctrl.can.driver_rules import FRESH, OUTGOING, OUTGOING_MOST, START_UP, DriverState
+from pkxyz_ctrl.can.driver_rules import FRESH, OUTGOING, OUTGOING_MOST, START_UP
 from pkxyz_ctrl.can.frame import Frame
 from pkxyz_ctrl.can.other_traffic import complaint
 from pkxyz_ctrl.can.startup import Setting
 from pkxyz_ctrl.compiled.direct_call import direct
 from pkxyz_ctrl.config.bus import BusConfig, CanConfig
 from pkxyz_ctrl.core.demand import PREDICTIVE
-from pkxyz_ctrl.loop import exchange, outputs
+from pkxyz_ctrl.loop import exchange, law_change, outputs
 from pkxyz_ctrl.loop.exchange import BLOCKED, EXCHANGE, EXCHANGE_MEMORY, NOT_RESTARTED, RESTARTED
 from pkxyz_ctrl.loop.period import period_of
 from pkxyz_ctrl.loop.reference import REFERENCE, standing_still
 from pkxyz_ctrl.safety.gate import GateConfig, TransmitGate
 from pkxyz_ctrl.safety.modes import Event, Mode
-from pkxyz_ctrl.safety.trips import explain
+from pkxyz_ctrl.safety.trips import Trip, explain
 
 Send = Callable[[Frame], object]
 Records = NDArray[np.void]
 
-_IDLE, _FAULT = int(Mode.IDLE), int(Mode.FAULT)
 _OUTGOING: Final = Struct("<8siiii")
 _PLACES: Final = tuple(place * OUTGOING.itemsize for place in range(OUTGOING_MOST))
 _unpack = _OUTGOING.unpack_from
@@ -92,6 +91,8 @@ class Controller:
         self._finish = direct(exchange.finish, config, memory, 0, 0)
         self._start, self._wait = direct(exchange.start, config, memory, 0), direct(exchange.wait, config, memory, 0)
         self._come_up, self._stop = direct(exchange.come_up, memory), direct(exchange.stop, config, memory, 0)
+        self._ask_to_clear = direct(exchange.ask_to_clear, memory)
+        self._change_law = direct(law_change.take_over, self.law, self.memory, np.zeros(1, law_change.CHANGE))
         self._period = self._period_of()
         self._period(config, memory.copy(), self._reference, 0)  # loaded now, not in the first tick
 
@@ -165,13 +166,41 @@ class Controller:
         """Ask for quiet holds, or no longer: less noise and less rejection while the set-point stands still."""
         self.memory["input"]["quiet"] = quiet
 
+    def release(self) -> None:
+        """Ask for 0 V, whatever runs: an operator's trip."""
+        self.memory["input"]["trips"] |= int(Trip.OPERATOR)
+
+    def settle(self, window_m: float, sigmas: float, dwell_s: float) -> None:
+        """When the stage is in position: see ``outputs.settle``."""
+        outputs.settle(self.outputs, window_m, sigmas, dwell_s, self.period_us * 1e-6)
+
+    def aim(self, axis: int, direction: int, start_m: float, pitch_m: float, count: int) -> None:
+        """Which positions are told: see ``outputs.aim``."""
+        outputs.aim(self.outputs, axis, direction, start_m, pitch_m, count)
+
+    def change_law(self, change: Records) -> None:
+        """Another law, (1,) of ``law_change.CHANGE``, takes over before the next tick."""
+        self._change_law(self.law, self.memory, change)
+
+    def passed(self) -> Iterable[Records]:
+        """The memory of the ticks since somebody looked last: of one."""
+        return (self.memory,)
+
+    @property
+    def is_obeyed(self) -> bool:
+        """Whether nothing that was asked for came too late: here, between two ticks, never."""
+        return True
+
+    @property
+    def has_outputs(self) -> bool:
+        """Whether the amplifier has digital outputs."""
+        return bool(self.exchange["driver"]["has_outputs"][0, 0])
+
     def clear(self) -> None:
         """Ask to forget the fault. Once the combs have been at 0 V for long enough, gate, driver and node start anew,
         tick by tick, while the loop goes on; where that failed, it is tried again. Without a fault nothing happens.
         """
-        self.exchange["clearing"] = self.mode == _FAULT or (
-            self.mode < _IDLE and self.driver.state is DriverState.FAILED
-        )
+        self._ask_to_clear(self.exchange)
 
     # -- one tick ---------------------------------------------------------------------------------------------------
 

@@ -296,6 +296,15 @@ def _put_outputs(config_array: Records, memory_array: Records, bits: int, t_us: 
 
 
 @njit(cache=True, error_model="numpy")
+def ask_to_clear(memory_array: Records) -> None:
+    """Somebody asks to forget the fault; without one, nothing happens."""
+    memory = memory_array[0]
+    mode = memory["cycle"][0]["mode"]
+    is_failed = mode < _IDLE and memory["driver"][0]["state"] == FAILED
+    memory["clearing"] = 1 if mode == _FAULT or is_failed else 0
+
+
+@njit(cache=True, error_model="numpy")
 def stop(config_array: Records, memory_array: Records, t_us: int) -> int:
     """0 V and pre-operational, whatever the mode. Returns the number of frames."""
     config, memory = config_array[0], memory_array[0]

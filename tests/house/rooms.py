@@ -84,8 +84,11 @@ HOUSE: Mapping[str, Room] = MappingProxyType({
     )),
     "hil.emulator": Room(("pkxyz_ctrl.*", "hil.faults", "hil.lanes")),
     "hil.conformance": Room(("sim.config", "sim", "pkxyz_ctrl.*", "hil.bus", "hil.node", "hil.plant", "hil.lanes")),
-    "hil.operate": Room(("pkxyz_ctrl.*", "hil.bus", "hil.lanes")),
+    "hil.operate": Room(("pkxyz_ctrl.*", "hil.lanes")),
     "hil.native": Room(("pkxyz_ctrl.*", "hil.bus", "hil.recording", "hil.lanes")),
+    "hil.operate.running": Room((
+        "pkxyz_ctrl.*", "hil.bus", "hil.recording", "hil.lanes", "hil.operate", "hil.native",
+    )),
     "hil.runs": Room(("sim.config", "pkxyz_ctrl.*", "hil.recording", "hil.faults", "hil.lanes", "hil.native")),
     "hil.server": Room(("pkxyz_ctrl.*", "hil.bus", "hil.recording", "hil.operate", "hil.runs")),
     # many times, for one question
@@ -128,7 +131,8 @@ HOUSE: Mapping[str, Room] = MappingProxyType({
         "hil.runs", "hil.studies", "hil.pictures", "hil.screen", "hil.bench.rigs", "hil.bench", "hil.commands.studies",
     )),
     "hil.commands.operation": Room((
-        "pkxyz_ctrl.*", "hil.lanes", "hil.conformance", "hil.operate", "hil.server", "hil.screen",
+        "pkxyz_ctrl.*", "hil.lanes", "hil.conformance", "hil.operate", "hil.native", "hil.operate.running",
+        "hil.server", "hil.screen",
     )),
     "hil": Room((
         "pkxyz_ctrl.*", "hil.recording", "hil.lanes", "hil.runs", "hil.studies.margins", "hil.screen", "hil.api",

@@ -16,7 +16,7 @@ ALLOWED = {
     ("hil/emulator/image.py", "subprocess"): "the cross compiler, for sources of this package",
     ("hil/emulator/board.py", "subprocess"): "the emulator, with the firmware that was made of them",
     ("hil/native/program.py", "subprocess"): "the C compiler, for sources of this package",
-    ("hil/native/native_rig.py", "subprocess"): "the program that it made of them",
+    ("hil/native/loop_process.py", "subprocess"): "the program that it made of them",
     ("hil/server/serving.py", "subprocess"): "this program: the loop and the plant, in processes of their own",
     ("pkxyz_ctrl/export/kernels.py", "subprocess"): "this program, where numba leaves what it compiles unoptimised",
 }

@@ -14,8 +14,10 @@ from patience import patient_bus, patient_law
 
 import pkxyz_ctrl
 from hil import cli
+from hil.native.program import compiled, compiler
 from pkxyz_ctrl.client import place
 from pkxyz_ctrl.client.plain import Stage
+from pkxyz_ctrl.compiled.kernel_cache import choose_kernel_cache
 
 ROOT = Path(__file__).parents[2]
 STARTS_S = 200.0
@@ -52,8 +54,8 @@ def refused(capsys, monkeypatch, *words):
 class Server:
     """``err``: what it said on its standard error."""
 
-    def __init__(self, law: Path, bus: Path) -> None:
-        words = ["serve", "--controller", str(law), "--bus", str(bus), "--port", "0", "--json"]
+    def __init__(self, law: Path, bus: Path, *more: str) -> None:
+        words = ["serve", *more, "--controller", str(law), "--bus", str(bus), "--port", "0", "--json"]
         words += [
             "--silence-s",
             "0.25",
@@ -80,11 +82,14 @@ class Server:
 
 
 @contextlib.contextmanager
-def served(folder: Path) -> Iterator[Server]:
+def served(folder: Path, *words: str, bus: str = "unix_1k") -> Iterator[Server]:
     """One that is found by its default name while this lasts; whatever becomes of the test, it is ended."""
+    if compiler() is not None:  # once, and not while somebody waits for the stage
+        choose_kernel_cache()
+        compiled()
     before = os.environ.get("XDG_RUNTIME_DIR")
     os.environ["XDG_RUNTIME_DIR"] = str(folder)
-    server = Server(patient_law(folder, "youla"), patient_bus(folder / "bus.toml"))
+    server = Server(patient_law(folder, "youla"), patient_bus(folder / "bus.toml", bus), *words)
     try:
         server.start()
         yield server

@@ -12,11 +12,11 @@ from hil.runs.replay import replay
 from hil.runs.run import run_into
 from hil.runs.run_folder import RunFolder
 from hil.runs.scenario import load_scenario
+from hil.runs.warnings import Warnings, in_words
 from pkxyz_ctrl.config.adaptation import NUMBERS
 from pkxyz_ctrl.config.files import ConfigError
 from pkxyz_ctrl.core import adaptation
 from pkxyz_ctrl.loop.row import ROW
-from pkxyz_ctrl.loop.warnings import Warnings, in_words
 
 SCENARIO, PLANT = "circle", "mild"
 

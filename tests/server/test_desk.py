@@ -10,9 +10,9 @@ import numpy as np
 import pytest
 from operated_rig import MIDDLE_M, OperatedRig, Script
 
-from hil.operate.at_rate import OperatedLoop
 from hil.operate.commands import Activity, Verb
 from hil.operate.memory import StageMemory
+from hil.operate.running.at_rate import OperatedLoop
 from hil.operate.tick_frames import TickFrames
 from hil.recording.recording import Recording
 from hil.runs.run_folder import RECORDING

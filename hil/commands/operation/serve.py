@@ -12,6 +12,7 @@ from hil.screen.options import (
     ControllerFile,
     ListenAt,
     ListenPort,
+    NativeLoop,
     OnSilence,
     Report,
     SilentFor,
@@ -37,6 +38,7 @@ def serve(
     host: ListenAt = "127.0.0.1",
     port: ListenPort = 8765,
     report: Report = None,
+    native: NativeLoop = None,
     as_json: Annotated[bool, typer.Option("--json", help="Print where it is as JSON.")] = False,
 ) -> None:
     """Operate a stage: a loop at rate, and beside it a page and clients, until Ctrl-C. At the end the combs are at 0 V.
@@ -61,7 +63,20 @@ def serve(
         print(json.dumps({"url": url}) if as_json else f"the stage is at {url}", flush=True)
 
     served = Served(
-        name, stage, controller, plant, bus, on_silence, silence_s, saves, host, port, is_simulated, settings, report
+        name,
+        stage,
+        controller,
+        plant,
+        bus,
+        on_silence,
+        silence_s,
+        saves,
+        host,
+        port,
+        is_simulated,
+        settings,
+        report,
+        native,
     )
     raise typer.Exit(serve(served, tell))
 

@@ -9,7 +9,7 @@ enum { WARM_UP_US = 1000 };
 enum { FRESH = 1, EMERGENCY = 2, START_UP = 4 };                      /* what pkxyz_on_frame tells */
 enum { BLOCKED = 256, RESTARTED = 512, NOT_RESTARTED = 1024, RARE = BLOCKED | RESTARTED | NOT_RESTARTED };
 
-static const pkxyz_exchange *config;
+static pkxyz_exchange *config;
 static pkxyz_exchange_memory *memory, warm;
 static uint32_t closed_modes;
 static int failed;
@@ -58,6 +58,16 @@ static void note(int32_t status)
 {
     if (failed == 0)
         failed = status;
+}
+
+void controller_clear(void)
+{
+    note(pkxyz_ask_to_clear(memory));
+}
+
+void controller_change_law(const pkxyz_law_change_change *change)
+{
+    note(pkxyz_take_over(config->law, memory->cycle, change));
 }
 
 /* Sends what the gate let out, and nothing else; what it held back somebody puts into words. */

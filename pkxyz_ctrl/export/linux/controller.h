@@ -5,7 +5,7 @@
 #include "frame.h"
 #include "pkxyz.h"
 
-/* The controller's records stand in what is shared: config is read, memory is all that it remembers. */
+/* The controller's records stand in what is shared: config is read, but for a change of law; memory is all that it remembers. */
 void controller_begin(pkxyz_shared *shared);
 
 /* Goes through a period with a copy of the memory, so that nothing is done for the first time later. */
@@ -15,6 +15,8 @@ int controller_mode(void);
 int controller_is_closed(void); /* whether the loop is closed in this mode */
 int controller_status(void);    /* of the first call that failed; 0: none did */
 void controller_request(int event);
+void controller_clear(void);
+void controller_change_law(const pkxyz_law_change_change *change); /* between two ticks */
 
 void controller_start(int64_t t_us);
 

@@ -9,7 +9,7 @@
 #include "pkxyz.h"
 
 static volatile sig_atomic_t signal_number;
-static int outcome, recorder = -1;
+static int outcome, gone, recorder = -1;
 
 static void note(int number)
 {
@@ -17,8 +17,7 @@ static void note(int number)
         signal_number = number;
 }
 
-/* recorder: the end of a pipe that somebody reads for as long as rows are taken; -1: nobody does. */
-void ending_begin(int recorder_pipe)
+void ending_begin(int recorder_pipe, int is_operated)
 {
     struct sigaction action = {.sa_handler = note, .sa_flags = SA_RESTART};
     const int numbers[] = {SIGINT, SIGTERM, SIGHUP};
@@ -26,6 +25,7 @@ void ending_begin(int recorder_pipe)
         sigaction(numbers[n], &action, 0);
     signal(SIGPIPE, SIG_IGN);
     recorder = recorder_pipe;
+    gone = is_operated ? PKXYZ_OUTCOME_SESSION_GONE : PKXYZ_OUTCOME_RECORDER_GONE;
     if (recorder >= 0)
         prctl(PR_SET_PDEATHSIG, SIGTERM); /* whoever writes the summary is gone: the same as if he had asked for the end */
 }
@@ -52,5 +52,5 @@ void ending_look(void)
 {
     struct pollfd looked = {recorder, 0, 0};
     if (recorder >= 0 && outcome == 0 && poll(&looked, 1, 0) == 1 && looked.revents & POLLERR)
-        outcome = PKXYZ_OUTCOME_RECORDER_GONE;
+        outcome = gone;
 }

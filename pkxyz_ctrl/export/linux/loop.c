@@ -6,6 +6,7 @@
 #include "clock.h"
 #include "controller.h"
 #include "ending.h"
+#include "orders.h"
 #include "path.h"
 #include "port.h"
 #include "realtime.h"
@@ -65,6 +66,8 @@ static void exchange(const pkxyz_shared_settings *settings, const pkxyz_referenc
     while (port_receive(deadline_us, &came))
         if (controller_take(&came, clock_now_us()) || clock_now_us() > deadline_us)
             break;
+    if (settings->is_operated)
+        orders_take(&rows, &rows_count);
     controller_compute(rows, rows_count, overrun);
     controller_finish(clock_now_us(), t_us + settings->heartbeat_deadline_us);
 }
@@ -81,7 +84,7 @@ static int run(pkxyz_shared *shared)
     int32_t rows_count = 1;
     int64_t t_us = clock_now_us() + period_us;
     for (int64_t tick = 0; tick < ticks; tick++, t_us += period_us) {
-        if (!path_at(memory->cycle->reference_tick, &rows, &rows_count))
+        if (!settings->is_operated && !path_at(memory->cycle->reference_tick, &rows, &rows_count))
             ending_ask(PKXYZ_OUTCOME_PATH_LATE);
         ending_look();
         if (!ticks_wait_until(t_us))
@@ -97,7 +100,9 @@ static int run(pkxyz_shared *shared)
             controller_request(PKXYZ_EVENT_DISABLE);
         state->ticks = tick + 1;
         state->reference_tick = memory->cycle->reference_tick;
-        if (is_amplifier_gone(settings, state))
+        if (settings->is_operated)
+            orders_leave();
+        else if (is_amplifier_gone(settings, state)) /* one that is operated may be cleared */
             return PKXYZ_OUTCOME_AMPLIFIER_GONE;
     }
     return PKXYZ_OUTCOME_DONE;

@@ -1,5 +1,6 @@
 /* loop FILE: control one stage at rate, as FILE says, and leave rows and frames in the folder "run" beside it.
-   loop FILE PIPE: what happens stands in FILE, and is taken from there by whoever reads the pipe as long as he does. */
+   loop FILE PIPE: what happens stands in FILE, and is taken from there by whoever reads the pipe as long as he does.
+   loop FILE PIPE WAKE: the same, and he is told of each tick by that eventfd. */
 #define _GNU_SOURCE
 #include <errno.h>
 #include <fcntl.h>
@@ -17,6 +18,7 @@
 #include "ending.h"
 #include "leave.h"
 #include "loop.h"
+#include "orders.h"
 #include "path.h"
 #include "port.h"
 #include "ring.h"
@@ -26,7 +28,7 @@
 static const char *const WORDS[] = {
     "", "done", "ended from outside", "the bus can't be had", "the amplifier could not be brought to operation",
     "the amplifier has fallen silent", "nobody takes the rows any more", "the path was not sampled in time",
-    "a kernel failed",
+    "a kernel failed", "nobody gives orders any more", "the set-points were not made in time",
 };
 
 static int refuse(const char *file, const char *words)
@@ -65,7 +67,7 @@ static const char *misfit(const pkxyz_shared *shared, int64_t size)
 int main(int argc, char **argv)
 {
     int64_t size = 0;
-    if (argc < 2 || argc > 3)
+    if (argc < 2 || argc > 4)
         return refuse("FILE [PIPE]", "give the file that says what to do");
     pkxyz_shared *shared = mapped(argv[1], argc > 2, &size);
     if (!shared)
@@ -78,12 +80,13 @@ int main(int argc, char **argv)
     pkxyz_shared_path *blocks = (void *)(shared + 1);
     uint8_t *ring_bytes = (uint8_t *)(blocks + settings->blocks);
 
-    ending_begin(argc > 2 ? atoi(argv[2]) : -1);
+    ending_begin(argc > 2 ? atoi(argv[2]) : -1, settings->is_operated);
     clock_begin(settings->spin_us);
     state->begun_ns = clock_begun_ns();
     path_begin(blocks, settings->blocks);
     ring_begin(shared->ring, ring_bytes, settings->ring_bytes);
     told_begin(shared);
+    orders_begin(shared, argc > 3 ? atoi(argv[3]) : -1);
     controller_begin(shared);
     ticks_begin(settings, state);
 

@@ -14,6 +14,7 @@ from hil.lanes.setup import Setup
 from hil.lanes.wall import WallRig, require_real_bus
 from hil.operate.commands import COMMAND, PATH_BLOCK, TICK, Verb, new_command
 from hil.operate.law_change import OFFER
+from hil.operate.loop import Loop
 from hil.operate.memory import StageMemory
 from hil.operate.path_stream import PathStream
 from hil.operate.reach import Reach
@@ -30,10 +31,10 @@ from pkxyz_ctrl.trajectory.check import DriveLimits
 
 KEPT_S = 60.0
 """Of telemetry that stays in the memory."""
-_COMMANDS_A_TICK = 4
+_COMMANDS_A_TICK, _BLOCKS_AT_ONCE = 4, 4
 
 
-class _Counted:
+class Counted:
     """``TakesTicks`` that counts frames and keeps those of the tick; the rows go to the memory."""
 
     def __init__(self, can: CanConfig) -> None:
@@ -59,9 +60,8 @@ class _Counted:
 class OperatedLoop:
     """What joins a session to the memory, tick by tick."""
 
-    def __init__(self, session: Session, memory: StageMemory, counted: _Counted) -> None:
-        self._session, self._memory, self._counted = session, memory, counted
-        self._controller = session.stage.controller
+    def __init__(self, session: Session, memory: StageMemory, counted: Counted) -> None:
+        self._session, self._counted = session, counted
         self._ticks, self._frames = memory.writer("ticks"), memory.writer("frames")
         self._commands = memory.reader("commands", from_start=True)  # what was asked while the amplifier started, too
         self._path = memory.reader("path", from_start=True)
@@ -72,19 +72,27 @@ class OperatedLoop:
         self._tick_bytes = self._tick.view(np.uint8).data
 
     def after(self, tick: int) -> None:
-        """A tick is over."""
-        session, controller = self._session, self._controller
-        row = controller.memory["row"][0]
+        """A tick of Python's loop is over."""
+        self.step()
+        self.tell(self._session.stage.controller.memory["row"].view(np.uint8).data)
+
+    def step(self, missed: int = 0) -> None:
+        """The session goes on, after a tick and so many more that it missed."""
+        session = self._session
         session.server_says(int(self._head["server"][0]))
-        if session.wants_rows:
-            self._take_rows()
-        session.after(row, self._come())
-        state = session.state
+        for _ in range(1 + min(missed, _BLOCKS_AT_ONCE)):
+            if session.wants_rows:
+                self._take_rows()
+        session.after(session.stage.controller.memory["row"][0], self._come(), missed)
+
+    def tell(self, row: bytes | memoryview) -> None:
+        """Write down a tick's record of ``ROW``, with its frames and what the session says now."""
+        state = self._session.state
         state["commands"] = self._commands.next - 1
         state["frames"], state["wire_ns"] = self._counted.frames, self._counted.wire_ns
-        self._tick_bytes[: ROW.itemsize] = controller.row
+        self._tick_bytes[: ROW.itemsize] = row
         self._tick["session"] = state
-        self._frames.write(self._counted.of_tick.taken(int(row["tick"])))
+        self._frames.write(self._counted.of_tick.taken(int(self._tick["row"]["tick"][0])))
         self._ticks.write(self._tick_bytes)
 
     def _come(self) -> list[np.void]:
@@ -120,13 +128,13 @@ def operate(setup: Setup, settings: Settings, name: str, files: dict[str, str], 
     Raises ``ConfigError``, ``StartUpError``, and ``OSError`` for the memory.
     """
     with Ending() as ending:
-        counted = _Counted(require_real_bus(setup.bus))
+        counted = Counted(require_real_bus(setup.bus))
         rig = WallRig(setup, counted, ending)
         memory = StageMemory.made(name, round(KEPT_S / setup.bus.period_s))
         try:
-            session = _session_of(setup, settings, rig, memory)
+            session = session_of(setup, settings, rig.controller, memory)
             rig.wait_for_others(say)
-            place.write(name, "loop", _description(setup, settings, memory, files))
+            place.write(name, "loop", description(setup, settings, memory, files))
             say(rig.go_real_time())
             rig.start(say)
             rig.operate(session.stage.setpoints, OperatedLoop(session, memory, counted).after)
@@ -141,10 +149,13 @@ def operate(setup: Setup, settings: Settings, name: str, files: dict[str, str], 
     return 0
 
 
-def _session_of(setup: Setup, settings: Settings, rig: WallRig, memory: StageMemory) -> Session:
+def session_of(
+    setup: Setup, settings: Settings, loop: Loop, memory: StageMemory, setpoints: Setpoints | None = None
+) -> Session:
+    """One that is ready, and answers into the memory."""
     reach = Reach(Stage(setup.stage), DriveLimits.of(setup.controller, setup.bus))
     rehearse(reach, settings)
-    return Session(rig.controller, reach, settings, memory.writer("answers").write, setup.controller.name)
+    return Session(loop, reach, settings, memory.writer("answers").write, setup.controller.name, setpoints)
 
 
 def rehearse(reach: Reach, settings: Settings) -> None:
@@ -156,11 +167,9 @@ def rehearse(reach: Reach, settings: Settings) -> None:
     reach.farthest(near_m, 0, 1.0)
     path = PathStream(1, 2, start, reach)
     path.take(1, 0, np.zeros((2, 9)), np.zeros(2, np.int32))
-    motion = setpoints.plan(near_m, settings.limits)
-    reach.motion_refusal(*setpoints.looked_at(motion))
     steps: tuple[Callable[[], object], ...] = (
-        lambda: setpoints.go(motion, near_m), setpoints.stop_on_path, setpoints.go_on, setpoints.leave_path,
-        lambda: setpoints.brake(settings.limits), lambda: setpoints.follow(path, start),
+        lambda: setpoints.go(near_m, settings.limits, reach.motion_refusal), setpoints.stop_on_path, setpoints.go_on,
+        setpoints.leave_path, lambda: setpoints.brake(settings.limits), lambda: setpoints.follow(path, start),
     )  # fmt: skip
     for step in steps:
         step()
@@ -168,7 +177,7 @@ def rehearse(reach: Reach, settings: Settings) -> None:
             setpoints.advance(row)
 
 
-def _description(setup: Setup, settings: Settings, memory: StageMemory, files: dict[str, str]) -> dict[str, object]:
+def description(setup: Setup, settings: Settings, memory: StageMemory, files: dict[str, str]) -> dict[str, object]:
     """What others need to know of the loop."""
     return {
         "pid": os.getpid(), "memory": str(memory.path), "files": files, "stage": setup.stage.name,
