@@ -82,6 +82,6 @@ SilentFor = Annotated[
 NativeLoop = Annotated[
     bool | None,
     typer.Option(
-        "--native/--no-native", help="The loop in C, or Python's; if not given, the one in C where it can be."
+        "--native/--no-native", help="The loop in C, or Python's; if not given, the one in C if it was compiled before."
     ),
 ]

@@ -55,7 +55,7 @@ class Served:
     report: Path | None = None
     """on the amplifier"""
     native: bool | None = None
-    """whether the loop is the one in C; None: where it can be"""
+    """whether the loop is the one in C; None: if it is there"""
 
 
 class _Children:

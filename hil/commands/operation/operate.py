@@ -55,7 +55,7 @@ def operate(
 
 
 def _program(setup: "Setup", native: bool | None) -> "Path | None":
-    """The native loop, compiled if it isn't yet; None, with a line that says why, where it can't be and needn't."""
+    """The native loop, if it is there or is asked for, which compiles it; else None, with a line that says why."""
     from hil.lanes.wall import require_real_bus
     from hil.native.program import compiled, kept
     from hil.native.settings import require_native
@@ -63,10 +63,11 @@ def _program(setup: "Setup", native: bool | None) -> "Path | None":
 
     try:
         require_native(setup, require_real_bus(setup.bus))
+        if kept() is None and not native:
+            note("the loop is Python's; `--native` compiles the one in C, which takes some minutes once")
+            return None
         if kept() is None:
-            note(
-                "the native loop is being compiled, once: some seconds, or some minutes if nothing was exported before"
-            )
+            note("the native loop is being compiled, once: some seconds, or minutes if nothing was exported before")
         return compiled()
     except (ConfigError, ExportError) as error:
         if native:
