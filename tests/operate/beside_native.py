@@ -22,6 +22,7 @@ from pkxyz_ctrl.safety.modes import Mode
 NAME = "beside"
 WORDS = ("operate", "--bus", "slow.toml", "--controller", "patient.toml", "--name", NAME, "--silence-s", "0.3")
 WAITS_S = 60.0
+_UNDER_WAY_ROWS = 20.0
 
 
 class Operator:
@@ -86,6 +87,7 @@ class Operator:
             self.link.rows(number, first, block, np.zeros(len(block), np.int64))
         command = self.give(Verb.PATH, path=number, rows=len(rows), start_m=start)
         self.until(Activity.SCANNING)
+        self._until(lambda: float(self.state["path_row"]) > _UNDER_WAY_ROWS)  # so the loop has taken it, too
         return command
 
     def until(self, *activities: Activity) -> None:

@@ -27,7 +27,11 @@ from pkxyz_ctrl.config.files import load
 from pkxyz_ctrl.design.law_store import law_of
 from pkxyz_ctrl.safety.modes import Mode
 
-pytestmark = [pytest.mark.at_rate, pytest.mark.skipif(compiler() is None, reason="no C compiler")]
+pytestmark = [
+    pytest.mark.at_rate,
+    pytest.mark.timeout(300),  # who waits for a line of the plant waits for ever
+    pytest.mark.skipif(compiler() is None, reason="no C compiler"),
+]
 
 __all__ = ["bench", "changes"]
 
