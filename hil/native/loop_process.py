@@ -5,13 +5,14 @@ import subprocess
 import time
 from collections.abc import Callable
 from pathlib import Path
-from typing import Any, NoReturn, Protocol
+from typing import Any, NoReturn
 
 import numpy as np
 
 from hil.lanes.ending import Ended, Ending
 from hil.lanes.setup import Setup
 from hil.lanes.wall import AmplifierGoneError, alone
+from hil.native.held_pipe import HeldPipe
 from hil.native.mapped import Mapped, text_of
 from hil.native.settings import fill
 from hil.native.teller import Teller
@@ -23,28 +24,20 @@ from pkxyz_ctrl.loop.controller import StartUpError
 LOOK_S = 0.01
 _END_S = 10.0  # for a loop that is to end: on its way down at a slow rate, or behind a full ring
 _LED_DOWN = {
+    LoopEnd.SESSION_GONE: "nobody looked after the stage, so it was led down; free the machine",
     LoopEnd.PATH_LATE: "the path was not sampled in time, so the stage was led down; free the machine",
     LoopEnd.SET_POINTS_LATE: "the set-points were not made in time, so the stage was led down; free the machine",
 }
-
-
-class Pipe(Protocol):
-    """Whoever the loop is not to outlive."""
-
-    pipe: int
-
-    def handed_over(self) -> None:
-        """The loop has inherited the pipe."""
 
 
 class LoopProcess:
     """``close`` ends it, and then everything is known of it. ``told``: its words, and what it begins with."""
 
     def __init__(
-        self, program: Path, setup: Setup, can: CanConfig, mapped: Mapped, told: Teller, pipe: Pipe, ending: Ending
+        self, program: Path, setup: Setup, can: CanConfig, mapped: Mapped, told: Teller, held: HeldPipe, ending: Ending
     ) -> None:
         self._program, self._setup, self._can = program, setup, can
-        self._mapped, self._told, self._pipe, self._ending = mapped, told, pipe, ending
+        self._mapped, self._told, self._held, self._ending = mapped, told, held, ending
         self.shared = mapped.shared[0]
         told.outputs[0] = setup.new_outputs()[0]
         self.shared["config"], self.shared["memory"] = told.record, told.exchange
@@ -60,12 +53,12 @@ class LoopProcess:
         a stage that is operated. Raises ``Ended`` and ``ConfigError``.
         """
         fill(self.shared["settings"], self._setup, self._can, company_s, is_operated=wake is not None)
-        inherited = [self._pipe.pipe, *((wake,) if wake is not None else ())]
+        inherited = [self._held.pipe, *((wake,) if wake is not None else ())]
         words = [str(self._program), self._mapped.path, *map(str, inherited)]
         self._process = subprocess.Popen(
             words, pass_fds=(self._mapped.descriptor, *inherited), stdin=subprocess.DEVNULL
         )
-        self._pipe.handed_over()
+        self._held.handed_over()
         self._mapped.close()
         if self.until(Phase.ALONE, meanwhile) == Phase.ALONE:
             say(alone(company_s))

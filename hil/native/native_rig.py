@@ -26,7 +26,7 @@ class NativeRig:
     ) -> None:
         self.controller = Teller(setup)
         self._feeder = PathFeeder(setup, mapped.blocks)
-        self._process = LoopProcess(program, setup, can, mapped, self.controller, recorder, ending)
+        self._process = LoopProcess(program, setup, can, mapped, self.controller, recorder.held, ending)
         self._state, self._is_among_processes = self._process.state, can.interface == "pkxyz-unix"
 
     @property

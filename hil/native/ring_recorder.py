@@ -9,6 +9,7 @@ import select
 from pathlib import Path
 from typing import Any
 
+from hil.native.held_pipe import HeldPipe
 from hil.native.mapped import Mapped
 from hil.recording.writer_process import Read, Watch, WriterProcess
 
@@ -17,7 +18,7 @@ _READ_MOST_BYTES = 1 << 20
 
 
 class RingRecorder:
-    """Rows and frames on their way from the ring to disk. ``pipe`` is for the loop to inherit."""
+    """Rows and frames on their way from the ring to disk. ``held``: the pipe between the loop and the writer."""
 
     def __init__(
         self, mapped: Mapped, recording: Path, frames: Path, metadata: dict[str, Any], channel: str,
@@ -25,30 +26,24 @@ class RingRecorder:
     ) -> None:  # fmt: skip
         """Files to write. Forks: make it before the loop is begun. ``watch`` is called in the writer's process."""
         self._mapped = mapped
-        alive, self.pipe = os.pipe()
+        self.held = held = HeldPipe()
 
         def begin() -> Read:
-            os.close(self.pipe)
-            return _reader(RingBytes(mapped), alive)
+            held.handed_over()  # the writer has the other end
+            return _reader(RingBytes(mapped), held.alive)
 
         self._writer = WriterProcess(recording, frames, metadata, channel, watch, begin)
         self.writer_pid = self._writer.pid
-        os.close(alive)
+        os.close(held.alive)
 
     @property
     def lost_rows(self) -> int:
         """Rows for which the writer was too slow, ticks whole."""
         return int(self._mapped.shared["ring"]["lost_rows"][0, 0])
 
-    def handed_over(self) -> None:
-        """The loop has inherited the pipe, and is the only one to hold it from now on."""
-        if self.pipe >= 0:
-            os.close(self.pipe)
-            self.pipe = -1
-
     def close(self) -> None:
         """Let the writer finish. Raises ``RecordingError`` if it could not write all."""
-        self.handed_over()
+        self.held.handed_over()
         self._writer.wait()
 
 

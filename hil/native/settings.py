@@ -16,6 +16,8 @@ from pkxyz_ctrl.io.clocks import SPIN_US
 from pkxyz_ctrl.io.realtime import FIFO_PRIORITY
 from pkxyz_ctrl.safety.modes import LOOP_CLOSED
 
+BLIND_S = 2.0
+"""For so long a session may stand still while the stage holds: meanwhile nobody could stop it."""
 _INTERFACES = {"pkxyz-unix": Interface.UNIX, "socketcan": Interface.SOCKETCAN}
 _OPTIONS = {"receive_own_messages": False}
 """What an option may say: it is so anyway."""
@@ -54,6 +56,7 @@ def fill(
     to, period_us, channel = settings[0], setup.bus.period_us, _channel(can)
     to["is_operated"], to["ticks"] = is_operated, NO_END if is_operated else setup.ticks
     to["period_us"], to["landing_ticks"] = period_us, setup.law["landing_ticks"][0]
+    to["blind_ticks"] = round(BLIND_S * 1e6 / period_us)
     to["sense_deadline_us"], to["heartbeat_deadline_us"] = can.sense_deadline_us, can.heartbeat_deadline_us
     to["guard_us"], to["latest_start_us"] = period_us // GUARDS_PER_PERIOD, can.sense_deadline_us // 2
     to["spin_us"], to["company_us"], to["silent_us"] = SPIN_US, round(company_s * 1e6), SILENT_US

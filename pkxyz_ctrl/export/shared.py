@@ -1,9 +1,9 @@
 """What the native loop shares with whoever starts it: one mapped file. It never waits for anything that stands in it.
 
 ``SHARED`` is the file's beginning. Behind it come ``settings["blocks"]`` blocks of the path, ``PATH``, then the ring's
-bytes. Each number that crosses has one writer: the loop reads settings, config, path, orders, change and sheets, and
-writes all else but ``ring["tail"]`` and ``events["tail"]``. What ``operated`` holds is for a stage in operation: then
-set-points come in sheets, not in blocks.
+bytes. Each number that crosses has one writer: the loop reads settings, config, path, orders, ``looked``, change and
+sheets, and writes all else but ``ring["tail"]`` and ``events["tail"]``. What ``operated`` holds is for a stage in
+operation: then set-points come in sheets, not in blocks.
 """
 
 from enum import IntEnum, IntFlag
@@ -93,6 +93,7 @@ SETTINGS = np.dtype(
         ("period_us", "i8"),
         ("ticks", "i8"),  # to be recorded
         ("landing_ticks", "i8"),  # behind them, on the way down
+        ("blind_ticks", "i8"),  # for so long a session may look at nothing while the loop is closed
         ("sense_deadline_us", "i8"),
         ("heartbeat_deadline_us", "i8"),
         ("guard_us", "i8"),  # a tick that ends later than this before the next one gives that up
@@ -242,6 +243,7 @@ SNAPSHOT = np.dtype(
 OPERATED = np.dtype(
     [
         ("orders", ORDERS, (1,)),
+        ("looked", "i8"),  # newest snapshot that the session has looked at
         ("newest", "i8"),  # snapshot
         ("snapshots", SNAPSHOT, (SNAPSHOTS,)),  # of the ends of the last ticks
         ("change", CHANGE, (1,)),

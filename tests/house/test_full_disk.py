@@ -32,9 +32,8 @@ def pkxyz(*words, file_limit_bytes=None):
 
 
 def test_sil_on_a_full_disk_says_so_in_one_line_and_what_was_written_opens(tmp_path):
-    assert (
-        pkxyz("sil", "raster", "--out", tmp_path / "whole").returncode == 0
-    )  # kernels that are kept are no small files
+    whole = pkxyz("sil", "raster", "--out", tmp_path / "whole")  # kernels that are kept are no small files
+    assert whole.returncode == 0, whole.stderr
     done = pkxyz("sil", "raster", "--out", tmp_path / "full", file_limit_bytes=2_200_000)
     assert done.returncode == 2
     assert done.stdout == ""

@@ -17,6 +17,7 @@ from two_processes import DRIVE, EMCY, ROOT, assert_missed_by_the_node, bench, c
 
 from hil.bus.unix_bus import UnixBus
 from hil.native.program import compiled, compiler
+from hil.native.settings import BLIND_S
 from hil.operate.commands import Activity, State, Verb
 from hil.operate.law_change import OFFER
 from hil.runs.scenario import load_scenario
@@ -145,6 +146,20 @@ def test_a_session_that_stands_still_while_the_stage_holds_is_not_noticed(bench,
         rows = operator.rows
     assert (np.diff(rows["tick"]) == 1).all()
     require_no_jump(rows, SPEED)
+
+
+def test_a_session_that_stands_still_for_good_does_not_leave_a_stage_that_nobody_can_stop(bench, changes):
+    changes("pre-operational", False)
+    with operating(bench) as operator:
+        operator.switched_on()
+        os.kill(operator.session, signal.SIGSTOP)
+        begin_s = time.monotonic()
+        assert changes("pre-operational", False)[-2]["driven"]
+        assert time.monotonic() - begin_s > 0.9 * BLIND_S
+        os.kill(operator.session, signal.SIGCONT)
+        _, err = operator.run.communicate(timeout=30)
+        assert operator.run.returncode == 1
+        assert "pkxyz: nobody looked after the stage, so it was led down" in err
 
 
 def test_a_session_that_is_killed_leaves_a_stage_that_is_led_down(bench, changes):

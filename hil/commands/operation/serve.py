@@ -63,21 +63,9 @@ def serve(
         print(json.dumps({"url": url}) if as_json else f"the stage is at {url}", flush=True)
 
     served = Served(
-        name,
-        stage,
-        controller,
-        plant,
-        bus,
-        on_silence,
-        silence_s,
-        saves,
-        host,
-        port,
-        is_simulated,
-        settings,
-        report,
+        name, stage, controller, plant, bus, on_silence, silence_s, saves, host, port, is_simulated, settings, report,
         native,
-    )
+    )  # fmt: skip
     raise typer.Exit(serve(served, tell))
 
 

@@ -12,6 +12,7 @@ from pathlib import Path
 from hil.lanes.ending import Ended, Ending
 from hil.lanes.setup import Setup
 from hil.lanes.wall import COMPANY_S, require_real_bus
+from hil.native.held_pipe import HeldPipe
 from hil.native.loop_process import LoopProcess
 from hil.native.mapped import RING_BYTES, Mapped, text_of
 from hil.native.ring_recorder import RingBytes
@@ -29,22 +30,6 @@ from pkxyz_ctrl.io.realtime import FIFO_PRIORITY, go_real_time, leave_real_time,
 _PRIORITY = FIFO_PRIORITY - 10
 """Below the loop's and the plant's, which wait for nothing of it."""
 _LOOK_MS, _LOOK_TICKS = 20, 50
-
-
-class _Pipe:
-    """Of which this process alone has the end that is read."""
-
-    def __init__(self) -> None:
-        self._read, self.pipe = os.pipe()
-
-    def handed_over(self) -> None:
-        if self.pipe >= 0:
-            os.close(self.pipe)
-            self.pipe = -1
-
-    def close(self) -> None:
-        self.handed_over()
-        os.close(self._read)
 
 
 class _Beside:
@@ -99,10 +84,10 @@ def operate_natively(
     """
     can = require_real_bus(setup.bus)
     with Ending() as ending:
-        counted, pipe, wake = Counted(can), _Pipe(), os.eventfd(0, os.EFD_NONBLOCK)
+        counted, held, wake = Counted(can), HeldPipe(), os.eventfd(0, os.EFD_NONBLOCK)
         mapped = Mapped(blocks=1, ring_bytes=RING_BYTES)
         ordered = Ordered(setup, mapped.shared[0])
-        loop = LoopProcess(program, setup, can, mapped, ordered, pipe, ending)
+        loop = LoopProcess(program, setup, can, mapped, ordered, held, ending)
         memory = StageMemory.made(name, round(KEPT_S / setup.bus.period_s))
         try:
             setpoints = Sheets(setup.bus.period_us, *rows_of(ordered.law), mapped.shared["operated"]["sheets"][0, 0])
@@ -123,7 +108,8 @@ def operate_natively(
             try:
                 loop.close()
             finally:
-                pipe.close()
+                held.handed_over()
+                os.close(held.alive)
                 os.close(wake)
                 place.forget(name, "loop")
                 memory.remove()

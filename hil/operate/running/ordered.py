@@ -53,7 +53,7 @@ class Ordered(Teller):
         self._port, self._obeyed = port.copy(), slot["obeyed"][0].copy()
         if int(slot["begun"]) != newest:  # being written over: the next one comes soon
             return False
-        self.seen = newest
+        self.seen = self._operated["looked"] = newest
         return True
 
     def answered(self, setpoints: Sheets) -> bool:

@@ -84,6 +84,14 @@ static void obey(const pkxyz_shared_orders *orders)
     take_outputs(orders);
 }
 
+/* Whether nobody could stop or release the stage any more: whoever would is there, but looks at nothing. */
+static int is_alone(void)
+{
+    const pkxyz_shared_operated *operated = shared->operated;
+    const int64_t looked = atomic_load_explicit((const _Atomic int64_t *)&operated->looked, memory_order_relaxed);
+    return controller_is_closed() && operated->newest - looked > shared->settings->blind_ticks;
+}
+
 /* Whether the law finds every row of this tick that it looks at, or the set-point stands behind the last one. */
 static int reaches(int64_t count)
 {
@@ -99,6 +107,8 @@ void orders_take(const pkxyz_reference **rows, int32_t *count)
         obey(orders);
         obeyed.number = number;
     }
+    if (is_alone())
+        ending_ask(PKXYZ_OUTCOME_SESSION_GONE); /* which leads it down */
     if (!sheet)
         return;
     const int64_t known = atomic_load_explicit((const _Atomic int64_t *)&sheet->count, memory_order_acquire);

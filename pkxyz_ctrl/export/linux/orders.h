@@ -10,7 +10,7 @@ void orders_begin(pkxyz_shared *shared, int wake);
 
 /* What was ordered since, if anything, and the rows of the set-points for this tick. A sheet that differs in a row which
    the law has seen is refused, and the one before goes on: so a set-point never jumps. Where the rows end while it moves,
-   the stage is led down. */
+   or where he has looked at nothing for too long, the stage is led down. */
 void orders_take(const pkxyz_reference **rows, int32_t *count);
 
 /* A tick is over: a snapshot of what it left, and word of it. */
