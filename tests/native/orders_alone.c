@@ -6,6 +6,7 @@
 static int mode, asked, requested;
 
 int controller_mode(void) { return mode; }
+int controller_is_closed(void) { return mode == PKXYZ_MODE_TRACKING; }
 void controller_request(int event) { requested = event; }
 void controller_clear(void) {}
 void controller_change_law(const pkxyz_law_change_change *change) { (void)change; }

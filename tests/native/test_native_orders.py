@@ -27,7 +27,7 @@ from pkxyz_ctrl.trajectory.segments import Limits
 HERE = Path(__file__).parent
 LIMITS = Limits(0.5e-3, 0.5, 300.0)
 PERIOD_S = 200e-6
-NOWHERE = 1e9
+BLIND_TICKS = 3000
 
 
 @pytest.fixture(scope="module")
@@ -55,6 +55,7 @@ class Side:
         self.shared = mapped.shared[0]
         self.ordered = Ordered(setup, self.shared)
         self.shared["config"], self.shared["memory"] = self.ordered.record, self.ordered.exchange
+        self.shared["settings"]["blind_ticks"] = BLIND_TICKS
         self.setpoints = Sheets(200, *rows_of(self.ordered.law), self.shared["operated"]["sheets"][0])
         self.memory = self.shared["memory"][0]
         self.keep = mapped
@@ -197,3 +198,23 @@ def test_rows_that_end_while_the_set_point_moves_lead_the_stage_down_and_not_whi
     assert side.library.alone_asked() == LoopEnd.SET_POINTS_LATE
     assert side.library.alone_requested() == Event.DISABLE
     assert len(side.played) - before > 0.025 / PERIOD_S
+
+
+def test_a_session_that_looks_at_nothing_for_too_long_has_the_stage_led_down_and_the_last_tick_before_not(
+    library, setup
+):
+    side = Side(library, setup)
+    side.step(0, lambda setpoints: None)
+    for _ in range(BLIND_TICKS + 1):
+        side.tick()
+        assert side.library.alone_asked() == 0
+    side.tick()
+    assert side.library.alone_asked() == LoopEnd.SESSION_GONE
+
+
+def test_a_stage_at_0_V_waits_for_a_session_as_long_as_it_takes(library, setup):
+    side = Side(library, setup)
+    library.alone_mode(int(Mode.IDLE))
+    for _ in range(BLIND_TICKS + 10):
+        side.tick()
+    assert side.library.alone_asked() == 0
