@@ -212,7 +212,7 @@ def test_a_session_that_looks_at_nothing_for_too_long_has_the_stage_led_down_and
     assert side.library.alone_asked() == LoopEnd.SESSION_GONE
 
 
-def test_a_stage_at_0_V_waits_for_a_session_as_long_as_it_takes(library, setup):
+def test_a_stage_without_voltage_waits_for_a_session_as_long_as_it_takes(library, setup):
     side = Side(library, setup)
     library.alone_mode(int(Mode.IDLE))
     for _ in range(BLIND_TICKS + 10):
