@@ -3,17 +3,16 @@
 import json
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass
+from functools import cached_property
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
-import pyarrow as pa
 from numpy.typing import NDArray
 
 from hil.lanes.lane import Lane
-from hil.pictures.run import draw
 from hil.recording.recording import COLUMNS, Recording
-from hil.runs.run import run_in_memory, run_into
+from hil.runs.run import require_bus, run_in_memory, run_into
 from hil.runs.run_folder import RECORDING, SUMMARY, RunFolder
 from hil.runs.scenario import Scenario, load_scenario
 from pkxyz_ctrl.config.files import ConfigError
@@ -22,6 +21,9 @@ from pkxyz_ctrl.loop.row import ROW, columns
 if TYPE_CHECKING:
     import pandas
     import polars
+    import pyarrow
+
+    from hil.runs.summary import Summary
 
 _FIELD_OF = {column: field for field in ROW.names or () for column in columns(field)}
 
@@ -32,10 +34,24 @@ class Run:
 
     summary: dict[str, Any]
     """plain data as in ``summary.json``: who ran, figures by name with their units, verdicts on the checks, ``ok``"""
-    rows: NDArray[np.void]
-    """(n,) one record a tick; fields as in the reference of recording columns"""
     folder: Path | None
     """where recording, frame log and picture are; None for a run in memory"""
+    figures: "Summary | None" = None
+    """the summary with its types; None for a run that was opened from its folder"""
+    in_memory: NDArray[np.void] | None = None
+    """the rows of a run without a folder"""
+
+    @cached_property
+    def rows(self) -> NDArray[np.void]:
+        """(n,) one record a tick; fields as in the reference of recording columns. Read when they are first asked for.
+
+        Raises ``RecordingError`` for a recording that can't be read, ``OSError`` without one.
+        """
+        if self.in_memory is not None:
+            return self.in_memory
+        assert self.folder is not None, "rows are in memory or in a folder"
+        blocks = list(Recording.open(self.folder / RECORDING).rows(ROW.names or ()))
+        return np.concatenate(blocks) if blocks else np.zeros(0, ROW)
 
     @property
     def ok(self) -> bool:
@@ -62,9 +78,11 @@ class Run:
         """All columns (n,) by name, each contiguous."""
         return {name: np.ascontiguousarray(self[name]) for name in COLUMNS}
 
-    def to_arrow(self) -> pa.Table:
+    def to_arrow(self) -> "pyarrow.Table":
         """All columns as a ``pyarrow.Table``."""
-        return pa.table(self.arrays())
+        import pyarrow
+
+        return pyarrow.table(self.arrays())
 
     def to_pandas(self) -> "pandas.DataFrame":
         """All columns as a ``pandas.DataFrame``. Needs pandas: ``pip install pkxyz-ctrl[frames]``."""
@@ -84,22 +102,34 @@ def run(
     *,
     lane: Lane | str = Lane.FAST,
     out: str | Path | None = None,
+    replace: bool = False,
+    draw: "Callable[[RunFolder, Summary], None] | None" = None,
     on_progress: Callable[[int, int], None] = lambda done, total: None,
 ) -> Run:
     """Close the loop on a scenario (by itself, or by the name or file of one).
 
     ``lane``: "fast", composed in one compiled loop, or "lockstep", over the simulated bus; both give the same bits.
-    ``out``: a folder for recording, frame log, configuration, summary and picture; without it nothing is written.
-    ``on_progress`` is told the ticks done and in all. Raises ``ConfigError`` for what can't be run.
+    ``out``: a folder for recording, frame log, configuration, summary and picture, ``replace``: also that of an earlier
+    run; without it nothing is written. ``draw``: who draws the picture, this process by default. ``on_progress`` is
+    told the ticks done and in all. Ctrl-C ends a run into a folder, which keeps what was recorded and says so in its
+    summary. Raises ``ConfigError`` for what can't be run, and it or ``RecordingError`` when the disk fails.
     """
     loaded = scenario if isinstance(scenario, Scenario) else load_scenario(scenario)
     chosen = _in_process(lane)
+    require_bus(loaded, chosen)
     if out is None:
         summary, rows = run_in_memory(loaded, chosen, on_progress)
-        return Run(summary.as_json(), rows, None)
-    folder = RunFolder(Path(out))
-    draw(folder, run_into(folder, loaded, chosen, on_progress))
-    return open_run(folder.path)
+        return Run(summary.as_json(), None, summary, rows)
+    folder = RunFolder(Path(out), replace=replace)
+    summary = run_into(folder, loaded, chosen, on_progress)
+    (draw or _drawn_here)(folder, summary)
+    return Run(_summary_of(folder.path), folder.path, summary)
+
+
+def _drawn_here(folder: RunFolder, summary: "Summary") -> None:
+    from hil.pictures.run import draw  # whoever draws elsewhere does without matplotlib here
+
+    draw(folder, summary)
 
 
 def _in_process(lane: Lane | str) -> Lane:
@@ -113,10 +143,10 @@ def _in_process(lane: Lane | str) -> Lane:
 def open_run(folder: str | Path) -> Run:
     """A run from its folder. Raises ``RecordingError`` for a recording that can't be read, ``OSError`` without one."""
     path = Path(folder)
-    summary = json.loads((path / SUMMARY).read_text(encoding="utf-8"))
-    return Run(summary, _rows_of(path / RECORDING), path)
+    Recording.open(path / RECORDING)  # what is no recording is said here
+    return Run(_summary_of(path), path)
 
 
-def _rows_of(path: Path) -> NDArray[np.void]:
-    blocks = list(Recording.open(path).rows(ROW.names or ()))
-    return np.concatenate(blocks) if blocks else np.zeros(0, ROW)
+def _summary_of(path: Path) -> dict[str, Any]:
+    summary: dict[str, Any] = json.loads((path / SUMMARY).read_text(encoding="utf-8"))
+    return summary

@@ -60,6 +60,7 @@ def sil(
     with DrawingProcess() as pictures:
         say_if_compiling(quiet=as_json)
         from hil.faults.fault import parse
+        from hil.runs.run_folder import next_free
         from hil.runs.scenario import load_scenario
 
         faults = [parse(text) for text in fault or ()]
@@ -69,37 +70,34 @@ def sil(
             learning=learning, adapted=adapted,
         )  # fmt: skip
         require_simulated(loaded.bus, "sil")
-        summary, folder = _ran(loaded, lane, out, replace_earlier, pictures, quiet=as_json)
+        path = out if out is not None else next_free(Path("runs"), loaded.config.name, lane)
+        summary = _ran(loaded, lane, path, replace_earlier, pictures, quiet=as_json)
     if as_json:
-        print(json.dumps(summary.as_json() | {"folder": str(folder)}, allow_nan=False))
+        print(json.dumps(summary.as_json() | {"folder": str(path)}, allow_nan=False))
     else:
-        show(summary, folder)
+        show(summary, path)
     raise typer.Exit(130 if summary.interrupted else 0 if summary.ok else 1)
 
 
 def _ran(
-    loaded: "Scenario", lane: Lane, out: Path | None, replace_earlier: bool, pictures: DrawingProcess, *, quiet: bool
-) -> "tuple[Summary, Path]":
+    loaded: "Scenario", lane: Lane, path: Path, replace_earlier: bool, pictures: DrawingProcess, *, quiet: bool
+) -> "Summary":
     """The run into its folder, with its picture."""
+    from hil.api.run import run
     from hil.recording.recording import RecordingError
-    from hil.runs.run import require_bus, run_into
-    from hil.runs.run_folder import RunFolder, next_free
     from pkxyz_ctrl.design.model.design_error import DesignError
     from pkxyz_ctrl.loop.controller import StartUpError
 
-    require_bus(loaded, lane)
-    path = out if out is not None else next_free(Path("runs"), loaded.config.name, lane)
-    folder = RunFolder(path, replace=replace_earlier)
     try:
         with progress_bar(f"{loaded.config.name}, {lane} lane", quiet=quiet) as tell:
-            summary = run_into(folder, loaded, lane, tell)
-        pictures.draw(folder, summary)
+            done = run(loaded, lane=lane, out=path, replace=replace_earlier, draw=pictures.draw, on_progress=tell)
     except RecordingError as error:
         raise ConfigError(str(error)) from None
     except (StartUpError, DesignError) as error:
         print(f"pkxyz: {error}", file=sys.stderr)
         raise typer.Exit(1) from None
-    return summary, folder.path
+    assert done.figures is not None, "it was run here"
+    return done.figures
 
 
 def show(summary: "Summary", folder: Path) -> None:

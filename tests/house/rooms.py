@@ -128,7 +128,8 @@ HOUSE: Mapping[str, Room] = MappingProxyType({
     )),
     "hil.commands": Room((
         "pkxyz_ctrl.*", "hil.recording", "hil.faults", "hil.lanes", "hil.native", "hil.emulator", "hil.conformance",
-        "hil.runs", "hil.studies", "hil.pictures", "hil.screen", "hil.bench.rigs", "hil.bench", "hil.commands.studies",
+        "hil.runs", "hil.studies", "hil.pictures", "hil.screen", "hil.bench.rigs", "hil.bench", "hil.api",
+        "hil.commands.studies",
     )),
     "hil.commands.operation": Room((
         "pkxyz_ctrl.*", "hil.lanes", "hil.conformance", "hil.operate", "hil.native", "hil.operate.running",
