@@ -310,7 +310,7 @@ def test_another_seed_is_another_digest():
 
 # -- the page -------------------------------------------------------------------------------------------------------
 
-PAGE = Path(__file__).parents[2] / "docs" / "understand" / "identification.md"
+PAGE = Path(__file__).parents[3] / "docs" / "understand" / "identification.md"
 
 
 def row_of(start, column):

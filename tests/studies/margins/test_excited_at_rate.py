@@ -36,7 +36,7 @@ from pkxyz_ctrl.loop.cycle import MEMORY
 
 pytestmark = pytest.mark.at_rate
 
-ROOT = Path(__file__).parents[2]
+ROOT = Path(__file__).parents[3]
 PERIOD_TICKS = 250
 SETTLED_TICKS = 70
 """More than the 52 ticks that this loop takes for 1e-3 of what stirs it up."""
