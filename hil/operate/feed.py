@@ -3,6 +3,7 @@
 The ramps are those of ``core.feed_hold``, so a path that is paused is not left.
 """
 
+import math
 from typing import NamedTuple
 
 import numpy as np
@@ -32,6 +33,13 @@ class Feed(NamedTuple):
             return self.phase + (row - self.origin)
         advanced, _, _ = feed_hold.advance(self.direction, row - self.origin, self.ramp)
         return self.phase + float(advanced)
+
+    def nearest(self, first: int, count: int) -> NDArray[np.int64]:
+        """Row of the path that is nearest to each of ``count`` rows of the loop from ``first`` on."""
+        if self.direction == feed_hold.STEADY:
+            begin = math.floor(self.phase + (first - self.origin) + 0.5)
+            return np.arange(begin, begin + count)
+        return np.array([math.floor(self.at(row) + 0.5) for row in range(first, first + count)])
 
     def turned(self, direction: int, row: int) -> "Feed":
         """Slowing down or starting from ``row`` on; in the middle of the other, from the speed that there is."""

@@ -1,7 +1,7 @@
 """A stage in operation: takes commands, moves the set-points, answers. Time, commands and memory are handed in.
 
-Called once a tick, after it; what it decides begins to act in the next. It knows no process and no clock, so it runs in
-lockstep as at rate.
+Called once a tick, after it: first to decide, which begins to act in the next, then to tell how things stand. It knows
+no process and no clock, so it runs in lockstep as at rate.
 """
 
 from collections.abc import Callable, Iterable
@@ -113,7 +113,7 @@ class Session:
 
     # -- once a tick ---------------------------------------------------------------------------------------------------
 
-    def after(self, row: np.void, commands: Iterable[np.void] = (), missed: int = 0) -> None:
+    def decide(self, row: np.void, commands: Iterable[np.void] = (), missed: int = 0) -> None:
         """A tick is over, and this is its row of ``ROW``; ``commands``, records of ``COMMAND``, have come since the
         last call, and so many more periods have passed that nobody said so of. On return the set-points of the next
         tick are ready.
@@ -130,7 +130,6 @@ class Session:
             stage.setpoints.advance(int(controller.memory["reference_tick"][0]))
         for command in commands:
             self._begin(command)
-        self._tell()
 
     # -- commands ------------------------------------------------------------------------------------------------------
 
@@ -343,7 +342,8 @@ class Session:
 
     # -- what is told --------------------------------------------------------------------------------------------------
 
-    def _tell(self) -> None:
+    def tell(self) -> None:
+        """Write into ``state`` how things stand."""
         state, stage = self.state, self.stage
         setpoints, path, position = stage.setpoints, stage.path, stage.controller.outputs["position"]
         state["activity"] = int(self._activity())

@@ -256,8 +256,7 @@ class Setpoints:
     def _sample(self, count: int) -> None:
         first, at = self._filled, self._filled - self._base
         write_rows(self._rows[at : at + count], self._motion(first, count), first)
-        on_path = np.array([math.floor(self._feed.at(row) + 0.5) for row in range(first, first + count)])
-        self._rows["output"][at : at + count] = self._source.outputs(on_path)
+        self._rows["output"][at : at + count] = self._source.outputs(self._feed.nearest(first, count))
         self._filled = first + count
 
     def _motion(self, first: int, count: int) -> Array:

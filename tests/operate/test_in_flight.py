@@ -1,9 +1,11 @@
 """Plans from any state: they begin there, keep the limits and end at rest where they should."""
 
 import numpy as np
+import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
+from pkxyz_ctrl.trajectory import in_flight
 from pkxyz_ctrl.trajectory.in_flight import to_rest, towards
 from pkxyz_ctrl.trajectory.segments import Limits
 
@@ -67,3 +69,32 @@ def test_a_state_faster_than_the_limits_is_brought_inside_them():
     assert rows[:, 3].max() <= 0.4e-3 * (1 + 1e-9)
     assert np.allclose(rows[-1, 0:3], [20e-6, 0, 0], atol=1e-12)
     assert (rows[len(rows) // 2 :, 3] <= 0.1e-3 * (1 + 1e-6)).all()
+
+
+@settings(max_examples=60)
+@given(states, three(10e-6).map(np.array))
+def test_rows_are_those_that_ruckig_itself_samples(state, target):
+    """ruckig's ``at_time``, in its own units, at whole periods, at the ends of pieces and between."""
+    planned = []
+
+    class Kept(in_flight.InFlight):
+        def __init__(self, trajectory, start_m, length_m, time_s):
+            planned.append((trajectory, start_m, length_m, time_s))
+            super().__init__(trajectory, start_m, length_m, time_s)
+
+    with pytest.MonkeyPatch.context() as patched:
+        patched.setattr(in_flight, "InFlight", Kept)
+        motions = towards(state, target, LIMITS), to_rest(state, LIMITS)
+    for motion, (trajectory, start_m, length_m, time_s) in zip(motions, planned, strict=True):
+        ends = np.unique(np.clip(motion._pieces[:, :, 0], 0.0, motion.total_s))
+        t_s = np.sort(np.concatenate([np.arange(0.0, motion.total_s, 1e-4), ends, np.nextafter(ends, 0.0)]))
+        if motion.total_s == 0.0:  # it is there
+            assert (state[1:] == 0).all()
+            continue
+        theirs = np.array([np.concatenate(trajectory.at_time(t / time_s)) for t in t_s[t_s < motion.total_s]])
+        theirs *= np.repeat([length_m, length_m / time_s, length_m / time_s**2], 3)
+        theirs[:, 0:3] += start_m
+        ours = motion.sample(t_s)[t_s < motion.total_s]
+        assert np.allclose(ours[:, 0:3], theirs[:, 0:3], rtol=0, atol=1e-12 * length_m + 1e-20)
+        assert np.allclose(ours[:, 3:6], theirs[:, 3:6], rtol=0, atol=1e-10 * LIMITS.velocity_m_per_s)
+        assert np.allclose(ours[:, 6:9], theirs[:, 6:9], rtol=0, atol=1e-9 * LIMITS.acceleration_m_per_s2)

@@ -52,6 +52,12 @@ class OperatedRig:
         record = np.frombuffer(answer, ANSWER)[0]
         self.answers.append((int(record["id"]), State(int(record["state"])), record["words"].decode()))
 
+    def after_tick(self, row: np.void) -> None:
+        """The session's turn."""
+        self.session.decide(row, self._given)
+        self.session.tell()
+        self._given.clear()
+
     def play(self, script: Script) -> np.ndarray:
         """Run until the script ends; returns the rows of all ticks."""
 
@@ -69,8 +75,7 @@ class OperatedRig:
                 next(script)
             except StopIteration:
                 raise _OverError from None
-            self.session.after(row, self._given)
-            self._given.clear()
+            self.after_tick(row)
             self.rows.append(row.copy())
 
         self.lockstep.node.power_on()

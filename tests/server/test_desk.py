@@ -42,7 +42,6 @@ class DeskRig(OperatedRig):
         place.write("stage", "loop", {"pid": 1, "memory": str(memory.path), "period_us": 200, "voltage_max_v": 200.0})
         monkeypatch.setattr(place, "_is_alive", lambda pid: True)
         self.loop = OperatedLoop(self.session, memory, _NoFrames())  # type: ignore[arg-type]
-        self.session.after = _through(self.loop, self.session.after)  # type: ignore[method-assign]
 
         async def plan(function: Any, *arguments: Any) -> Any:
             return function(*arguments)
@@ -50,6 +49,10 @@ class DeskRig(OperatedRig):
         self.desk = Desk(Link("stage"), Planner("reconstructed", "youla", "fd_5k"), plan)
         self.every_tick.append(self.desk.look)
         self._server_tags = 0
+
+    def after_tick(self, row: np.void) -> None:
+        """By way of the memory, as at rate."""
+        self.loop.after(0)
 
     def heard(self, client: Client) -> dict[str, list[Any]]:
         """All that waits for a client, by kind."""
@@ -77,17 +80,6 @@ class DeskRig(OperatedRig):
                     return answer
             yield
         raise AssertionError(f"no end of {message}")
-
-
-def _through(loop: OperatedLoop, after: Any) -> Any:
-    """What the rig calls goes by way of the memory, as at rate."""
-
-    def replaced(row: Any, commands: Any = ()) -> None:
-        loop._session.after = after  # the loop calls it itself
-        loop.after(0)
-        loop._session.after = replaced
-
-    return replaced
 
 
 @pytest.fixture
@@ -291,7 +283,6 @@ def test_what_is_asked_while_the_loop_starts_is_answered(tmp_path, monkeypatch):
     rig.ask(client, do="move", tag="early", x_m=1e-6)
     memory = StageMemory(tmp_path / "memory")
     rig.loop = OperatedLoop(rig.session, memory, _NoFrames())  # type: ignore[arg-type]
-    rig.session.after = _through(rig.loop, type(rig.session).after.__get__(rig.session))  # type: ignore[method-assign]
 
     def script() -> Script:
         yield

@@ -83,10 +83,11 @@ class OperatedLoop:
         for _ in range(1 + min(missed, _BLOCKS_AT_ONCE)):
             if session.wants_rows:
                 self._take_rows()
-        session.after(session.stage.controller.memory["row"][0], self._come(), missed)
+        session.decide(session.stage.controller.memory["row"][0], self._come(), missed)
 
     def tell(self, row: bytes | memoryview) -> None:
         """Write down a tick's record of ``ROW``, with its frames and what the session says now."""
+        self._session.tell()
         state = self._session.state
         state["commands"] = self._commands.next - 1
         state["frames"], state["wire_ns"] = self._counted.frames, self._counted.wire_ns

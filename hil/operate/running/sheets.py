@@ -27,7 +27,7 @@ _MARGIN_LEAST, _MARGIN_KEPT, _MARGIN_MOST = 1, 6, 64
 """How many rows behind those that the law has seen something begins: at least; at most once the loop has taken it; and
 where it was refused.
 """
-_IN_TIME = 16  # sheets in a row with a tick to spare, until the margin is a row less
+_IN_TIME = 6  # sheets in a row with a tick to spare, until the margin is a row less
 _NEVER = np.iinfo(np.int64).max
 
 assert SHEET_ROWS == BLOCK_ROWS
