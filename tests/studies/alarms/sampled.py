@@ -13,7 +13,7 @@ import math
 import time
 from functools import cache
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 from test_false_alarms import circles, corner_to_corner
@@ -26,6 +26,7 @@ from hil.studies.margins.loop import Loop
 from hil.studies.montecarlo import Study
 from pkxyz_ctrl.config.files import ConfigError, load
 from pkxyz_ctrl.design.margins.tolerances import Tolerances
+from pkxyz_ctrl.loop.row import ROW
 from pkxyz_ctrl.safety.modes import LOOP_CLOSED
 from pkxyz_ctrl.stage import Stage
 
@@ -43,6 +44,10 @@ KEPT = Path(__file__).parents[3] / "docs" / "tables" / "alarms.jsonl"
 PIECE = 50
 """Devices after which what was found is kept."""
 BEFORE_TICKS = 50
+SWING_S, SWINGS, SWING_LEAST_M = 0.1, 4, 50e-9
+"""A stage whose true error has got larger in each of so many equal parts of the time before it was stopped, up to more
+than this (standard deviation), was not stopped for nothing: its loop is not stable, whatever the linear plant says.
+"""
 STOP_M = 25e-6
 """Of a slider, at either end of its stroke."""
 MOTIONS = {"moves": corner_to_corner, "circles": circles}
@@ -61,25 +66,44 @@ def designed(motion: str, law: str) -> tuple[Study, Setup]:
     return Study(scenario, load("tolerances", "wide", Tolerances)), setup
 
 
-def stopped(motion: str, law: str, seed: int) -> tuple[str, bool] | None:
-    """Why the device of a seed was stopped, and whether it could not get where it was to be: it was at a stop of its
-    own, or its combs at their limits. None if it was not stopped.
-    """
+class Stopped(NamedTuple):
+    """What became of a device that was stopped."""
+
+    why: str
+    is_beyond: bool
+    """it could not get where it was to be: it was at a stop of its own, or its combs at their limits"""
+    has_swung: bool
+    """its error grew and grew"""
+
+
+def swings(rows: np.ndarray) -> bool:
+    """Whether the true error has grown from part to part of rows of ``ROW``."""
+    error_m = rows["position_m"] - rows["reference_m"]
+    sizes = [part.std(axis=0).max() for part in np.array_split(error_m, SWINGS)]
+    return bool(len(rows) >= 10 * SWINGS and np.all(np.diff(sizes) > 0.0) and sizes[-1] > SWING_LEAST_M)
+
+
+def stopped(motion: str, law: str, seed: int) -> Stopped | None:
+    """What became of the device of a seed. None if it was not stopped."""
     study, base = designed(motion, law)
     setup = dataclasses.replace(base, plant=study.sampled(seed).plant, seed=seed)
     vars(setup)["law"] = base.law
-    last: list[Any] = []
+    kept_ticks = round(SWING_S / setup.bus.period_s)
+    last = np.zeros(0, ROW)
 
     def on_block(block: Any) -> None:
+        nonlocal last
         driven = block[LOOP_CLOSED[block["mode"]] != 0]
-        last[:] = [driven[-BEFORE_TICKS:].copy()] if len(driven) else last
+        last = np.concatenate([last, driven])[-kept_ticks:]
 
     faults = in_process.run(setup, Lane.FAST, on_block=on_block).faults
     if not faults:
         return None
-    strokes = Stage(setup.stage).inverse_kinematics(last[0]["position_m"]) if last else np.zeros((1, 3))
-    at_limits = float(last[0]["saturated"].mean()) > 0.5 if last else False
-    return faults[0].splitlines()[0], bool(strokes.max() > STOP_M or strokes.min() < 0.0) or at_limits
+    end = last[-BEFORE_TICKS:]
+    strokes = Stage(setup.stage).inverse_kinematics(end["position_m"]) if len(end) else np.zeros((1, 3))
+    at_limits = float(end["saturated"].mean()) > 0.5 if len(end) else False
+    is_beyond = bool(strokes.max() > STOP_M or strokes.min() < 0.0) or at_limits
+    return Stopped(faults[0].splitlines()[0], is_beyond, swings(last))
 
 
 def is_stable(motion: str, law: str, seed: int) -> bool:
@@ -96,15 +120,15 @@ def judge(motion: str, law: str, seed: int) -> str | None:
     """``None`` for a device that was not stopped; else whether it could not get there (``beyond``), has a loop that is
     not stable (``unstable``), or was stopped for nothing (``false``).
     """
-    why = stopped(motion, law, seed)
-    if why is None:
+    found = stopped(motion, law, seed)
+    if found is None:
         return None
-    if why[1]:
+    if found.is_beyond:
         return "beyond"
-    if is_stable(motion, law, seed):
-        print(f"  {law} in {motion}, device {seed}: {why[0]}", flush=True)
-        return "false"
-    return "unstable"
+    if found.has_swung or not is_stable(motion, law, seed):
+        return "unstable"
+    print(f"  {law} in {motion}, device {seed}: {found.why}", flush=True)
+    return "false"
 
 
 def read(path: Path) -> dict[tuple[str, str], dict[str, Any]]:
