@@ -1,8 +1,8 @@
 """Mutation testing of what stands between a mistake and 200 V: ``make mutate``; options: ``mutate.py --help``.
 
-Every outcome is written to runs/ at once, so that a run that was stopped goes on where it was: what was killed is known
-as long as the module stays as it is, what survived as long as its tests do as well. Survivors that are equivalent, with
-the reason, are listed in mutation_survivors.toml.
+Every outcome is written to outcomes.jsonl at once, so that a run that was stopped goes on where it was, here or from a
+commit: what was killed is known as long as the module stays as it is, what survived as long as its tests do as well.
+Survivors that are equivalent, with the reason, are listed in mutation_survivors.toml.
 """
 
 import argparse
@@ -17,6 +17,7 @@ import tomllib
 from collections import Counter
 from collections.abc import Iterator
 from dataclasses import dataclass
+from functools import cache
 from pathlib import Path
 
 from mutants import Mutant, mutants
@@ -24,7 +25,7 @@ from mutation_run import ROOT, TESTS, BaselineError, Subject, preload, run_mutan
 
 SURVIVORS = TESTS / "mutation" / "mutation_survivors.toml"
 REPORT = ROOT / "docs" / "lookup" / "mutation.md"
-STATE = ROOT / "runs" / "mutation.jsonl"
+STATE = TESTS / "mutation" / "outcomes.jsonl"
 SEED = 1
 FEW = 8  # mutants, for which it does not pay to measure the tests beforehand
 
@@ -123,7 +124,6 @@ class State:
     """Outcomes of this run and those before, a line of JSON each."""
 
     def __init__(self, fresh: bool) -> None:
-        STATE.parent.mkdir(parents=True, exist_ok=True)
         if fresh:
             STATE.unlink(missing_ok=True)
         lines = STATE.read_text(encoding="utf-8").splitlines() if STATE.exists() else []
@@ -141,13 +141,20 @@ class State:
 
     def add(self, job: Job, result: str) -> None:
         name = _name_with_tests(job) if result == "survived" else _name(job)
+        self._known[name] = result
         with STATE.open("a", encoding="utf-8") as file:
             file.write(json.dumps([name, result]) + "\n")
 
+    def tidy(self, jobs: list[Job]) -> None:
+        """Keep of the file what is known of ``jobs``, in their order: no longer what modules were before."""
+        names = [name for job in jobs for name in (_name(job), _name_with_tests(job)) if name in self._known]
+        fresh = STATE.with_suffix(".part")
+        fresh.write_text("".join(json.dumps([name, self._known[name]]) + "\n" for name in names), encoding="utf-8")
+        fresh.replace(STATE)
+
 
 def _name(job: Job) -> str:
-    mutant = job.mutant
-    return f"{job.module} {_digest(job.path)} {mutant.place} {mutant.number} {one_line(mutant.change)}"
+    return f"{job.module} {_digest(job.path)} {job.mutant.place} {job.mutant.number}"
 
 
 def _name_with_tests(job: Job) -> str:
@@ -155,6 +162,7 @@ def _name_with_tests(job: Job) -> str:
     return f"{_name(job)} {_digest(*sorted(helpers), *(TESTS / name for name in subject_of(job.module).files))}"
 
 
+@cache
 def _digest(*paths: Path) -> str:
     digest = hashlib.sha256()
     for path in paths:
@@ -250,6 +258,8 @@ def main() -> int:
         if result != "killed":
             where = f"{job.module}:{job.mutant.line}"
             print(f"{len(outcomes)}/{len(jobs)} {result}: {where}: {one_line(job.mutant.change)}", flush=True)
+    if modules == list(TARGETS) and not arguments.match:
+        state.tidy(jobs)
     text, unexplained = report(jobs, outcomes)
     if arguments.report:
         said = REPORT.read_text(encoding="utf-8") if REPORT.exists() else ""

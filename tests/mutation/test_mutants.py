@@ -2,6 +2,7 @@
 
 import ast
 import math
+from collections.abc import Iterator
 from pathlib import Path
 
 import mutate
@@ -159,6 +160,30 @@ def test_a_report_never_tells_of_less_than_the_one_before(
     page.write_text("no report")
     assert mutate.main() == 0
     assert "mutants tried" in page.read_text()
+
+
+def test_a_run_goes_on_from_what_is_kept_and_forgets_what_modules_were(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    kept, tried = tmp_path / "outcomes.jsonl", []
+
+    def run_two(jobs: list[mutate.Job], end_s: float, workers: int) -> Iterator[tuple[mutate.Job, str]]:
+        tried.append(len(jobs))
+        yield jobs[0], "killed"
+        yield jobs[-1], "survived"
+
+    kept.write_text('["pkxyz_ctrl.safety.modes 0123456789abcdef 3 0", "killed"]\n')  # of another day
+    monkeypatch.setattr(mutate, "STATE", kept)
+    monkeypatch.setattr(mutate, "TARGETS", {"pkxyz_ctrl.safety.modes": ("safety/test_safety_modes.py",)})
+    monkeypatch.setattr(mutate, "run_jobs", run_two)
+    monkeypatch.setattr("sys.argv", ["mutate.py"])
+    for _ in range(2):
+        mutate.main()
+    assert tried[1] == tried[0] - 2
+    lines = kept.read_text().splitlines()
+    assert [line.endswith('"killed"]') for line in lines].count(True) == 2
+    assert len(lines) == 4
+    assert "0123456789abcdef" not in kept.read_text()
 
 
 def test_tests_that_fail_without_a_mutant_are_told(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
