@@ -6,10 +6,9 @@ import can
 import cantools
 
 import hil
-from pkxyz_ctrl.config.files import CONFIG_DIR
 
 hil.run("steps", lane="lockstep", out="steps")
-database = cantools.database.load_file(CONFIG_DIR / "comb_amplifier.dbc")
+database = cantools.database.load_file(hil.CONFIG_DIR / "comb_amplifier.dbc")
 known = {message.frame_id for message in database.messages}
 shown = set()
 for frame in can.LogReader(Path("steps", "frames.log")):

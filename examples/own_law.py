@@ -3,9 +3,8 @@
 from pathlib import Path
 
 import hil
-from pkxyz_ctrl.config.files import CONFIG_DIR
 
-text = (CONFIG_DIR / "controllers" / "lqg.toml").read_text(encoding="utf-8")
+text = (hil.CONFIG_DIR / "controllers" / "lqg.toml").read_text(encoding="utf-8")
 calmer = text.replace('name = "lqg"', 'name = "calm"').replace("\nforce_n = 2.0e-6", "\nforce_n = 6.0e-6")
 assert "\nforce_n = 6.0e-6" in calmer, "the weight that the example changes has moved"
 Path("calm.toml").write_text(calmer, encoding="utf-8")

@@ -5,13 +5,12 @@ from pathlib import Path
 
 import hil
 from pkxyz_ctrl import Stage
-from pkxyz_ctrl.config.files import CONFIG_DIR
 
-drawn = (CONFIG_DIR / "stages" / "reconstructed.toml").read_text(encoding="utf-8")
+drawn = (hil.CONFIG_DIR / "stages" / "reconstructed.toml").read_text(encoding="utf-8")
 thinner = drawn.replace('name = "reconstructed"', 'name = "thinner"')
 thinner = thinner.replace("leaf_thickness_m = 8.0e-6", "leaf_thickness_m = 7.9e-6")
 Path("thinner.toml").write_text(thinner, encoding="utf-8")
-shutil.copy(CONFIG_DIR / "scenarios" / "circle.toml", "circle.toml")
+shutil.copy(hil.CONFIG_DIR / "scenarios" / "circle.toml", "circle.toml")
 
 for name in ("reconstructed", "thinner.toml"):
     stage = Stage.load(name)

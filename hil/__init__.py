@@ -14,6 +14,7 @@ from typing import TYPE_CHECKING, Any
 if TYPE_CHECKING:
     from hil.api.design import DesignedLaw as DesignedLaw
     from hil.api.design import design as design
+    from hil.api.design import with_law as with_law
     from hil.api.identify import identify as identify
     from hil.api.montecarlo import SampledPlants as SampledPlants
     from hil.api.montecarlo import montecarlo as montecarlo
@@ -28,11 +29,13 @@ if TYPE_CHECKING:
     from hil.runs.scenario import build_scenario as build_scenario
     from hil.runs.scenario import load_scenario as load_scenario
     from hil.studies.margins.excited import MeasurementError as MeasurementError
+    from pkxyz_ctrl.config.files import CONFIG_DIR as CONFIG_DIR
     from pkxyz_ctrl.config.files import ConfigError as ConfigError
     from pkxyz_ctrl.design.identification.modal_fit import FitError as FitError
     from pkxyz_ctrl.design.model.design_error import DesignError as DesignError
 
 _HOME = {
+    "CONFIG_DIR": "pkxyz_ctrl.config.files",
     "ConfigError": "pkxyz_ctrl.config.files",
     "DesignError": "pkxyz_ctrl.design.model.design_error",
     "DesignedLaw": "hil.api.design",
@@ -52,9 +55,11 @@ _HOME = {
     "run": "hil.api.run",
     "tune": "hil.api.tune",
     "tune_taps": "hil.api.tune",
+    "with_law": "hil.api.design",
 }
 
 __all__ = [
+    "CONFIG_DIR",
     "ConfigError",
     "DesignError",
     "DesignedLaw",
@@ -74,6 +79,7 @@ __all__ = [
     "run",
     "tune",
     "tune_taps",
+    "with_law",
 ]
 
 

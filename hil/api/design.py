@@ -3,6 +3,7 @@
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
+from typing import TYPE_CHECKING, Literal
 
 import numpy as np
 from numpy.typing import NDArray
@@ -11,11 +12,15 @@ from hil.studies.margins.loop import ChangedPlants, Loop, over_changed_plants
 from hil.studies.operating_point import operating_strokes
 from pkxyz_ctrl.config.bus import BusConfig
 from pkxyz_ctrl.config.controller import ControllerConfig
-from pkxyz_ctrl.config.files import load
+from pkxyz_ctrl.config.files import ConfigError, load, plain, write_toml
 from pkxyz_ctrl.design.law_store import law_of
 from pkxyz_ctrl.design.margins.margins import LoopResponse, Margins
 from pkxyz_ctrl.design.margins.tolerances import Tolerances
+from pkxyz_ctrl.design.model.discrete_law import LawError
 from pkxyz_ctrl.stage import Stage
+
+if TYPE_CHECKING:
+    import control
 
 Point = tuple[float, float, float]
 
@@ -48,11 +53,38 @@ class DesignedLaw:
         """
         return self.loop.response(operating_strokes(self.stage, at_um), np.asarray(frequency_hz, np.float64))
 
+    def write(self, path: str | Path) -> None:
+        """Write the controller as a file, which runs in every command that takes ``--controller``."""
+        write_toml(plain(self.controller), path)
+
     def over_changed_plants(
         self, tolerances: str = "wide", on_progress: Callable[[int, int], None] = lambda done, total: None
     ) -> ChangedPlants:
         """Ms on each of the changed plants that a tolerances file names; infinite where the loop is unstable."""
         return over_changed_plants(self.loop, load("tolerances", tolerances, Tolerances).cases(), on_progress)
+
+
+def with_law(
+    controller: ControllerConfig | str | Path, system: "control.lti.LTI", method: Literal["tustin", "zoh"] = "tustin"
+) -> ControllerConfig:
+    """A controller with a linear law of your own in place of its law; limits, monitors and all else stay.
+
+    ``system``: of python-control, from error (m) to force (N), one axis for all three or 3 by 3; where it is continuous
+    it is sampled by ``method``. Raises ``ConfigError`` for what is no such law; whether its loop is stable, ``design``
+    finds out.
+    """
+    from pkxyz_ctrl.design.laws.chosen_law import with_law as with_law_of  # with python-control, a second
+
+    try:
+        return with_law_of(_controller_of(controller), system, method)
+    except LawError as error:
+        raise ConfigError(f"this law can't be had: {error}") from error
+
+
+def _controller_of(controller: ControllerConfig | str | Path) -> ControllerConfig:
+    if isinstance(controller, ControllerConfig):
+        return controller
+    return load("controllers", controller, ControllerConfig)
 
 
 def design(
@@ -63,10 +95,10 @@ def design(
 ) -> DesignedLaw:
     """Design and check the law of a controller file for a stage and a bus; each by name, by file, or itself.
 
-    A law designed before for the same is not designed again. Raises ``ConfigError`` for files that can't be used and
-    ``DesignError`` for weights that lead to no stable loop.
+    A law designed before for the same is not designed again. Raises ``ConfigError`` for files that can't be used, and
+    for a linear law whose loop is not stable; ``DesignError`` for weights that lead to no stable loop.
     """
-    law = controller if isinstance(controller, ControllerConfig) else load("controllers", controller, ControllerConfig)
+    law = _controller_of(controller)
     device = stage if isinstance(stage, Stage) else Stage.load(str(stage))
     on_bus = bus if isinstance(bus, BusConfig) else load("buses", bus, BusConfig)
     record = law_of(device.config, law, on_bus, autostart=True)

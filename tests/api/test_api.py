@@ -9,6 +9,7 @@ import tomllib
 from collections.abc import Callable
 from pathlib import Path
 
+import control
 import numpy as np
 import pytest
 
@@ -56,7 +57,7 @@ def test_a_lane_that_is_not_to_be_had_here_is_refused(lane: str, words: str) -> 
 
 
 def test_what_is_raised_can_be_caught_by_its_public_name() -> None:
-    for function in (hil.run, hil.open_run, hil.design, hil.tune, hil.identify, hil.montecarlo):
+    for function in (hil.run, hil.open_run, hil.design, hil.with_law, hil.tune, hil.identify, hil.montecarlo):
         for name in re.findall(r"``(\w+Error)``", function.__doc__ or ""):
             assert name in hil.__all__ or hasattr(builtins, name), f"{function.__name__}: {name}"
 
@@ -180,3 +181,16 @@ def test_a_program_that_is_interrupted_has_what_was_done(tmp_path: Path) -> None
 def test_a_search_of_taps_says_who_finds_them() -> None:
     with pytest.raises(ConfigError, match=r"youla: asks for taps.*hil\.tune_taps"):
         hil.tune("youla")
+
+
+def test_a_law_of_one_s_own_is_designed_written_and_refused_in_words(tmp_path: Path) -> None:
+    """An integrator: its margins by hand-made chains, tests/design/laws; here, that it goes through the front door."""
+    mine = hil.with_law("lqg", control.tf([14600.0], [1, 0]))
+    law = hil.design(mine)
+    assert 2.0 < max(axis.peak_s for axis in law.margins().axes) < 3.0
+    law.write(tmp_path / "mine.toml")
+    assert np.array_equal(hil.design(tmp_path / "mine.toml").record, law.record)
+    with pytest.raises(hil.ConfigError, match="with a tenth of its gain it is stable"):
+        hil.design(hil.with_law("lqg", control.tf([146000.0], [1, 0])))
+    with pytest.raises(hil.ConfigError, match="this law can't be had"):
+        hil.with_law("lqg", control.tf([1, 0, 0], [1, 0]))

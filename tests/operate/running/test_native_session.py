@@ -2,6 +2,7 @@
 is killed. Nothing is asserted about the machine.
 """
 
+import contextlib
 import os
 import signal
 import subprocess
@@ -46,6 +47,23 @@ def program():
     return compiled()
 
 
+@contextlib.contextmanager
+def holding(bench, changes, *words):
+    """An operator of a stage that is switched on."""
+    changes("pre-operational", False)
+    with operating(bench, *words) as operator:
+        operator.switched_on()
+        yield operator
+
+
+@contextlib.contextmanager
+def scanning(bench, changes):
+    """An operator of a stage that is under way on a path, and the path's command."""
+    path, start = raster_rows(1000)
+    with holding(bench, changes) as operator:
+        yield operator, operator.follow(1, path, start)
+
+
 def offer(operator, bench, name):
     """Another law that forgives a machine which stands still; its number."""
     setup = load_scenario(bench / "on_slow.toml").setup()
@@ -59,10 +77,8 @@ def offer(operator, bench, name):
 
 
 def test_everything_that_may_be_asked(bench, changes):
-    changes("pre-operational", False)
     path, start = raster_rows(1000)
-    with operating(bench) as operator:
-        operator.switched_on()
+    with holding(bench, changes) as operator:
         first = operator.give(Verb.MOVE, target_m=(4e-6, NAN, NAN))
         time.sleep(0.01)
         assert "in position at (-3, 2, 18) um" in operator.do(Verb.MOVE, target_m=(-3e-6, 2e-6, NAN))
@@ -99,11 +115,7 @@ def test_everything_that_may_be_asked(bench, changes):
 
 
 def test_a_session_that_stands_still_for_20_ms_in_a_scan_is_not_noticed(bench, changes):
-    changes("pre-operational", False)
-    path, start = raster_rows(1000)
-    with operating(bench) as operator:
-        operator.switched_on()
-        scan = operator.follow(2, path, start)
+    with scanning(bench, changes) as (operator, scan):
         for _ in range(3):
             os.kill(operator.session, signal.SIGSTOP)
             time.sleep(0.02)
@@ -120,11 +132,7 @@ def test_a_session_that_stands_still_for_20_ms_in_a_scan_is_not_noticed(bench, c
 
 def test_a_session_that_stands_still_for_longer_than_the_set_points_reach(bench, changes):
     """Then the stage is led down, and the session says so once it goes on."""
-    changes("pre-operational", False)
-    path, start = raster_rows(1000)
-    with operating(bench) as operator:
-        operator.switched_on()
-        operator.follow(3, path, start)
+    with scanning(bench, changes) as (operator, _):
         os.kill(operator.session, signal.SIGSTOP)
         lines = changes("pre-operational", False)
         assert lines[-2]["driven"]
@@ -135,9 +143,7 @@ def test_a_session_that_stands_still_for_longer_than_the_set_points_reach(bench,
 
 
 def test_a_session_that_stands_still_while_the_stage_holds_is_not_noticed(bench, changes):
-    changes("pre-operational", False)
-    with operating(bench) as operator:
-        operator.switched_on()
+    with holding(bench, changes) as operator:
         os.kill(operator.session, signal.SIGSTOP)
         time.sleep(0.6)
         os.kill(operator.session, signal.SIGCONT)
@@ -149,9 +155,7 @@ def test_a_session_that_stands_still_while_the_stage_holds_is_not_noticed(bench,
 
 
 def test_a_session_that_stands_still_for_good_does_not_leave_a_stage_that_nobody_can_stop(bench, changes):
-    changes("pre-operational", False)
-    with operating(bench) as operator:
-        operator.switched_on()
+    with holding(bench, changes) as operator:
         os.kill(operator.session, signal.SIGSTOP)
         begin_s = time.monotonic()
         assert changes("pre-operational", False)[-2]["driven"]
@@ -163,11 +167,7 @@ def test_a_session_that_stands_still_for_good_does_not_leave_a_stage_that_nobody
 
 
 def test_a_session_that_is_killed_leaves_a_stage_that_is_led_down(bench, changes):
-    changes("pre-operational", False)
-    path, start = raster_rows(1000)
-    with operating(bench) as operator:
-        operator.switched_on()
-        operator.follow(4, path, start)
+    with scanning(bench, changes) as (operator, _):
         with UnixBus(f"{bench}/bus") as observer:
             loop = operator.loop
             next_with(observer, DRIVE)
@@ -185,10 +185,7 @@ def test_a_session_that_is_killed_leaves_a_stage_that_is_led_down(bench, changes
 
 
 def test_a_loop_that_is_killed_is_missed_by_the_node_and_told(bench, changes):
-    changes("pre-operational", False)
-    words = ("--bus", "quick.toml", "--native")
-    with operating(bench, *words) as operator, UnixBus(f"{bench}/bus") as observer:
-        operator.switched_on()
+    with holding(bench, changes, "--bus", "quick.toml", "--native") as operator, UnixBus(f"{bench}/bus") as observer:
         while next_with(observer, DRIVE).timestamp < time.time() - 0.1:  # what went before
             pass
         os.kill(operator.loop, signal.SIGKILL)
@@ -200,11 +197,7 @@ def test_a_loop_that_is_killed_is_missed_by_the_node_and_told(bench, changes):
 
 
 def test_a_server_that_falls_silent_in_a_scan_leaves_a_stage_that_stops_on_its_path(bench, changes):
-    changes("pre-operational", False)
-    path, start = raster_rows(1000)
-    with operating(bench) as operator:
-        operator.switched_on()
-        scan = operator.follow(5, path, start)
+    with scanning(bench, changes) as (operator, scan):
         operator.is_silent = True
         assert operator.ended(scan) == (State.ABORTED, "the server has fallen silent")
         operator.until(Activity.HOLDING)
