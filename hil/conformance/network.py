@@ -1,5 +1,6 @@
 """NMT, boot-up, heartbeat, frame formats: checks of how the node behaves on the network."""
 
+from collections.abc import Sequence
 from itertools import pairwise
 
 from hil.conformance.deviation import DeviationError, NotTestedError, deviate_if
@@ -10,6 +11,7 @@ from pkxyz_ctrl.can.cob_id import NmtCommand, NmtState
 
 _PERIOD_MS = 20
 _BEATS = 20
+_PERIOD_MEAN_SHARE = 0.1
 _SYNCS = 5
 _NAMES = {state.value: state.name.lower().replace("_", "-") for state in NmtState}
 
@@ -147,9 +149,17 @@ def _heartbeat_period(talker: Talker) -> str:
     times = [t_us for t_us, _ in talker.since(mark, talker.heartbeat_id)]
     if len(times) < 2:
         raise DeviationError(f"{len(times)} heartbeats in {_PERIOD_MS * _BEATS} ms")
-    gaps_ms = [(b - a) / 1000 for a, b in pairwise(times)]
-    told = f"{len(times)} heartbeats, {min(gaps_ms):.2f} to {max(gaps_ms):.2f} ms apart"
-    if max(gaps_ms) > 1.1 * _PERIOD_MS or min(gaps_ms) < 0.5 * _PERIOD_MS:
+    return period_told(times)
+
+
+def period_told(times_us: Sequence[int]) -> str:
+    """What is said of heartbeats. Their mean is judged, and that none is missing: single ones come early and late by
+    the resolution of a system's timers and by how busy its host is, and CiA 301 has no word on that.
+    """
+    gaps_ms = [(b - a) / 1000 for a, b in pairwise(times_us)]
+    mean_ms = sum(gaps_ms) / len(gaps_ms)
+    told = f"{len(times_us)} heartbeats, {mean_ms:.2f} ms apart, {min(gaps_ms):.2f} to {max(gaps_ms):.2f}"
+    if abs(mean_ms - _PERIOD_MS) > _PERIOD_MEAN_SHARE * _PERIOD_MS or max(gaps_ms) >= 2 * _PERIOD_MS:
         raise DeviationError(told)
     return told
 
@@ -229,7 +239,8 @@ CHECKS = (
     Check(_A, "SDO by state", "answered in pre-operational and operational, not in stopped", _STATES, _sdo_by_state),
     Check(_A, "PDO by state", "sense PDOs in operational only", _STATES, _pdo_by_state),
     Check(
-        _B, "heartbeat period", f"0x1017 = {_PERIOD_MS} ms: every {_PERIOD_MS // 2} to {_PERIOD_MS * 1.1:g} ms",
+        _B, "heartbeat period",
+        f"0x1017 = {_PERIOD_MS} ms: so far apart on average, within {_PERIOD_MEAN_SHARE:.0%}, and none is missing",
         _ERRORS, _heartbeat_period,
     ),
     Check(

@@ -1,11 +1,14 @@
 """What CANopenNode and lely-core said to us and heard from us, played again (CONTRIBUTING.md says how to record it)."""
 
+from itertools import pairwise
+
 import pytest
 from node_rig import EDS, RecordingPlant
 from recording import NMT, REPLY, REQUEST, FollowedNode, RecordedNode, RecordedPort, frames_of
 
 from hil.bus.clock import Lockstep
 from hil.conformance import network, objects, outputs, process
+from hil.conformance.deviation import DeviationError
 from hil.conformance.eds import read_eds
 from hil.conformance.run import conformance
 from hil.conformance.talker import Talker
@@ -129,6 +132,17 @@ def test_what_the_check_says_of_lely():
         verdict, words = OF_LELY.get(name, (Verdict.PASS, ""))
         assert line.verdict is verdict, line
         assert words in line.got
+
+
+def test_heartbeats_of_a_system_with_coarse_timers_are_regular_and_those_that_are_slow_or_missing_are_not():
+    """lely's, pre-operational, at 0x1017 = 20: 15 to 24 ms apart, and all together they are 6 % slow."""
+    beats = [t_us for t_us, frame in frames_of("lely_check.log") if frame.can_id == 0x70A and frame.data == b"\x7f"]
+    steady = beats[29:38]
+    assert "ms apart" in network.period_told(steady)
+    assert max(b - a for a, b in pairwise(steady)) > 22_000  # which was said to be too late
+    for wrong in ([round(1.2 * t) for t in steady], [round(0.8 * t) for t in steady], steady[:4] + steady[6:]):
+        with pytest.raises(DeviationError, match="heartbeats"):
+            network.period_told(wrong)
 
 
 def test_frames_are_read_as_candump_writes_them():
