@@ -26,6 +26,7 @@ from hil.screen.options import (
 from hil.screen.terminal import note
 from pkxyz_ctrl.config.files import ConfigError
 from pkxyz_ctrl.config.refused import reason
+from pkxyz_ctrl.io.quick_can import load_can_quickly
 
 if TYPE_CHECKING:
     from hil.runs.summary import Summary
@@ -68,6 +69,7 @@ def run(
 
     Ctrl-C, SIGTERM and errors leave the combs at 0 V. Errors of position are those of the estimate.
     """
+    load_can_quickly()
     from hil.conformance.proven import with_report
     from hil.lanes.ending import Ended
     from hil.lanes.lane import Lane
@@ -124,6 +126,7 @@ def plant(
     as_json: Annotated[bool, typer.Option("--json", help="Print each change as a line of JSON.")] = False,
 ) -> None:
     """Serve amplifier node and plant on a bus until Ctrl-C or SIGTERM."""
+    load_can_quickly()
     from hil.lanes.ending import Ended, Ending
     from hil.lanes.wall import require_real_bus
     from hil.lanes.wall_plant import WallPlant, WitnessedPlant

@@ -10,6 +10,7 @@ import tempfile
 from functools import cache
 from importlib.metadata import version
 from pathlib import Path
+from typing import Final
 
 import numpy as np
 from numpy.typing import NDArray
@@ -21,6 +22,8 @@ from pkxyz_ctrl.loop import cycle
 
 _LIBRARIES = ("numpy", "scipy", "control", "filterpy")
 _KEPT = 256
+_ELSEWHERE: Final = {"can": {"channel"}}
+"""Of a bus: where it is says nothing of a law, and each stage that is served has a channel of its own."""
 _SEAL_BYTES = hashlib.sha256().digest_size
 
 
@@ -46,8 +49,8 @@ def _path_of(stage: StageConfig, controller: ControllerConfig, bus: BusConfig, a
     if not home:
         return None
     digest = hashlib.sha256()
-    for model in (stage, controller, bus):
-        digest.update(model.model_dump_json().encode() + b"\0")
+    for model, elsewhere in ((stage, None), (controller, None), (bus, _ELSEWHERE)):
+        digest.update(model.model_dump_json(exclude=elsewhere).encode() + b"\0")
     digest.update(repr((autostart, _program())).encode())
     return Path(home) / "laws" / digest.hexdigest()[:32]
 

@@ -66,6 +66,20 @@ def test_every_input_counts(folder: Path, designs: list[object]) -> None:
     assert len(list(folder.iterdir())) == 5
 
 
+def test_where_a_bus_is_does_not_count(folder: Path, designs: list[object]) -> None:
+    """Each stage that is served has a channel of its own, and waited for a design at each new name."""
+    stage, controller, bus = shipped()
+    assert bus.can is not None
+    elsewhere = bus.model_copy(update={"can": bus.can.model_copy(update={"channel": "elsewhere"})})
+    law, other = law_of(*shipped(), autostart=True), law_of(stage, controller, elsewhere, autostart=True)
+    assert len(designs) == 1
+    assert (
+        other.tobytes()
+        == law.tobytes()
+        == design.design_law(Stage(stage), controller, elsewhere, autostart=True).tobytes()
+    )
+
+
 def test_a_program_of_other_sources_designs_anew(
     folder: Path, designs: list[object], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:

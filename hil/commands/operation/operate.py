@@ -8,6 +8,7 @@ import typer
 from hil.screen.options import BusFile, ControllerFile, NativeLoop, OnSilence, Report, SilentFor, StageCalled, StageFile
 from hil.screen.terminal import note
 from pkxyz_ctrl.config.files import ConfigError
+from pkxyz_ctrl.io.quick_can import load_can_quickly
 
 if TYPE_CHECKING:
     from pathlib import Path
@@ -26,6 +27,7 @@ def operate(
     native: NativeLoop = None,
 ) -> None:
     """Run the loop of a stage that `pkxyz serve` operates, until Ctrl-C or SIGTERM; at its end the combs are at 0 V."""
+    load_can_quickly()
     from hil.conformance.proven import with_report
     from hil.lanes.setup import bare_setup
     from hil.operate.running.at_rate import operate as run_loop
