@@ -70,7 +70,6 @@ def run(
     Ctrl-C, SIGTERM and errors leave the combs at 0 V. Errors of position are those of the estimate.
     """
     load_can_quickly()
-    from hil.conformance.proven import with_report
     from hil.lanes.ending import Ended
     from hil.lanes.lane import Lane
     from hil.lanes.wall import require_real_bus
@@ -93,6 +92,8 @@ def run(
     loaded = _lasting(loaded, duration_s)
     can_config = require_real_bus(loaded.bus)
     if report is not None:
+        from hil.conformance.proven import with_report
+
         loaded = dataclasses.replace(loaded, bus=with_report(loaded.bus, report))
     program = native_loop(loaded, can_config) if native else None
     live = LiveStatus(round(loaded.config.duration_s / loaded.bus.period_s), loaded.bus.period_s)

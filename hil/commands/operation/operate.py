@@ -28,7 +28,6 @@ def operate(
 ) -> None:
     """Run the loop of a stage that `pkxyz serve` operates, until Ctrl-C or SIGTERM; at its end the combs are at 0 V."""
     load_can_quickly()
-    from hil.conformance.proven import with_report
     from hil.lanes.setup import bare_setup
     from hil.operate.running.at_rate import operate as run_loop
     from hil.operate.running.native import operate_natively
@@ -41,6 +40,8 @@ def operate(
     settings = Settings(on_silence=_silence(on_silence), silence_s=silence_s)
     config = load("buses", bus, BusConfig)
     if report is not None:
+        from hil.conformance.proven import with_report
+
         config = with_report(config, report)
     law = load("controllers", controller, ControllerConfig)
     setup = bare_setup(stage, "nominal", law, config, 1, autostart=False)

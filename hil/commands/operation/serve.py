@@ -45,7 +45,6 @@ def serve(
 
     What it prints is the address of the page; what stands behind # in it lets people in, so keep it to yourself.
     """
-    from hil.conformance.proven import with_report
     from hil.server.serving import Served, bus_of_its_own, serve
     from pkxyz_ctrl.config.bus import BusConfig
     from pkxyz_ctrl.config.files import load
@@ -54,6 +53,8 @@ def serve(
     config = load("buses", bus, BusConfig)
     is_simulated = config.can is not None and config.can.interface == "pkxyz-unix"
     if report is not None:
+        from hil.conformance.proven import with_report
+
         with_report(config, report)  # said here, before anything is started
     say_if_compiling(quiet=as_json)
     if host not in ("127.0.0.1", "localhost", "::1"):
