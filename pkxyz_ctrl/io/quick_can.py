@@ -3,7 +3,6 @@
 Nobody writes such logs by it in our commands; `pkxyz recording --to mf4` has no need of it.
 """
 
-import importlib
 import sys
 
 _FOR_MF4 = "asammdf"
@@ -17,6 +16,6 @@ def load_can_quickly() -> None:
         return
     sys.modules[_FOR_MF4] = None  # type: ignore[assignment]  # how Python says: not to be imported
     try:
-        importlib.import_module("can")
+        import can  # noqa: F401
     finally:
         del sys.modules[_FOR_MF4]
