@@ -2,7 +2,7 @@
 
 import json
 from collections.abc import Callable, Iterator
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from functools import cached_property
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -38,8 +38,7 @@ class Run:
     """where recording, frame log and picture are; None for a run in memory"""
     figures: "Summary | None" = None
     """the summary with its types; None for a run that was opened from its folder"""
-    in_memory: NDArray[np.void] | None = None
-    """the rows of a run without a folder"""
+    _in_memory: NDArray[np.void] | None = field(default=None, repr=False)
 
     @cached_property
     def rows(self) -> NDArray[np.void]:
@@ -47,8 +46,8 @@ class Run:
 
         Raises ``RecordingError`` for a recording that can't be read, ``OSError`` without one.
         """
-        if self.in_memory is not None:
-            return self.in_memory
+        if self._in_memory is not None:
+            return self._in_memory
         assert self.folder is not None, "rows are in memory or in a folder"
         blocks = list(Recording.open(self.folder / RECORDING).rows(ROW.names or ()))
         return np.concatenate(blocks) if blocks else np.zeros(0, ROW)
