@@ -23,7 +23,7 @@ Array = NDArray[np.float64]
 
 BLOCK_ROWS = 1024
 PIECE_ROWS = 16
-"""Sampled at once, some 30 us, so that no tick has much to do."""
+"""Sampled at once, some 10 us, so that no tick has much to do."""
 _LOOKED_AT_ROWS = 128
 
 

@@ -2,7 +2,7 @@
 
 Limits hold for each axis. Where the motion goes beyond them when the plan begins, it is brought inside them first.
 ruckig plans; what it plans are pieces of constant jerk, which a kernel samples: a plan with its hundred rows takes some
-40 us, which fits between two ticks.
+60 us, which fits between two ticks.
 """
 
 import math

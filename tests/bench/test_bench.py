@@ -82,7 +82,6 @@ def test_all_measurements_unless_some_are_named() -> None:
 
 
 def test_the_targets_of_quality_are_those_of_the_shipped_scenario() -> None:
-
     checks = load_scenario("raster").config.checks
     assert {name: bound.max for name, bound in checks.items()} == quality._AT_MOST["nominal"]
 

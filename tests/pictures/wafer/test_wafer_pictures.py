@@ -27,10 +27,7 @@ def test_the_wafer_shows_the_share_that_fails_of_each_die_and_of_each_requiremen
     shares = {name.removeprefix("ok."): share_of(columns[name], columns["wafer"]) for name in study.requirement_columns}
     draw_wafer(SHIPPED, columns, shares, None, tmp_path / "wafer.png")
     left, middle, right = drawn[0].axes
-    told = {
-        tuple(np.round(text.xy, 6)): float(text.get_text())
-        for text in left.texts
-    }  # fmt: skip
+    told = {tuple(np.round(text.xy, 6)): float(text.get_text()) for text in left.texts}
     for x_m, y_m in {(float(x), float(y)) for x, y in zip(columns["x_m"], columns["y_m"], strict=True)}:
         here = (columns["x_m"] == x_m) & (columns["y_m"] == y_m)
         fails = 100.0 * (1.0 - columns["ok"][here].mean())

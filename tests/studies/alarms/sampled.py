@@ -44,9 +44,10 @@ KEPT = Path(__file__).parents[3] / "docs" / "tables" / "alarms.jsonl"
 PIECE = 50
 """Devices after which what was found is kept."""
 BEFORE_TICKS = 50
-SWING_S, SWINGS, SWING_LEAST_M = 0.1, 4, 50e-9
-"""A stage whose true error has got larger in each of so many equal parts of the time before it was stopped, up to more
-than this (standard deviation), was not stopped for nothing: its loop is not stable, whatever the linear plant says.
+SWING_S, SWINGS, SWING_GROWTH, SWING_LEAST_M = 0.1, 4, 1.2, 50e-9
+"""A stage whose true error (standard deviation) has grown by this factor from each of so many equal parts of the time
+before it was stopped to the next, up to more than this, was not stopped for nothing: its loop is not stable, whatever
+the linear plant says.
 """
 STOP_M = 25e-6
 """Of a slider, at either end of its stroke."""
@@ -79,8 +80,10 @@ class Stopped(NamedTuple):
 def swings(rows: np.ndarray) -> bool:
     """Whether the true error has grown from part to part of rows of ``ROW``."""
     error_m = rows["position_m"] - rows["reference_m"]
-    sizes = [part.std(axis=0).max() for part in np.array_split(error_m, SWINGS)]
-    return bool(len(rows) >= 10 * SWINGS and np.all(np.diff(sizes) > 0.0) and sizes[-1] > SWING_LEAST_M)
+    if len(rows) < 10 * SWINGS:
+        return False
+    sizes = np.array([part.std(axis=0).max() for part in np.array_split(error_m, SWINGS)])
+    return bool(np.all(sizes[1:] >= SWING_GROWTH * sizes[:-1]) and sizes[-1] > SWING_LEAST_M)
 
 
 def stopped(motion: str, law: str, seed: int) -> Stopped | None:

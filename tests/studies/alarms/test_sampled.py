@@ -30,7 +30,12 @@ def test_a_loop_that_swings_is_told_as_one_though_its_linear_plant_is_stable(see
 
 def test_what_does_not_grow_up_to_something_is_no_swing():
     rows, t = np.zeros(2000, ROW), np.arange(2000)
-    for size, is_one in ((SWING_LEAST_M * np.exp(t / 1000), True), (np.full(2000, 1e-6), False), (1e-12 * t, False)):
+    for size, is_one in (
+        (SWING_LEAST_M * np.exp(t / 1000), True),
+        (np.full(2000, 1e-6), False),
+        (1e-12 * t, False),
+        (1e-6 * np.exp(t / 5000), False),
+    ):
         rows["position_m"][:, 2] = size * np.sin(0.3 * t)
         assert swings(rows) is is_one
 
