@@ -31,7 +31,7 @@ _LIMITS = np.dtype(
     ],
     align=True,
 )
-_FINE, _DOMAIN, _STROKE, _PUSH, _VOLTAGE, _SLEW = range(6)
+_FINE, _NUMBER, _DOMAIN, _STROKE, _PUSH, _VOLTAGE, _SLEW = range(7)
 _HALVINGS = 28
 _SPAN_STROKES, _PROBES = 2.5, 101
 _AXES = "xyz"
@@ -58,28 +58,28 @@ class Reach:
 
     def holds(self, position_m: Array) -> bool:
         """Whether a position (3,) can be held."""
-        return self._look(self._at(position_m))[0] == _FINE
+        return self._look(position_m)[0] == _FINE
 
     def target_refusal(self, position_m: Array) -> str | None:
         """Why a position (3,) can't be held: axis, value, unit and limit."""
-        if not np.isfinite(position_m).all():
-            return "a target has to be finite"
-        code, comb, value = self._look(self._at(position_m))
+        code, comb, value = self._look(position_m)
         if code == _FINE:
             return None
+        if code == _NUMBER:
+            return "a target has to be finite"
         return (
             f"{self.where(position_m)} can't be held: {self._words(code, comb, value)}{self._range_words(position_m)}"
         )
 
     def motion_refusal(self, rows: Array, periods: int = 1) -> str | None:
         """Why rows (n, 9) of a motion, so many periods apart, can't be followed: where, comb, value, unit, limit."""
-        if not np.isfinite(rows).all():
-            return "a motion has to be finite"
         at, code, comb, value = _first_beyond(
             self._stage.geometry, self._stage.elasticity, self._limits, np.ascontiguousarray(rows), periods
         )
         if code == _FINE:
             return None
+        if code == _NUMBER:
+            return "a motion has to be finite"
         return f"on the way, at {self.where(rows[at, 0:3])}, {self._words(code, comb, value)}"
 
     def farthest(self, position_m: Array, axis: int, direction: float) -> float:
@@ -134,11 +134,9 @@ class Reach:
         """A position (3,) in words."""
         return f"({', '.join(_um(v) for v in self.turn.to_sample(position_m))}) um"
 
-    def _at(self, position_m: Array) -> Array:
-        return np.concatenate([position_m, np.zeros(6)])
-
-    def _look(self, row: Array) -> tuple[int, int, float]:
-        code, comb, value = _objection(self._stage.geometry, self._stage.elasticity, self._limits, row, np.empty(3))
+    def _look(self, position_m: Array) -> tuple[int, int, float]:
+        position_m = np.ascontiguousarray(position_m)
+        code, comb, value = _objection_at_rest(self._stage.geometry, self._stage.elasticity, self._limits, position_m)
         return int(code), int(comb), float(value)
 
     def _range_words(self, position_m: Array) -> str:
@@ -179,6 +177,9 @@ def _objection(
 ) -> tuple[int, int, float]:
     """The limit that a row (9,) of a reference passes, the comb, and the value; ``force`` (3,): what the combs give."""
     bounds = limits[0]
+    for k in range(9):
+        if not math.isfinite(row[k]):
+            return _NUMBER, 0, 0.0
     position = row[0:3]
     if kinematics.in_domain(geometry[0], position) != 0:
         return _DOMAIN, 0, 0.0
@@ -193,6 +194,16 @@ def _objection(
         if force[i] > bounds["force_max_n"][i]:
             return _VOLTAGE, i, force[i]
     return _FINE, 0, 0.0
+
+
+@njit(cache=True)
+def _objection_at_rest(
+    geometry: Records, elastic: Records, limits: Records, position_m: Array
+) -> tuple[int, int, float]:
+    """The same of a position (3,)."""
+    row = np.zeros(9)
+    row[0:3] = position_m
+    return _objection(geometry, elastic, limits, row, np.empty(3))  # type: ignore[no-any-return]
 
 
 @njit(cache=True)

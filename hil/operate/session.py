@@ -66,6 +66,7 @@ class Session:
         self.state["matrix"] = PLAIN
         self.now_us = 0
         self._say = say
+        self._unsaid: list[bytes] = []
         self._period_us = period_us
         self._job: _Job | None = None
         self._beside: _Job | None = None  # pause, resume: besides the job that they act on
@@ -343,7 +344,10 @@ class Session:
     # -- what is told --------------------------------------------------------------------------------------------------
 
     def tell(self) -> None:
-        """Write into ``state`` how things stand."""
+        """Say what is to be answered, and write into ``state`` how things stand."""
+        for answer in self._unsaid:
+            self._say(answer)
+        self._unsaid.clear()
         state, stage = self.state, self.stage
         setpoints, path, position = stage.setpoints, stage.path, stage.controller.outputs["position"]
         state["activity"] = int(self._activity())
@@ -379,7 +383,5 @@ class Session:
         return Activity.JOGGING if verb is Verb.JOG else Activity.MOVING
 
     def _answer(self, command_id: int, verb: int, state: State, words: str) -> None:
-        answer = np.zeros(1, ANSWER)
-        answer["id"], answer["verb"], answer["state"], answer["t_us"] = command_id, verb, state, self.now_us
-        answer["words"] = words.encode()[:_WORDS_BYTES]
-        self._say(answer.tobytes())
+        said = words.encode()[:_WORDS_BYTES]
+        self._unsaid.append(np.array([(command_id, verb, state, self.now_us, said)], ANSWER).tobytes())

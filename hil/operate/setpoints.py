@@ -35,6 +35,8 @@ class Source(Protocol):
     """Where a set-point goes by itself, in rows since its own start, at rest in the first and from the last on."""
 
     rows: int
+    has_outputs: bool
+    """Whether any row may raise a trigger."""
 
     def sample(self, first: int, count: int) -> Array:
         """(count, 9) from row ``first`` on; before 0 and past the end as these."""
@@ -52,7 +54,7 @@ class Source(Protocol):
 class Standing:
     """At rest at a position (3,)."""
 
-    rows = 0
+    rows, has_outputs = 0, False
 
     def __init__(self, position_m: Array) -> None:
         self._row = np.concatenate([position_m, np.zeros(6)])
@@ -70,13 +72,15 @@ class Standing:
 class Going:
     """A motion that was planned in flight."""
 
+    has_outputs = False
+
     def __init__(self, motion: InFlight, period_s: float) -> None:
         self._motion = motion
         self._period_s = period_s
         self.rows = math.ceil(motion.total_s / period_s)
 
     def sample(self, first: int, count: int) -> Array:
-        return self._motion.sample(np.maximum(np.arange(first, first + count), 0) * self._period_s)
+        return self._motion.rows(first, 1, count, self._period_s)
 
     def has(self, row: int) -> bool:
         return True
@@ -215,7 +219,8 @@ class Setpoints:
         motion = towards(self.state(), target_m, limits)
         rows = math.ceil(motion.total_s / self._period_s)
         step = -(-rows // _LOOKED_AT_ROWS) or 1
-        if (why := judge(motion.sample(np.arange(0, rows + step, step) * self._period_s), step)) is not None:
+        count = -(-rows // step) + 1
+        if (why := judge(motion.rows(0, step, count, self._period_s), step)) is not None:
             raise TrajectoryError(why)
         self._set_out(Going(motion, self._period_s), target_m, self.free_row - 1)
 
@@ -256,7 +261,8 @@ class Setpoints:
     def _sample(self, count: int) -> None:
         first, at = self._filled, self._filled - self._base
         write_rows(self._rows[at : at + count], self._motion(first, count), first)
-        self._rows["output"][at : at + count] = self._source.outputs(self._feed.nearest(first, count))
+        if self._source.has_outputs:
+            self._rows["output"][at : at + count] = self._source.outputs(self._feed.nearest(first, count))
         self._filled = first + count
 
     def _motion(self, first: int, count: int) -> Array:

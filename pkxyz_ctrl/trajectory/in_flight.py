@@ -18,18 +18,19 @@ _NEAREST_M = 1e-12
 _NO_BOUND = 1e6  # in units of the problem's own size: far larger ones lose ruckig its digits
 _PIECES = 10
 """Of an axis: two that bring it inside the limits, seven to its end, and the end."""
-_PLANNER = ruckig.Ruckig(3)  # keeps nothing from plan to plan
+_PLANNERS = {axes: ruckig.Ruckig(axes) for axes in (1, 3)}  # keep nothing from plan to plan
 
 
 class InFlight:
     """A ``Motion`` as ruckig planned it: it begins in a state, moving or not, and ends at rest."""
 
-    def __init__(self, planned: ruckig.Trajectory, start_m: Array, length_m: float, time_s: float) -> None:
-        """``planned`` from the origin, in units of a length and a time."""
+    def __init__(self, planned: ruckig.Trajectory, start_m: Array, spans_m: list[float], time_s: float) -> None:
+        """``planned`` from the origin, in units of ``spans_m`` of each axis and of a time; of three axes, or of one
+        that stands for all.
+        """
         self.total_s = planned.duration * time_s
-        units = [time_s, length_m, length_m / time_s, length_m / time_s**2, length_m / time_s**3]
-        self._pieces = np.array([_pieces_of(axis) for axis in planned.profiles[0]])
-        self._pieces *= units
+        units = [[[time_s, *(span_m / time_s**order for order in range(4))]] for span_m in spans_m]
+        self._pieces = np.array([_pieces_of(axis) for axis in planned.profiles[0]]) * np.array(units)
         self._pieces[:, :, 1] += start_m[:, None]
         self.end_m = self._pieces[:, -1, 1].copy()
         """(3,), where it comes to rest"""
@@ -42,6 +43,12 @@ class InFlight:
         """(n, 9) at instants (n,); past the end it stands."""
         out = np.empty((len(t_s), 9))
         _sample(self._pieces, self.total_s, t_s, out)
+        return out
+
+    def rows(self, first: int, step: int, count: int, period_s: float) -> Array:
+        """(count, 9) of the rows ``first``, ``first + step``, ..., which are a period apart; before 0 it stands."""
+        out = np.empty((count, 9))
+        _rows(self._pieces, self.total_s, first, step, period_s, out)
         return out
 
 
@@ -62,19 +69,30 @@ def _pieces_of(axis: ruckig.Profile) -> list[tuple[float, float, float, float, f
 
 
 @njit(cache=True)
+def _at(pieces: Array, total_s: float, t_s: float, row: Array) -> None:
+    """A row (9,) at an instant of pieces (3, ``_PIECES``, 5)."""
+    for axis in range(3):
+        last = 0
+        for k in range(1, _PIECES):
+            if pieces[axis, k, 0] <= t_s:
+                last = k
+        piece = pieces[axis, last]
+        t, a, j = t_s - piece[0], piece[3], piece[4]
+        row[axis] = piece[1] + t * (piece[2] + t * (a / 2.0 + t * j / 6.0))
+        row[3 + axis] = piece[2] + t * (a + t * j / 2.0) if t_s < total_s else 0.0
+        row[6 + axis] = a + t * j if t_s < total_s else 0.0
+
+
+@njit(cache=True)
 def _sample(pieces: Array, total_s: float, t_s: Array, out: Array) -> None:
-    """Rows (n, 9) at instants (n,) of pieces (3, ``_PIECES``, 5)."""
-    for n in range(len(t_s)):
-        for axis in range(3):
-            last = 0
-            for k in range(1, _PIECES):
-                if pieces[axis, k, 0] <= t_s[n]:
-                    last = k
-            piece = pieces[axis, last]
-            t, a, j = t_s[n] - piece[0], piece[3], piece[4]
-            out[n, axis] = piece[1] + t * (piece[2] + t * (a / 2.0 + t * j / 6.0))
-            out[n, 3 + axis] = piece[2] + t * (a + t * j / 2.0) if t_s[n] < total_s else 0.0
-            out[n, 6 + axis] = a + t * j if t_s[n] < total_s else 0.0
+    for n in range(len(out)):
+        _at(pieces, total_s, t_s[n], out[n])
+
+
+@njit(cache=True)
+def _rows(pieces: Array, total_s: float, first: int, step: int, period_s: float, out: Array) -> None:
+    for n in range(len(out)):
+        _at(pieces, total_s, max(first + n * step, 0) * period_s, out[n])
 
 
 def towards(state: Array, target_m: Array, limits: Limits) -> InFlight:
@@ -82,45 +100,54 @@ def towards(state: Array, target_m: Array, limits: Limits) -> InFlight:
 
     From rest the path is the straight line. Raises ``TrajectoryError`` where ruckig finds no way.
     """
-    way = target_m - state[0]
-    problem, length_m, time_s = _problem(state, way, limits)
-    problem.target_position = (way / length_m).tolist()
-    problem.synchronization = ruckig.Synchronization.Phase
-    planned = _planned(problem, state, length_m, time_s)
+    way_m, velocity, acceleration = (target_m - state[0]).tolist(), state[1].tolist(), state[2].tolist()
+    if any(velocity) or any(acceleration):
+        problem, length_m, time_s = _problem(way_m, velocity, acceleration, limits)
+        problem.synchronization = ruckig.Synchronization.Phase
+        problem.target_position = [value / length_m for value in way_m]
+        spans_m = [length_m] * 3
+    else:  # one axis, the longest, stands for all: no more can be asked for, and planning takes a third of the time
+        size_m = max(map(abs, way_m))
+        problem, length_m, time_s = _problem([size_m], [0.0], [0.0], limits)
+        problem.target_position = [size_m / length_m]
+        spans_m = [length_m * (value / size_m) for value in way_m] if size_m else [0.0] * 3
+    planned = InFlight(_planned(problem), state[0], spans_m, time_s)
     planned.end_m = target_m.copy()  # without the rounding
     return planned
 
 
 def to_rest(state: Array, limits: Limits) -> InFlight:
     """Motion from ``state`` (3, 3) to rest, wherever that is, each axis as soon as its limits allow."""
-    problem, length_m, time_s = _problem(state, np.zeros(3), limits)
+    problem, length_m, time_s = _problem([0.0] * 3, state[1].tolist(), state[2].tolist(), limits)
     problem.control_interface = ruckig.ControlInterface.Velocity
     problem.synchronization = ruckig.Synchronization.No
-    return _planned(problem, state, length_m, time_s)
+    return InFlight(_planned(problem), state[0], [length_m] * 3, time_s)
 
 
-def _problem(state: Array, way_m: Array, limits: Limits) -> tuple[ruckig.InputParameter, float, float]:
+def _problem(
+    way_m: list[float], velocity: list[float], acceleration: list[float], limits: Limits
+) -> tuple[ruckig.InputParameter, float, float]:
     """The problem in units of its own size, as ruckig's tolerances are absolute; and these units."""
     v, a, j = limits
-    velocity, acceleration = state[1].tolist(), state[2].tolist()
+    axes = len(way_m)
     speed, pull = max(map(abs, velocity)), max(map(abs, acceleration))
-    length_m = max(max(map(abs, way_m.tolist())), speed**2 / a, pull**3 / j**2, _NEAREST_M)
+    length_m = max(max(map(abs, way_m)), speed**2 / a, pull**3 / j**2, _NEAREST_M)
     time_s = length_m / v + math.sqrt(length_m / a) + (length_m / j) ** (1 / 3)
-    problem = ruckig.InputParameter(3)
+    problem = ruckig.InputParameter(axes)
     problem.current_velocity = [value * (time_s / length_m) for value in velocity]
     problem.current_acceleration = [value * (time_s**2 / length_m) for value in acceleration]
-    problem.max_velocity = [v * time_s / length_m] * 3
-    problem.max_acceleration = [min(a * time_s**2 / length_m, _NO_BOUND)] * 3
-    problem.max_jerk = [min(j * time_s**3 / length_m, _NO_BOUND)] * 3
+    problem.max_velocity = [v * time_s / length_m] * axes
+    problem.max_acceleration = [min(a * time_s**2 / length_m, _NO_BOUND)] * axes
+    problem.max_jerk = [min(j * time_s**3 / length_m, _NO_BOUND)] * axes
     return problem, length_m, time_s
 
 
-def _planned(problem: ruckig.InputParameter, state: Array, length_m: float, time_s: float) -> InFlight:
-    planned = ruckig.Trajectory(3)
+def _planned(problem: ruckig.InputParameter) -> ruckig.Trajectory:
+    planned = ruckig.Trajectory(problem.degrees_of_freedom)
     try:
-        result = _PLANNER.calculate(problem, planned)
+        result = _PLANNERS[problem.degrees_of_freedom].calculate(problem, planned)
     except (ruckig.RuckigError, ValueError) as error:  # ValueError: a result that its Python binding has no name for
         raise TrajectoryError(f"no way there inside these limits: {error}") from None
     if result not in (ruckig.Result.Working, ruckig.Result.Finished):
         raise TrajectoryError(f"no way there inside these limits: {result}")
-    return InFlight(planned, state[0].copy(), length_m, time_s)
+    return planned
