@@ -42,6 +42,10 @@ class FaultConfinement:
             e.transmit_errors or e.receive_errors or e.bus_off or e._earliest_ns > free_ns for e in self.endpoints
         )
 
+    def may_everybody_send(self, free_ns: int) -> bool:
+        """True if nobody is error-passive or bus-off, or has to wait once the wire is free at ``free_ns``."""
+        return not any(e.is_passive or e.bus_off or e._earliest_ns > free_ns for e in self.endpoints)
+
     def is_alone(self) -> bool:
         """True if there is nobody who could acknowledge the frame of another."""
         return self.nodes < 2

@@ -12,6 +12,7 @@ takes over, so their CRC does not change their length.
 
 import numpy as np
 from numba import njit
+from numpy.typing import NDArray
 
 from pkxyz_ctrl.can.frame import BIT_RATE_SWITCH, ERROR, EXTENDED, FD, REMOTE, Frame
 
@@ -45,6 +46,27 @@ def _stuff(state: int, word: int, n_bits: int) -> int:
         run = run + 1 if bit == last else 1
         last = bit
     return (count << 8) | (run << 1) | last
+
+
+def _stuffed_bytes() -> NDArray[np.int16]:
+    """(12, 256): what ``_stuff`` makes of a byte, by run and last bit before it."""
+    before, byte = np.arange(2 * 5 + 2)[:, None], np.arange(256)
+    count, run, last = np.zeros((len(before), 256), int), before >> 1, before & 1
+    for i in range(7, -1, -1):
+        is_due = run == 5
+        count, run, last = count + is_due, np.where(is_due, 1, run), np.where(is_due, 1 - last, last)
+        bit = byte >> i & 1
+        run, last = np.where(bit == last, run + 1, 1), bit
+    return (count << 8 | run << 1 | last).astype(np.int16)
+
+
+_STUFFED = _stuffed_bytes()
+
+
+@njit(cache=True)
+def _stuff_byte(state: int, byte: int) -> int:
+    """``_stuff`` of eight bits, in one step."""
+    return int((state & ~0xFF) + _STUFFED[state & 0xFF, byte])
 
 
 @njit(cache=True)
@@ -91,7 +113,7 @@ def _bit_counts(can_id: int, data: bytes, flags: int) -> int:
             length = 0
         for i in range(length):
             byte = np.int64(data[i])
-            state, crc = _stuff(state, byte, 8), _crc15(crc, byte, 8)
+            state, crc = _stuff_byte(state, byte), _crc15(crc, byte, 8)
         state = _stuff(state, crc, 15)
         stuffed = (state >> 8) + (1 if (state >> 1) & 0x7F == 5 else 0)
         return int(n_header + 8 * length + 15 + stuffed + 1 + ACK_TO_END_BITS + INTERFRAME_BITS)
@@ -105,7 +127,7 @@ def _bit_counts(can_id: int, data: bytes, flags: int) -> int:
     nominal = n_header + (state >> 8) + ACK_TO_END_BITS + INTERFRAME_BITS
     state = _stuff(state & 0xFF, (16 if flags & ERROR_PASSIVE else 0) | code, 5)  # ESI, DLC
     for i in range(length):
-        state = _stuff(state, np.int64(data[i]), 8)
+        state = _stuff_byte(state, np.int64(data[i]))
     crc_field = FIXED_STUFFED_CRC21_BITS if length > 16 else FIXED_STUFFED_CRC17_BITS
     fast = 5 + 8 * length + (state >> 8) + crc_field + 1
     return int(nominal | fast << 16 if switch else nominal + fast)

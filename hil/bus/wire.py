@@ -137,11 +137,11 @@ class Wire:
         return (now.busy_ns - then.busy_ns) / max(1, (now.t_us - then.t_us) * 1000)
 
     def is_calm(self, tap: FaultTap | None = None) -> bool:
-        """Whether it is idle, with nothing queued, and the next frame meets no error but what ``tap`` makes of it."""
+        """Whether it is idle, nothing queued, nobody error-passive, and no error ahead but what ``tap`` makes."""
         if self._end_us >= 0 or self._rivals or any(e._to_send for e in self.endpoints):
             return False
         all_of_us, free_ns = self._confinement, self._free_ns
-        return self.disturbance.is_only(tap) and not all_of_us.is_alone() and all_of_us.is_everybody_well(free_ns)
+        return self.disturbance.is_only(tap) and not all_of_us.is_alone() and all_of_us.may_everybody_send(free_ns)
 
     @property
     def carried(self) -> tuple[int, int, int]:

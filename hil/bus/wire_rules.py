@@ -1,4 +1,5 @@
 """The wire between two endpoints while nothing goes wrong on it, compiled: arbitration and times as ``wire`` has them.
+Errors that were counted before are forgotten frame by frame.
 
 A frame that carries data has at most eight bytes, as an integer of 64 bits, the first one lowest.
 """
@@ -44,6 +45,8 @@ WIRE = np.dtype(
         ("queue", FRAME, (PLACES,)),
         ("done", FRAME, (1,)),  # the frame that has just ended
         ("payload", "u1", (_BYTES,)),
+        ("transmit_errors", "i4", (2,)),  # by sender; each below what makes it error-passive
+        ("receive_errors", "i4", (2,)),
         ("place", "i4"),  # in ``queue``, of the frame under way
         ("waiting", "i4"),
     ],
@@ -106,3 +109,14 @@ def end(wire: np.void) -> None:
     wire["frames"] += 1
     frame["can_id"] = _EMPTY
     wire["waiting"] -= 1
+    errors, sender = wire["transmit_errors"], frame["sender"]
+    if errors[sender] > 0:
+        errors[sender] -= 1
+
+
+@njit(cache=True, error_model="numpy")
+def received(wire: np.void) -> None:
+    """The other one has got the frame in ``done``."""
+    errors, receiver = wire["receive_errors"], 1 - wire["done"][0]["sender"]
+    if errors[receiver] > 0:
+        errors[receiver] -= 1

@@ -1,5 +1,5 @@
 """The node's part of a tick in which all is as it should be, compiled: SYNC, drive PDO, sense PDO; and what it does in
-pre-operational.
+pre-operational, where it answers what a start-up reads, and stopped.
 
 Each kernel looks before it acts. What is out of the ordinary it leaves alone and says so: that is for the node itself.
 A payload is its bytes as an integer of 64 bits, the first one lowest.
@@ -15,12 +15,21 @@ from hil.node.crc import STEP, crc8h2f
 
 Records = NDArray[np.void]
 
+OBJECTS_MOST: Final = 192
+
+OBJECT = np.dtype([("key", "i4"), ("reply", "i8")], align=True)
+"""What answers an SDO upload of an object; ``key``: index, and sub-index above it, as a request has them."""
+
 NODE = np.dtype(
     [
+        ("objects", OBJECT, (OBJECTS_MOST,)),
+        ("objects_count", "i4"),
         ("sync_id", "i4"),
         ("drive_id", "i4"),
         ("sense_id", "i4"),
         ("heartbeat_id", "i4"),
+        ("request_id", "i4"),  # of SDO, and of what is answered
+        ("reply_id", "i4"),
         ("output_id", "i4"),  # of the digital outputs' PDO; -1: not in use
         ("consumer_id", "i4"),  # whose heartbeat is waited for
         ("flags", "i4"),  # of the frames that it sends
@@ -57,6 +66,7 @@ NODE_MEMORY = np.dtype(
         ("sense_crc", "i4"),
         ("digital", "i4"),  # bits at the digital outputs ...
         ("digital_pending", "i4"),  # ... and those that wait for the SYNC; -1: none
+        ("served_key", "i4"),  # of the last object that was read; -1: none
         ("signature_left", "i4"),  # SYNCs until the signature is due; 0: never
     ],
     align=True,
@@ -65,9 +75,12 @@ NODE_MEMORY = np.dtype(
 NEVER_US: Final = 1 << 62
 DEAF: Final = 0  # a node that boots: it takes nothing
 OPERATIONAL: Final = 5
+STOPPED: Final = 4
 UNKNOWN: Final = -1
 """In ``sync_expected``: any may come."""
 _LEAVE: Final = 128  # NMT: to pre-operational
+_COMMAND, _UPLOAD = 0xE0, 0x40  # bits of an SDO request
+_KEY: Final = 0xFFFFFF
 LENGTH: Final = 8  # of a process PDO with counter and CRC
 _CRC_BYTES: Final = 7
 _STEP: Final = np.frombuffer(STEP, np.uint8)
@@ -191,6 +204,31 @@ def on_frame_at_rest(config: np.void, memory: np.void, can_id: int, length: int,
     if can_id == 0:  # NMT
         return length == 2 and word & 0xFF == _LEAVE
     return bool(can_id == config["drive_id"] or can_id == config["output_id"])  # not taken in this state
+
+
+@njit(cache=True, error_model="numpy")
+def on_frame_stopped(config: np.void, memory: np.void, can_id: int, length: int, word: int, t_us: int) -> bool:
+    """A frame that comes to a stopped node, likewise."""
+    if can_id == config["consumer_id"]:
+        return memory["consumer_us"] != NEVER_US and bool(on_heartbeat(config, memory, length, word, t_us))
+    return bool(can_id != 0)  # NMT is all that it takes besides
+
+
+@njit(cache=True, error_model="numpy")
+def read(config: np.void, memory: np.void, length: int, word: int) -> int:
+    """The reply to an SDO request, a number with sign. 0, and nothing is done, for one that is no upload, or of an
+    object whose value has to be looked up.
+    """
+    if length != LENGTH or word & _COMMAND != _UPLOAD:
+        return 0
+    key = word >> 8 & _KEY
+    for place in range(config["objects_count"]):
+        found = config["objects"][place]
+        if found["key"] == key:
+            if found["reply"] != 0:
+                memory["served_key"] = key
+            return int(found["reply"])
+    return 0
 
 
 @njit(cache=True, error_model="numpy")

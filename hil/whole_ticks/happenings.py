@@ -135,7 +135,10 @@ def happen(lane: np.void, node: np.void, memory: np.void, stage: Stage, line: Li
         lane["logged"] = write_line(
             line[3], lane["logged"], line[2], now_us, frame["can_id"], frame["flags"], frame["length"], frame["word"]
         )
-    told = HEARD if is_lost else _hear(lane, node, memory, frame, now_us)
+    told = HEARD
+    if not is_lost:
+        wire_rules.received(wire)
+        told = _hear(lane, node, memory, frame, now_us)
     if told == SAMPLED:
         _exchange(lane, memory, stage, now_us)
     wire_rules.arbitrate(wire, now_us)
@@ -168,7 +171,11 @@ def _hear(lane: np.void, node: np.void, memory: np.void, frame: np.void, now_us:
         return HEARD if _keep(lane, frame) else REFUSED
     if lane["node_state"] == rules.DEAF:
         return HEARD
+    if lane["node_state"] == rules.STOPPED:
+        return HEARD if rules.on_frame_stopped(node, memory, can_id, length, word, now_us) else REFUSED
     if lane["node_state"] != rules.OPERATIONAL:
+        if can_id == node["request_id"]:
+            return HEARD if _serve(node, memory, lane["wire"][0], length, word, now_us) else REFUSED
         return HEARD if rules.on_frame_at_rest(node, memory, can_id, length, word, now_us) else REFUSED
     if can_id == node["drive_id"]:
         return HEARD if rules.on_drive(node, memory, length, word, now_us) else REFUSED
@@ -179,6 +186,15 @@ def _hear(lane: np.void, node: np.void, memory: np.void, frame: np.void, now_us:
     if can_id == node["sync_id"] and rules.on_sync(node, memory, length, word, now_us):
         return SAMPLED
     return REFUSED
+
+
+@njit(cache=True, error_model="numpy")
+def _serve(node: np.void, memory: np.void, wire: np.void, length: int, word: int, now_us: int) -> bool:
+    """An SDO request."""
+    reply = rules.read(node, memory, length, word)
+    if reply == 0:
+        return False
+    return bool(wire_rules.send(wire, AMPLIFIER, node["reply_id"], node["flags"], rules.LENGTH, reply, now_us))
 
 
 @njit(cache=True, error_model="numpy")

@@ -3,9 +3,14 @@
 import numpy as np
 
 from hil.node.amplifier import AmplifierNode, NmtState
-from hil.node.rules import NEVER_US, NODE, NODE_MEMORY, UNKNOWN, crc_start
+from hil.node.object_dictionary import Value
+from hil.node.rules import NEVER_US, NODE, NODE_MEMORY, OBJECTS_MOST, UNKNOWN, crc_start
+from hil.node.sdo_server import SdoServer
 
 _WATCHED_MOST = 1
+_LOOKED_UP = frozenset((0x1003, 0x2000, 0x2001, 0x2020, 0x6401, 0x6411))
+"""Objects whose values the node brings up to date when they are asked for."""
+_SHORT, _SHORT_REPLY = 0xE2, 0x42  # of a reply's command: a value of four bytes at most
 
 
 class NodeAtWork:
@@ -14,6 +19,12 @@ class NodeAtWork:
     def __init__(self, node: AmplifierNode) -> None:
         self.node = node
         self.record, self.memory = np.zeros(1, NODE), np.zeros(1, NODE_MEMORY)
+        self._entries = [e for e in node.od if e.index not in _LOOKED_UP][:OBJECTS_MOST]
+        self._seen: list[Value | None] = [None] * len(self._entries)  # the values that ``record`` answers with
+        self.record["objects_count"] = len(self._entries)
+        self.record["request_id"], self.record["reply_id"] = 0x600 + node.node_id, 0x580 + node.node_id
+        self.record["heartbeat_id"], self.record["flags"] = 0x700 + node.node_id, node._flags
+        self._settings: tuple[int, ...] = ()  # those that ``record`` holds
 
     def take(self) -> bool:
         """Read the node. False for one that does anything else than its daily work."""
@@ -48,19 +59,25 @@ class NodeAtWork:
         return True
 
     def _take_settings(self) -> None:
-        node, c = self.node, self.record[0]
-        c["drive_id"], c["sense_id"] = node._drive_pdo.cob_id, node._sense_pdo.cob_id
+        """What it goes by, which seldom changes: to write a record takes longer than to look."""
+        node = self.node
+        watched = [(consumer.cob_id, consumer.time_us) for consumer in node._consumers if consumer.cob_id is not None]
+        settings = (
+            node.od[0x1005, 0] & 0x7FF, node._drive_pdo.cob_id, node._sense_pdo.cob_id,
+            next(iter(node.digital.receivers), -1), *(watched[-1] if watched else (-1, 0)),
+            node._drive._limit, node._step_max, node.od[0x1019, 0],
+            node._sense.turnaround_us, node._drive_timeout_us, node._heartbeat.beat_period_us,
+        )  # fmt: skip
+        if settings == self._settings:
+            return
+        self._settings, c = settings, self.record[0]
+        (
+            c["sync_id"], c["drive_id"], c["sense_id"],
+            c["output_id"], c["consumer_id"], c["consumer_time_us"],
+            c["limit"], c["step_max"], c["sync_overflow"],
+            c["turnaround_us"], c["drive_timeout_us"], c["beat_period_us"],
+        ) = settings  # fmt: skip
         c["drive_crc_start"], c["sense_crc_start"] = crc_start(int(c["drive_id"])), crc_start(int(c["sense_id"]))
-        c["output_id"] = next(iter(node.digital.receivers), -1)
-        c["sync_id"] = node.od[0x1005, 0] & 0x7FF
-        c["heartbeat_id"], c["flags"] = 0x700 + node.node_id, node._flags
-        c["consumer_id"], c["consumer_time_us"] = -1, 0
-        for consumer in node._consumers:
-            if consumer.cob_id is not None:
-                c["consumer_id"], c["consumer_time_us"] = consumer.cob_id, consumer.time_us
-        c["limit"], c["step_max"], c["sync_overflow"] = node._drive._limit, node._step_max, node.od[0x1019, 0]
-        c["turnaround_us"], c["drive_timeout_us"] = node._sense.turnaround_us, node._drive_timeout_us
-        c["beat_period_us"] = node._heartbeat.beat_period_us
 
     def put(self) -> None:
         """What has become of the node's state; `take` had said yes."""
@@ -86,17 +103,20 @@ class NodeAtWork:
         node.digital.pending = None if digital < 0 else digital
 
     def take_at_rest(self) -> int | None:
-        """Read a node that is not operational: its state, as its heartbeat has it. None for one that is, or that does
-        more than to beat and to count SYNCs.
+        """Read a node that is not operational: its state, as its heartbeat has it. None for one that is, or that
+        watches more than the controller.
         """
         node, m = self.node, self.memory[0]
         watched = [consumer for consumer in node._consumers if consumer.cob_id is not None]
         is_booting, is_ready = node.state is NmtState.INITIALISING, node.state is NmtState.PRE_OPERATIONAL
-        if not (is_booting or is_ready) or len(watched) > 1:
+        is_stopped = node.state is NmtState.STOPPED
+        if not (is_booting or is_ready or is_stopped) or len(watched) > _WATCHED_MOST:
             return None
         self._take_settings()
+        self._take_objects()
         m["drive_deadline_us"] = m["due_us"] = m["beat_us"] = m["consumer_us"] = NEVER_US
-        if is_ready:
+        m["served_key"] = -1
+        if not is_booting:
             beat_us = node._heartbeat.alarm.due_us
             m["beat_us"] = NEVER_US if beat_us is None else beat_us
             lasts_us = watched[0].alarm.due_us if watched else None
@@ -108,14 +128,31 @@ class NodeAtWork:
     def put_at_rest(self) -> None:
         """What has become of it; ``take_at_rest`` had not said None."""
         node, m = self.node, self.memory[0]
-        if node.state is not NmtState.PRE_OPERATIONAL:
+        if node.state is NmtState.INITIALISING:
             return
+        if m["served_key"] >= 0:
+            node._sdo.reset()
+            node._sdo._multiplexer = int(m["served_key"]).to_bytes(3, "little")
         node._heartbeat.alarm.due_us = None if m["beat_us"] >= NEVER_US else int(m["beat_us"])
         for consumer in node._consumers:
             if consumer.cob_id is not None and m["consumer_us"] != NEVER_US:
                 consumer.alarm.due_us = int(m["consumer_us"])
         if m["sync_expected"] != UNKNOWN:
             node._sync_expected = bytes((int(m["sync_expected"]),)) if self.record["sync_overflow"][0] else b""
+
+    def _take_objects(self) -> None:
+        """What its SDO server answers to who reads."""
+        values: list[Value | None] = [entry.value for entry in self._entries]
+        if values == self._seen:
+            return
+        server, rows = SdoServer(self.node._sdo._objects), self.record["objects"][0]
+        for place, (entry, value) in enumerate(zip(self._entries, values, strict=True)):
+            if value != self._seen[place]:
+                key = entry.index | entry.subindex << 16
+                reply = server.serve(b"\x40" + key.to_bytes(3, "little") + bytes(4)) or bytes(8)
+                is_short = reply[0] & _SHORT == _SHORT_REPLY
+                rows[place] = key, int.from_bytes(reply, "little", signed=True) if is_short else 0
+        self._seen = values
 
 
 def _time(due_us: int | None) -> int:

@@ -16,6 +16,7 @@ from hil.faults.channels import DICE
 from hil.faults.frame_rules import RULE
 from hil.faults.injection import Injection
 from hil.faults.plant import channels_of
+from hil.faults.wire import SENDERS
 from hil.node.alarm import Alarm
 from hil.node.amplifier import AmplifierNode
 from hil.node.rules import OPERATIONAL
@@ -49,6 +50,7 @@ class Stretches:
         self._clock, self._wire, self._endpoint, self._log = clock, wire, endpoint, log
         self._plant, self._controller = plant, controller
         self._known = known
+        self._senders = [next(e for e in known if e.name == name) for name in SENDERS]
         self._node, self._alarms = NodeAtWork(node), node.work_alarms
         self._faults = None if injection is None else injection.wire_faults
         self._bench = bench = np.zeros(1, BENCH)
@@ -121,11 +123,17 @@ class Stretches:
         bench["was_sampled"] = plant.was_sampled
         bench["rules"] = 0 if self._faults is None else self._faults.count
         medium["free_ns"], medium["busy_ns"], medium["frames"] = wire.carried
+        medium["transmit_errors"] = [e.transmit_errors for e in self._senders]
+        medium["receive_errors"] = [e.receive_errors for e in self._senders]
         done = int(self._run(*self._before, reference, rows, *self._behind))
         if done == 0:
             self._endpoint.put_back(waiting)
             return 0
         wire.carried = int(medium["free_ns"][0]), int(medium["busy_ns"][0]), int(medium["frames"][0])
+        for sender, sent, received in zip(
+            self._senders, medium["transmit_errors"][0].tolist(), medium["receive_errors"][0].tolist(), strict=True
+        ):
+            sender.transmit_errors, sender.receive_errors = sent, received
         if state == OPERATIONAL:
             self._node.put()
         else:

@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 from hil.bus.log_lines import LINE_MOST
 from hil.node.rules import NEVER_US, OPERATIONAL
 from hil.whole_ticks.happenings import Bytes, Line, Records, Stage, happen, look, next_us, pass_time, send, take_first
-from pkxyz_ctrl.can.driver_rules import FRESH, RUNNING
+from pkxyz_ctrl.can.driver_rules import FRESH, RUNNING, START_UP
 from pkxyz_ctrl.loop.exchange import BLOCKED, NOT_RESTARTED, RESTARTED, begin, finish, on_frame, period
 from pkxyz_ctrl.safety.modes import Mode
 
@@ -37,19 +37,30 @@ def whole_ticks(
     watched; returns how many there were.
 
     ``live`` are the words of all that a tick changes, ``kept`` room for them. They are kept every few ticks only: the
-    first that can't be played leads back there, and those between are played again.
+    first that can't be played leads back there, and those between are played again. So does an end with a frame on its
+    way: the last one is that behind which nothing was.
     """
-    done, marked, most = 0, 0, len(rows)
-    while done < most:
-        if done % _MARK_TICKS == 0:
+    done, calm, most = 0, 0, len(rows)
+    marked = -_MARK_TICKS
+    while done < most or done != calm:
+        if done == calm and done - marked >= _MARK_TICKS:
             _copy_all(live, kept)
             marked = done
-        if _is_room(bench[0], line[3]) and _tick(controller, node, stage, line, bench, reference, rows, seen_v, done):
+        if done < most and _is_room(bench[0], line[3]) and _tick(
+            controller, node, stage, line, bench, reference, rows, seen_v, done
+        ):  # fmt: skip
             done += 1
+            calm = done if _is_calm(bench[0], node[1][0]) else calm
         else:
-            most, done = done, marked
+            most, done = calm, marked
             _copy_all(kept, live)
     return done
+
+
+@njit(cache=True, error_model="numpy")
+def _is_calm(lane: np.void, memory: np.void) -> bool:
+    """Whether nothing is on its way."""
+    return bool(lane["wire"][0]["waiting"] == 0 and memory["due_us"] == NEVER_US)
 
 
 @njit(cache=True, error_model="numpy")
@@ -99,7 +110,7 @@ def _tick(
     if not pass_time(lane, its, own, stage, line, end_us):
         return False
     lane["t_us"] = end_us
-    return bool(wire["waiting"] == 0 and own["due_us"] == NEVER_US)
+    return True
 
 
 @njit(cache=True, error_model="numpy")
@@ -116,8 +127,10 @@ def _wait(
             first = lane["inbox"][0]
             told = on_frame(config, memory, first["can_id"], first["flags"], first["length"], first["word"], now_us)
             take_first(lane)
-            if told != 0:
-                return now_us if told == FRESH else NEVER_US
+            if told & ~(FRESH | START_UP) or (told & START_UP and not _go_on_starting(memory, lane, now_us)):
+                return NEVER_US
+            if told & FRESH:
+                return now_us
             if now_us > deadline_us:
                 return NEVER_US if is_owed else now_us
             continue
@@ -127,6 +140,14 @@ def _wait(
         now_us = soonest_us
         if not happen(lane, its, own, stage, line, now_us):
             return NEVER_US
+
+
+@njit(cache=True, error_model="numpy")
+def _go_on_starting(memory: Records, lane: np.void, now_us: int) -> bool:
+    """What a start-up sends in answer to a frame."""
+    if memory[0]["blocked"] != 0:
+        return False
+    return bool(send(memory, lane["wire"][0], memory[0]["driver"][0]["outgoing"], now_us))
 
 
 @njit(cache=True, error_model="numpy")

@@ -6,6 +6,7 @@ from hypothesis import strategies as st
 from node_rig import CONTROLLER, DRIVE, EMCY, SENSE, SYNC, Rig, protected, sample_at
 
 from hil.node import rules
+from hil.node.amplifier import NmtState
 from hil.whole_ticks.node_at_work import NodeAtWork
 from pkxyz_ctrl.can.driver import bytes_of, word_of
 
@@ -271,3 +272,64 @@ def test_who_does_something_else_than_its_daily_work_is_left_to_itself() -> None
         rig.cycle((0, 0, 0))
         rig.cycle((0, 0, 0))
         assert not NodeAtWork(rig.node).take()
+
+
+def request(key: int, command: int = 0x40) -> int:
+    """The word of an SDO request."""
+    return word_of(bytes((command,)) + key.to_bytes(3, "little") + bytes(4))
+
+
+def test_what_a_start_up_reads_is_answered_as_the_node_answers_it() -> None:
+    """Every object of the dictionary, again after one was written; what is looked up when it is asked for is not."""
+    rig = Rig()
+    rig.start()
+    rig.nmt(128)
+    work = NodeAtWork(rig.node)
+    for value in (500, 700):
+        assert rig.write(0x2011, 0, value, 2) == 0
+        assert work.take_at_rest() == 127
+        answered = set()
+        for entry in rig.node.od:
+            word = request(entry.index | entry.subindex << 16)
+            if (reply := rules.read(work.record[0], work.memory[0], 8, word)) != 0:
+                answered.add(entry.index)
+                assert bytes_of(reply, 8) == rig.node._sdo.serve(bytes_of(word, 8))
+        assert {0x1000, 0x1018, 0x1401, 0x1601, 0x1A01, 0x2011, 0x2012, 0x6444} <= answered
+        assert not {0x1003, 0x1008, 0x2000, 0x2001, 0x2020, 0x6401, 0x6411} & answered
+    assert bytes_of(rules.read(work.record[0], work.memory[0], 8, request(0x2011)), 8)[4:6] == (700).to_bytes(
+        2, "little"
+    )
+    rig.node._sdo._multiplexer = bytes(3)
+    work.put_at_rest()
+    assert rig.node._sdo._multiplexer == b"\x11\x20\x00"
+
+
+@pytest.mark.parametrize(
+    ("length", "word"),
+    [(7, request(0x1000)), (8, request(0x1000, 0x23)), (8, request(0x1000, 0x60)), (8, request(0x1000, 0x80)),
+     (8, request(0x7777)), (8, request(0x011000))],
+)  # fmt: skip
+def test_a_request_that_is_no_read_is_the_nodes_own(length: int, word: int) -> None:
+    work = NodeAtWork(Rig().node)
+    work.node.state = NmtState.PRE_OPERATIONAL
+    assert work.take_at_rest() == 127
+    assert rules.read(work.record[0], work.memory[0], 8, request(0x1000)) != 0
+    work.memory["served_key"] = -1
+    assert rules.read(work.record[0], work.memory[0], length, word) == 0
+    assert work.memory["served_key"][0] == -1
+
+
+def test_a_stopped_node_takes_heartbeats_and_leaves_nmt_to_itself() -> None:
+    twin = Twin()
+    rig, work = twin.rigs[0], twin.work
+    rig.give(CONTROLLER, b"\x05")
+    rig.nmt(2)
+    assert work.take_at_rest() == rules.STOPPED
+    node, memory = work.record[0], work.memory[0]
+    for can_id in (SYNC, DRIVE, 0x600 + rig.node.node_id):
+        assert rules.on_frame_stopped(node, memory, can_id, 8, 0, T_US)
+    assert not rules.on_frame_stopped(node, memory, 0, 2, 1, T_US)
+    assert rules.on_frame_stopped(node, memory, CONTROLLER, 1, 5, T_US)
+    assert memory["consumer_us"] == T_US + 50_000
+    memory["consumer_us"] = rules.NEVER_US  # it was missed, and has come again
+    assert not rules.on_frame_stopped(node, memory, CONTROLLER, 1, 5, T_US)

@@ -16,7 +16,7 @@ from hil.bus.frame_log import FrameLog
 from hil.bus.frame_time import to_end_ns
 from hil.bus.log_lines import LINE_MOST, write_line
 from hil.bus.wire import Wire
-from hil.bus.wire_rules import NEVER_US, WIRE, arbitrate, clear, end, send
+from hil.bus.wire_rules import NEVER_US, WIRE, arbitrate, clear, end, received, send
 from hil.faults.fault import parse
 from hil.lanes.blocks import Blocks
 from hil.lanes.lockstep import LockstepRig
@@ -154,6 +154,15 @@ def test_ticks_under_a_lasting_fault_are_whole(text: str, share: float, tmp_path
     assert sum(whole) > share * made.ticks, rig.controller.faults
 
 
+@pytest.mark.parametrize("text", ["sense.1:off", "node:reset", "bus:error_frames", "bus:drop"])
+def test_a_start_up_is_played_whole(text: str, tmp_path: Path, whole: list[int]) -> None:
+    """What it reads of the node, and a node that stands there meanwhile, errors still counted against it."""
+    made = dataclasses.replace(setup("nominal"), duration_s=0.35, clear_s=0.02, faults=(parse(f"{text}@0.11+0.004"),))
+    rig = same_both_ways(made, tmp_path)
+    assert rig.controller.faults
+    assert sum(whole) > 0.95 * made.ticks
+
+
 @pytest.mark.parametrize("text", ["sense.1:off", "amplifier.2:slew_collapse", "bus.drive:drop", "node:silent"])
 def test_combs_that_are_watched_are_the_same_both_ways(text: str, whole: list[int]) -> None:
     """What ``pkxyz faults`` judges by: the voltages behind each tick."""
@@ -207,10 +216,17 @@ FRAMES = st.tuples(
 )
 
 
-@given(planned=st.lists(FRAMES, min_size=1, max_size=12), flags=st.sampled_from([0, FD, FD | BIT_RATE_SWITCH]))
+@given(
+    planned=st.lists(FRAMES, min_size=1, max_size=12), flags=st.sampled_from([0, FD, FD | BIT_RATE_SWITCH]),
+    errors=st.lists(st.sampled_from([0, 1, 5, 127]), min_size=4, max_size=4),
+)  # fmt: skip
 @settings(max_examples=200, deadline=None)
-def test_the_compiled_wire_is_the_wire(planned: list[tuple[int, int, bytes, bool]], flags: int) -> None:
-    """Frames of two senders at any instants, by both wires: the same ends, in the same order, and the same books."""
+def test_the_compiled_wire_is_the_wire(
+    planned: list[tuple[int, int, bytes, bool]], flags: int, errors: list[int]
+) -> None:
+    """Frames of two senders at any instants, by both wires: the same ends, in the same order, and the same books, those
+    of errors that were counted before, too.
+    """
     planned.sort(key=lambda frame: frame[0])
     clock, ended = Lockstep(), []
     medium = Wire(clock, *RATES)
@@ -221,6 +237,9 @@ def test_the_compiled_wire_is_the_wire(planned: list[tuple[int, int, bytes, bool
     compiled["to_end_ns"] = to_end_ns(RATES[0])
     clear(compiled)
     wire = compiled[0]
+    for place, one in enumerate(ends):
+        one.transmit_errors, one.receive_errors = errors[place], errors[2 + place]
+    wire["transmit_errors"], wire["receive_errors"] = errors[:2], errors[2:]
 
     def pass_time(until_us: int) -> None:
         while wire["end_us"] <= until_us:
@@ -229,6 +248,7 @@ def test_the_compiled_wire_is_the_wire(planned: list[tuple[int, int, bytes, bool
             done = wire["done"][0]
             data = (int(done["word"]) & (1 << 64) - 1).to_bytes(8, "little")[: done["length"]]
             found.append((at_us, int(done["can_id"]), data))
+            received(wire)
             arbitrate(wire, at_us)
 
     for gap_us, can_id, data, is_second in planned:
@@ -243,3 +263,5 @@ def test_the_compiled_wire_is_the_wire(planned: list[tuple[int, int, bytes, bool
     assert found == ended
     assert wire["end_us"] == NEVER_US
     assert (int(wire["free_ns"]), int(wire["busy_ns"]), int(wire["frames"])) == medium.carried
+    assert wire["transmit_errors"].tolist() == [one.transmit_errors for one in ends]
+    assert wire["receive_errors"].tolist() == [one.receive_errors for one in ends]
