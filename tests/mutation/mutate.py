@@ -65,7 +65,7 @@ TARGETS = {
     "pkxyz_ctrl.learning.store": ("learning/test_learning_store.py", "learning/test_learning.py"),
     "hil.node.drive": _NODE,
     "hil.node.amplifier": (*_NODE, "node/test_node_sdo.py"),
-    "hil.node.rules": ("node/test_node_rules.py",),
+    "hil.node.rules": ("node/test_node_rules.py", "node/test_node_rules_at_rest.py"),
     "hil.recording.journal": ("recording/test_recording.py",),
 }
 
