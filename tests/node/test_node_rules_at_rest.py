@@ -2,12 +2,12 @@
 
 import pytest
 from node_rig import CONTROLLER, DRIVE, NMT, REQUEST, SYNC, Rig, protected
+from test_node_rules import at_work, synced
 
 from hil.node import rules
 from hil.node.amplifier import NmtState
 from hil.whole_ticks.node_at_work import NodeAtWork
 from pkxyz_ctrl.can.driver import word_of
-from test_node_rules import at_work, synced
 
 CONSUMER = 0x1016, 1, 0x7F_0032, 4  # the controller's heartbeat, 50 ms
 HEARTBEAT_PERIOD = 0x1017, 0, 20, 2
@@ -93,6 +93,21 @@ def test_syncs_that_are_not_counted_are_empty(data: bytes, taken: bool) -> None:
         assert by_rule(ruled, SYNC, data) is taken
         shipped.give(SYNC, data)
         assert not taken or of(ruled) == of(shipped)
+
+
+def test_one_sync_after_the_other_is_taken() -> None:
+    for overflow, syncs in ((0, (b"", b"", b"")), (240, (b"\xef", b"\xf0", b"\x01"))):
+        rig = at_rest(overflow=overflow)
+        work = NodeAtWork(rig.node)
+        work.take_at_rest()
+        for data in syncs:
+            taken = rules.on_frame_at_rest(work.record[0], work.memory[0], SYNC, len(data), word_of(data), rig.now_us)
+            assert taken is True
+
+
+def test_states_are_those_of_the_heartbeat() -> None:
+    """A node is at work, or deaf, by the number of its state."""
+    assert (rules.DEAF, rules.OPERATIONAL) == (NmtState.INITIALISING, NmtState.OPERATIONAL)
 
 
 @pytest.mark.parametrize(
