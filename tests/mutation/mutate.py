@@ -31,7 +31,10 @@ FEW = 8  # mutants, for which it does not pay to measure the tests beforehand
 
 # The modules, and the tests that are about them. Before each come numbers that are contracts: fast, and soon imported.
 PINNED = "safety/test_safety_pinned.py"
-_GATE = tuple(f"safety/test_safety_gate{part}.py" for part in ("_reasons", "", "_traffic", "_sweep"))
+_GATE = (
+    "safety/test_output_frames.py",
+    *(f"safety/test_safety_gate{part}.py" for part in ("_reasons", "", "_traffic", "_sweep")),
+)
 _START = tuple(
     f"can/test_can_{part}.py" for part in ("start_plan", "start_conditions", "sdo", "driver_start", "driver")
 )
