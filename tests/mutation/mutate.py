@@ -36,8 +36,10 @@ _GATE = (
     *(f"safety/test_safety_gate{part}.py" for part in ("_reasons", "", "_traffic", "_sweep")),
 )
 _START = tuple(
-    f"can/test_can_{part}.py" for part in ("start_plan", "start_conditions", "sdo", "driver_start", "driver")
+    f"can/test_can_{part}.py"
+    for part in ("start_plan", "start_conditions", "driver_at_work", "sdo", "driver_start", "driver")
 )
+_DRIVER = tuple(f"can/test_can_driver{part}.py" for part in ("_conditions", "_at_work", "_start", ""))
 _NODE_PARTS = ("pdo", "conditions", "release", "sync", "nmt", "heartbeat", "emergency")
 _NODE = tuple(f"node/test_node_{part}.py" for part in _NODE_PARTS)
 TARGETS = {
@@ -53,13 +55,8 @@ TARGETS = {
     "pkxyz_ctrl.can.process_pdo": ("can/test_can_codec.py",),
     "pkxyz_ctrl.can.codec": ("can/test_can_codec.py",),
     "pkxyz_ctrl.can.sense_input": ("can/test_can_sense.py",),
-    "pkxyz_ctrl.can.driver": (
-        "can/test_can_driver.py",
-        "can/test_can_driver_start.py",
-        "can/test_can_sdo.py",
-        "loop/test_overrun.py",
-    ),
-    "pkxyz_ctrl.can.driver_rules": ("can/test_can_driver.py", "can/test_can_driver_start.py", "loop/test_overrun.py"),
+    "pkxyz_ctrl.can.driver": (*_DRIVER, "can/test_can_sdo.py"),
+    "pkxyz_ctrl.can.driver_rules": (*_DRIVER, "can/test_can_start_conditions.py"),
     "pkxyz_ctrl.can.sdo": ("can/test_can_sdo.py", "can/test_can_start_plan.py", "can/test_can_start_conditions.py"),
     "pkxyz_ctrl.can.start_plan": _START,
     "pkxyz_ctrl.can.start_sequence": _START,
