@@ -35,10 +35,8 @@ _GATE = (
     "safety/test_output_frames.py",
     *(f"safety/test_safety_gate{part}.py" for part in ("_reasons", "", "_traffic", "_sweep")),
 )
-_START = tuple(
-    f"can/test_can_{part}.py"
-    for part in ("start_plan", "start_conditions", "driver_at_work", "sdo", "driver_start", "driver")
-)
+_START_PARTS = ("start_plan", "start_conditions", "driver_at_work", "sdo", "driver_start", "driver")
+_START = tuple(f"can/test_can_{part}.py" for part in _START_PARTS)
 _DRIVER = tuple(f"can/test_can_driver{part}.py" for part in ("_conditions", "_at_work", "_start", ""))
 _NODE_PARTS = ("pdo", "conditions", "release", "sync", "nmt", "heartbeat", "emergency")
 _NODE = tuple(f"node/test_node_{part}.py" for part in _NODE_PARTS)
