@@ -58,7 +58,7 @@ TARGETS = {
     "pkxyz_ctrl.can.sdo": ("can/test_can_sdo.py", "can/test_can_start_plan.py", "can/test_can_start_conditions.py"),
     "pkxyz_ctrl.can.start_plan": _START,
     "pkxyz_ctrl.can.start_sequence": _START,
-    "pkxyz_ctrl.loop.exchange": ("loop/test_controller.py", "loop/test_overrun.py", "loop/test_flood.py"),
+    "pkxyz_ctrl.loop.exchange": ("loop/exchange/test_exchange.py", "loop/exchange/test_room.py"),
     "pkxyz_ctrl.loop.controller": ("loop/test_controller.py", "loop/test_overrun.py", "loop/test_flood.py"),
     "pkxyz_ctrl.learning.store": ("learning/test_learning_store.py", "learning/test_learning.py"),
     "hil.node.drive": _NODE,
