@@ -214,10 +214,15 @@ def test_the_rules_tell_what_a_frame_was_and_nothing_else() -> None:
     assert told(driver, "08a 10 23") == 0
     driver.stop(10)
     assert told(driver, "080 05") == 0
+    driver.release(20)
+    for state in (OPERATIONAL, PRE_OPERATIONAL, PRE_OPERATIONAL):
+        assert told(driver, f"70a {state}") == 0
     trial = AmplifierDriver(DriverConfig())
     trial.start(0)
     run_dialogue(trial, ObedientServer(), trial.receive(heartbeat(BOOT_UP), 0))
     assert told(trial, "08a 30 81 11 00 00 00 00 00") == 0
+    assert told(trial, "08a 00 01 00 00 00 00 00 00") == driver_rules.EMERGENCY
+    assert told(trial, "08a ff 00 00 00 00 00 00 00") == 0
     assert told(trial, "000 01 0b") == 0
     assert told(trial, "58a 60 17 10 00 00 00 00 00") == driver_rules.START_UP
     assert told(trial, "70a 05") == driver_rules.START_UP
@@ -247,3 +252,57 @@ def test_a_frame_to_send_has_not_been_judged_yet() -> None:
     driver.memory["out"]["reason"] = 9
     driver_rules.put(driver.record[0], driver.memory[0], 0x123, 1, 5)
     assert driver.memory["out"]["reason"][0, 0] == 0
+
+
+@pytest.mark.parametrize(("counter", "before"), [(5, 4), (1, 0), (0, 255), (255, 254)])
+def test_a_counter_that_is_taken_back(counter: int, before: int) -> None:
+    driver = started()
+    driver.memory["drive_counter"] = counter
+    driver.revoke_drive()
+    assert driver.drive((0, 0, 0), 0).data[6] == before
+
+
+def test_before_it_is_started_a_driver_is_silent_and_watches_nobody() -> None:
+    driver = AmplifierDriver(DriverConfig())
+    assert driver.heartbeat_due(10**9) is None
+    assert driver.poll(10**9) == ()
+    driver.sync(10**9)
+    assert (driver.node_events, driver.state) == (0, DriverState.OFF)
+
+
+# -- where heartbeats would meet ---------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize(
+    ("due_us", "sent_us", "next_us"),
+    [
+        (998, 998, 19_000),  # 1 ms behind the node's, which comes at 20 000: before it
+        (999, 999, 19_000),
+        (1_000, 1_000, 21_000),  # far enough
+        (1_500, 1_500, 21_500),
+        (19_000, 19_000, 39_000),  # far enough before
+        (19_001, 19_001, 39_000),
+        (500, 19_000, 20_500),  # it would be now
+        (500, 18_999, 19_000),
+    ],
+)
+def test_ours_is_put_before_the_nodes_where_they_would_meet(due_us: int, sent_us: int, next_us: int) -> None:
+    driver = started()
+    driver.memory["heartbeat_next_us"], driver.memory["node_heartbeat_us"] = due_us, 0
+    driver.heartbeat_sent(sent_us)
+    assert driver.memory["heartbeat_next_us"][0] == next_us
+
+
+def test_a_node_that_beats_every_two_milliseconds_leaves_no_room_to_keep_away() -> None:
+    for period_ms, next_us in ((2, 20_500), (3, 20_000)):
+        driver = started(node_heartbeat_period_ms=period_ms)
+        driver.memory["heartbeat_next_us"], driver.memory["node_heartbeat_us"] = 500, 0
+        driver.heartbeat_sent(500)
+        assert driver.memory["heartbeat_next_us"][0] == next_us
+
+
+def test_where_the_nodes_comes_at_another_time_ours_goes_out_of_its_way() -> None:
+    driver = started()
+    driver.memory["heartbeat_next_us"] = 40_500
+    driver.receive(heartbeat(OPERATIONAL), 20_800)
+    assert driver.memory["heartbeat_next_us"][0] == 39_800

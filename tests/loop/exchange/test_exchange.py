@@ -11,7 +11,7 @@ from pkxyz_ctrl.can.driver_config import DriverConfig
 from pkxyz_ctrl.can.driver_rules import NEVER_US, DriverState
 from pkxyz_ctrl.loop import exchange
 from pkxyz_ctrl.loop.controller import part
-from pkxyz_ctrl.loop.exchange import EXCHANGE, EXCHANGE_MEMORY, NOT_RESTARTED, RESTARTED
+from pkxyz_ctrl.loop.exchange import BLOCKED, EXCHANGE, EXCHANGE_MEMORY, NOT_RESTARTED, RESTARTED
 from pkxyz_ctrl.loop.reference import standing_still
 from pkxyz_ctrl.safety.gate import GateConfig, TransmitGate
 from pkxyz_ctrl.safety.modes import Event, Mode
@@ -158,6 +158,55 @@ def test_a_start_up_that_goes_well_is_no_failure() -> None:
     bench.memory["is_restarting"] = 1
     assert bench.begin() == 1
     assert (bench.memory["event"], bench.memory["is_restarting"]) == (Event.NODE_READY, 1)
+
+
+def test_the_start_up_goes_on_by_time() -> None:
+    bench = Bench(Mode.BOOT, DriverState.RESETTING)
+    start = bench.driver["start"][0]
+    start["deadline_us"], start["repeats_left"] = PERIOD_US, 1
+    bench.begin()
+    assert bench.sent[:1] == [(NMT, b"\x81\x0a")]
+    assert bench.ids == [NMT, SYNC]
+    bench.begin()
+    assert bench.ids == [SYNC]
+
+
+@pytest.mark.parametrize("call", ["begin", "start", "wait", "stop"])
+def test_whatever_is_sent_the_gate_has_seen(call: str) -> None:
+    """In a mode that there is not, it lets nothing pass."""
+    bench = Bench(Mode.BOOT, DriverState.RESETTING)
+    bench.cycle["mode"] = 99
+    bench.driver["start"][0]["repeats_left"] = 1
+    assert getattr(exchange, call)(bench.config, bench.all, 10**7) == BLOCKED | (2 if call == "stop" else 1)
+    assert bench.sent == []
+    assert bench.memory["blocked"] == 1
+
+
+def test_what_is_switched_on_has_sent_and_received_nothing() -> None:
+    """Whatever stood in its memory."""
+    bench = Bench()
+    driver, others = bench.driver, bench.memory["others"][0]
+    for name in (
+        "state",
+        "outgoing",
+        "node_events",
+        "foreign_id",
+        "signature",
+        "heartbeat_next_us",
+        "node_heartbeat_us",
+    ):
+        driver[name] = 3
+    others["frames"], others["since_us"], bench.memory["gate"][0]["known"] = 4, 5, 1
+    exchange.switch_on(bench.all)
+    assert (driver["state"], driver["outgoing"], driver["node_events"]) == (DriverState.OFF.value, 0, 0)
+    assert (driver["foreign_id"], driver["signature"], driver["node_heartbeat_us"]) == (-1, -1, 0)
+    assert driver["heartbeat_next_us"] == driver["node_deadline_us"] == NEVER_US
+    assert (others["frames"], others["since_us"], bench.memory["gate"][0]["known"]) == (0, 0, 0)
+
+
+def test_what_is_told_besides_the_number_of_frames() -> None:
+    """Whoever runs the exported controller reads these bits."""
+    assert (BLOCKED, RESTARTED, NOT_RESTARTED) == (256, 512, 1024)
 
 
 # -- before there are periods ------------------------------------------------------------------------------------------

@@ -74,6 +74,22 @@ def test_our_heartbeat_goes_out_when_it_is_due_and_there_is_room(late_us: int, u
     assert (bench.ids == [DRIVE, OURS]) == sent
 
 
+def test_outputs_that_the_gate_holds_back_do_not_go_out() -> None:
+    bench = Bench()
+    bench.memory["outputs"][0]["bits"] = 0x20
+    assert bench.finish() == BLOCKED | 2
+    assert bench.ids == [DRIVE]
+    assert bench.memory["blocked"] == 1
+
+
+@pytest.mark.parametrize("mode", [Mode.BOOT, Mode.FAULT])
+def test_where_there_are_no_outputs_our_heartbeat_has_their_room(mode: Mode) -> None:
+    bench = Bench(mode)
+    bench.driver["heartbeat_next_us"] = bench.now_us
+    bench.finish(0)
+    assert bench.ids == [DRIVE, OURS]
+
+
 @pytest.mark.parametrize(("until_us", "ids"), [(SHORT_US, [DRIVE, OUTPUT, OURS]), (SHORT_US - 1, [DRIVE, OUTPUT])])
 def test_behind_outputs_there_has_to_be_room_for_it_as_well(until_us: int, ids: list[int]) -> None:
     bench = Bench()
