@@ -26,7 +26,9 @@ from pkxyz_ctrl.can.driver_config import DriverConfig
 from pkxyz_ctrl.can.driver_rules import DriverState
 from pkxyz_ctrl.can.frame import Frame
 from pkxyz_ctrl.can.startup import table
+from pkxyz_ctrl.safety.monitors import NodeEvent
 
+NODE_EVENTS = ("HEARTBEAT_LOST", "NOT_OPERATIONAL", "REBOOTED", "EMERGENCY")
 SYNCS = 10  # from one signature to the next
 ALL: dict[str, object] = {"digital_outputs": True, "signature_syncs": SYNCS}
 OFF, ON = "23 00 14 01 0a 02 00 80", "23 00 14 01 0a 02 00 00"  # RPDO 1
@@ -185,6 +187,14 @@ def test_a_node_whose_safety_objects_were_changed_is_reset_and_then_kept_out_of_
     assert text(failed.release(10)) == [PRE_OP]
 
 
+def test_from_a_release_on_nobody_is_watched_and_nothing_heard_of_us() -> None:
+    driver = started()
+    driver.release(100)
+    assert driver.heartbeat_due(10**9) is None
+    driver.sync(10**9)
+    assert (driver.node_events, driver.state) == (0, DriverState.RELEASING)
+
+
 def test_a_release_forgets_what_the_outputs_are_to_be() -> None:
     driver = whole(Whole())
     driver.memory["output"], driver.memory["output_owed"] = 3, 4
@@ -306,3 +316,9 @@ def test_where_the_nodes_comes_at_another_time_ours_goes_out_of_its_way() -> Non
     driver.memory["heartbeat_next_us"] = 40_500
     driver.receive(heartbeat(OPERATIONAL), 20_800)
     assert driver.memory["heartbeat_next_us"][0] == 39_800
+
+
+def test_what_happened_to_the_node_is_told_in_the_bits_that_the_monitors_know() -> None:
+    bits = {name: getattr(driver_rules, name) for name in ("FOREIGN_FRAME", "SAFETY_OBJECTS")}
+    bits |= {name: getattr(driver_rules, f"NODE_{name}") for name in NODE_EVENTS}
+    assert bits == {event.name: event.value for event in NodeEvent}

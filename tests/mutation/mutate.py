@@ -59,7 +59,7 @@ TARGETS = {
     "pkxyz_ctrl.can.start_plan": _START,
     "pkxyz_ctrl.can.start_sequence": _START,
     "pkxyz_ctrl.loop.exchange": ("loop/exchange/test_exchange.py", "loop/exchange/test_room.py"),
-    "pkxyz_ctrl.loop.controller": ("loop/test_controller.py", "loop/test_overrun.py", "loop/test_flood.py"),
+    "pkxyz_ctrl.loop.controller": ("loop/exchange/test_controller_alone.py",),
     "pkxyz_ctrl.learning.store": ("learning/test_learning_store.py", "learning/test_learning.py"),
     "hil.node.drive": _NODE,
     "hil.node.amplifier": (*_NODE, "node/test_node_sdo.py"),
