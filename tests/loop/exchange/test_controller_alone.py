@@ -7,7 +7,11 @@ from scripted_node import BOOT_UP, OPERATIONAL, PRE_OPERATIONAL, ObedientServer,
 
 from pkxyz_ctrl.can.codec import ProcessCodec
 from pkxyz_ctrl.can.frame import Frame
+from pkxyz_ctrl.core.demand import PREDICTIVE
+from pkxyz_ctrl.core.linear_law import ORDER_MAX
+from pkxyz_ctrl.loop import controller as controller_module
 from pkxyz_ctrl.loop.controller import Controller, StartUpError, part
+from pkxyz_ctrl.loop.law_change import change_to
 from pkxyz_ctrl.loop.outputs import OUTPUTS
 from pkxyz_ctrl.loop.reference import standing_still
 from pkxyz_ctrl.safety.modes import Event, Mode
@@ -184,14 +188,17 @@ def test_a_frame_is_told_fresh_and_a_short_one_is_looked_at_too() -> None:
     assert rig.controller.receive(frame(EMERGENCY), 220) is False
     assert len(rig.controller.driver.emergencies) == 1
     assert rig.controller.receive(sense(), 230) is True
-    assert rig.controller.receive(frame("28a " + "00 " * 11 + "00"), 240) is True
+    for length in (9, 12):
+        assert rig.controller.receive(Frame(0x28A, bytes(length), True, True), 240) is True
 
 
 def test_our_heartbeat_goes_out_whole_behind_the_voltages() -> None:
     rig = Rig().come_up()
     rig.memory["driver"][0]["heartbeat_next_us"] = 100
+    rig.controller.receive(frame("08a 00 00 00 00 00 00 00 00"), 5)
     told = rig.tick(sense())
     assert (len(told), told[2]) == (3, OURS)
+    assert len(rig.controller.driver.emergencies) == 1, "as long as nothing starts anew"
 
 
 def test_a_fault_is_told_with_all_that_is_known_of_it_and_what_waits_is_discarded() -> None:
@@ -208,6 +215,47 @@ def test_a_fault_is_told_with_all_that_is_known_of_it_and_what_waits_is_discarde
     assert rig.discarded == [1], "behind the SYNC, before the 0 V"
     rig.tick()
     assert len(rig.controller.faults) == len(rig.discarded) == 1
+
+
+def test_a_fault_before_there_is_a_node_is_told_as_well() -> None:
+    rig = Rig()
+    assert rig.controller.mode == Mode.BOOT
+    rig.controller.release()
+    rig.controller.compute(standing_still(), 0)
+    assert rig.controller.mode == Mode.FAULT
+    assert "(OPERATOR)" in rig.controller.faults[0]
+
+
+def test_the_bytes_of_its_latest_row_can_be_looked_at() -> None:
+    rig = Rig().come_up()
+    rig.tick(sense())
+    assert bytes(rig.controller.row) == rig.controller.memory["row"].tobytes()
+
+
+def test_a_period_in_two_parts_is_the_compiled_one(monkeypatch: pytest.MonkeyPatch) -> None:
+    """A law that plans does so between them; one that does not, gives the same bits that way."""
+    found = []
+    for kind in (PREDICTIVE, int(LAW["tick"]["kind"][0])):
+        monkeypatch.setattr(controller_module, "PREDICTIVE", kind)
+        rig = Rig().come_up()
+        sent = [rig.tick(sense(number, (number, 5, 7)), overrun=number % 2) for number in range(1, 30)]
+        rig.controller.release()
+        sent.append(rig.tick())
+        found.append(
+            (sent, rig.controller.faults, rig.controller.memory["row"].tobytes(), rig.controller.outputs.tobytes())
+        )
+    assert found[0] == found[1]
+    assert len(found[0][1]) == 1
+
+
+def test_another_law_takes_over_between_two_ticks() -> None:
+    rig = Rig().come_up()
+    new = LAW.copy()
+    new["tick"]["drive"]["count_slew_max"] = 77
+    rig.controller.change_law(change_to(new, np.zeros(ORDER_MAX), adapts_alike=True))
+    assert rig.controller.law["tick"]["drive"]["count_slew_max"][0] == 77
+    assert LAW["tick"]["drive"]["count_slew_max"][0] != 77
+    assert rig.tick(sense())
 
 
 def test_a_start_anew_is_clean_and_one_that_fails_is_told() -> None:
@@ -244,10 +292,13 @@ def test_a_blocked_voltage_is_told_with_what_it_was_held_against() -> None:
     rig.controller.begin(400)
     rig.taken()
     rig.controller.memory["mode"] = Mode.TRACKING
-    rig.controller.memory["tick"]["count"][0, 0] = (20_000, 0, 0)
-    rig.controller.finish(400, 0)
-    assert "drive counts 20000, 0, 0 after 0, 0, 0: a step beyond" in rig.controller.faults[-1]
-    assert [words[:24] for words in rig.taken()] == ["30a 00 00 00 00 00 00 01"]
+    for count, t_us in ((50, 400), (20_000, 600)):
+        rig.controller.memory["tick"]["count"][0, 0] = (count, 0, 0)
+        rig.controller.finish(t_us, 0)
+        rig.controller.begin(t_us + 200)
+    assert "drive counts 20000, 0, 0 after 50, 0, 0: a step beyond" in rig.controller.faults[-1]
+    drives = [words[:24] for words in rig.taken() if words.startswith("30a")]
+    assert drives == ["30a 32 00 00 00 00 00 01", "30a 00 00 00 00 00 00 02"]
 
 
 # -- records -----------------------------------------------------------------------------------------------------------
