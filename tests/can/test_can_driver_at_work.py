@@ -244,6 +244,7 @@ def test_a_frame_for_the_outputs_that_is_not_ours_is_noticed(sent: str) -> None:
     driver = whole(Whole())
     told(driver, sent)
     assert driver.node_events == FOREIGN_FRAME
+    assert ", an RPDO 1 that this controller did not send" in driver.foreign
     plain = started()
     told(plain, sent)
     assert plain.node_events == 0
@@ -301,6 +302,12 @@ def test_ours_is_put_before_the_nodes_where_they_would_meet(due_us: int, sent_us
     driver.memory["heartbeat_next_us"], driver.memory["node_heartbeat_us"] = due_us, 0
     driver.heartbeat_sent(sent_us)
     assert driver.memory["heartbeat_next_us"][0] == next_us
+
+
+def test_how_long_ours_may_be_put_off_is_the_configurations() -> None:
+    """One that is lost is survived all the same."""
+    assert started().record["heartbeat_wait_us"][0] == 5_000
+    assert started(controller_heartbeat_timeout_ms=80).record["heartbeat_wait_us"][0] == 20_000
 
 
 def test_a_node_that_beats_every_two_milliseconds_leaves_no_room_to_keep_away() -> None:

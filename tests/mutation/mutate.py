@@ -53,7 +53,7 @@ TARGETS = {
     "pkxyz_ctrl.can.process_pdo": ("can/test_can_codec.py",),
     "pkxyz_ctrl.can.codec": ("can/test_can_codec.py",),
     "pkxyz_ctrl.can.sense_input": ("can/test_can_sense.py",),
-    "pkxyz_ctrl.can.driver": (*_DRIVER, "can/test_can_sdo.py"),
+    "pkxyz_ctrl.can.driver": (*_DRIVER, "can/test_can_start_conditions.py", "can/test_can_sdo.py"),
     "pkxyz_ctrl.can.driver_rules": (*_DRIVER, "can/test_can_start_conditions.py"),
     "pkxyz_ctrl.can.sdo": ("can/test_can_sdo.py", "can/test_can_start_plan.py", "can/test_can_start_conditions.py"),
     "pkxyz_ctrl.can.start_plan": _START,

@@ -238,6 +238,8 @@ def test_a_period_in_two_parts_is_the_compiled_one(monkeypatch: pytest.MonkeyPat
     for kind in (PREDICTIVE, int(LAW["tick"]["kind"][0])):
         monkeypatch.setattr(controller_module, "PREDICTIVE", kind)
         rig = Rig().come_up()
+        assert (rig.controller._period.__name__ == "planning") == (kind != PREDICTIVE)
+        rig.memory["outputs"][0]["bits"] = 7
         sent = [rig.tick(sense(number, (number, 5, 7)), overrun=number % 2) for number in range(1, 30)]
         rig.controller.release()
         sent.append(rig.tick())

@@ -164,7 +164,7 @@ def test_the_start_up_goes_on_by_time() -> None:
     bench = Bench(Mode.BOOT, DriverState.RESETTING)
     start = bench.driver["start"][0]
     start["deadline_us"], start["repeats_left"] = PERIOD_US, 1
-    bench.begin()
+    assert bench.begin() == 2
     assert bench.sent[:1] == [(NMT, b"\x81\x0a")]
     assert bench.ids == [NMT, SYNC]
     bench.begin()
