@@ -9,6 +9,7 @@ from crccheck.crc import Crc8Autosar
 from hypothesis import example, given, settings
 from hypothesis import strategies as st
 
+from pkxyz_ctrl.can import process_pdo
 from pkxyz_ctrl.can.codec import (
     COUNTS_MAX,
     COUNTS_MIN,
@@ -83,6 +84,17 @@ def test_literal_bytes():
     assert payload[7] == crc8_bit_by_bit(bytes.fromhex("0a03") + payload[:7]) == 0x94
 
 
+@pytest.mark.parametrize("place", [0, 1, 2])
+@pytest.mark.parametrize("count", [COUNTS_MIN, COUNTS_MAX])
+def test_each_count_goes_to_its_limits(place, count):
+    values = [0, 0, 0]
+    values[place] = count
+    for protected in (True, False):
+        assert ProcessCodec(DRIVE, protected).decode(ProcessCodec(DRIVE, protected).encode(tuple(values), 0))[:3] == (
+            *values,
+        )
+
+
 @pytest.mark.parametrize("protected", [True, False])
 @pytest.mark.parametrize("place", [0, 1, 2])
 @pytest.mark.parametrize("bad", [COUNTS_MIN - 1, COUNTS_MAX + 1, 65535, 65536, -65536, -65537, 10**9, 1.5, math.nan])
@@ -154,3 +166,23 @@ def test_scale_clamps_and_refuses_nan():
     assert [DRIVE_SCALE.counts(volt) for volt in (1e9, math.inf, -math.inf, 100.0)] == [32767, 32767, -32768, 16384]
     with pytest.raises(ValueError, match="not a number"):
         DRIVE_SCALE.counts(math.nan)
+
+
+# -- what the compiled codec reads -------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize(("protected", "length"), [(True, 8), (False, 6)])
+def test_the_record_of_a_pdo_is_one_and_nobody_changes_it(protected, length):
+    record = process_pdo.pdo_record(DRIVE, protected)
+    assert record.shape == (1,)
+    assert (record[0]["cob_id"], record[0]["length"]) == (DRIVE, length)
+    for fixed in (record["cob_id"], process_pdo._TABLE):
+        with pytest.raises(ValueError, match="read-only"):
+            fixed[0] = 1
+
+
+@pytest.mark.parametrize(("values", "counter"), PAYLOADS)
+def test_a_payload_is_a_number_of_64_bits_with_a_sign(values, counter):
+    """As the compiled gate takes it; without the compiler a number may have any size."""
+    word = process_pdo.encode(process_pdo.pdo_record(DRIVE, True), *values, counter)
+    assert int(word).to_bytes(8, "little", signed=True) == ProcessCodec(DRIVE, True).encode(values, counter)

@@ -197,6 +197,9 @@ def test_a_node_without_outputs_is_told_and_not_refused(lacking: tuple[int, int]
     assert plan.refusal == ""
     assert [words[: len(OUTPUTS_LOST)] for words in plan.lost] == [OUTPUTS_LOST]
     assert not [step for step in plan.steps if step.write], "its RPDO 1 may be for something else"
+    assert lacking[0] not in {step.index for step in plan.steps}
+    drive = written(whole(**ALL) | {lacking: None, (0x1401, 1): 0x30B}, **ALL)
+    assert drive == [(0x1401, 1, 0x8000030A), (0x1401, 1, 0x30A)], "its combs are driven all the same"
 
 
 @pytest.mark.parametrize("lacking", [(0x2020, 1), (0x1802, 1), (0x1A02, 0)])

@@ -31,10 +31,13 @@ FEW = 8  # mutants, for which it does not pay to measure the tests beforehand
 
 # The modules, and the tests that are about them. Before each come numbers that are contracts: fast, and soon imported.
 PINNED = "safety/test_safety_pinned.py"
-_GATE = tuple(f"safety/test_safety_gate{part}.py" for part in ("_reasons", "", "_traffic", "_sweep"))
-_START = tuple(
-    f"can/test_can_{part}.py" for part in ("start_plan", "start_conditions", "sdo", "driver_start", "driver")
+_GATE = (
+    "safety/test_output_frames.py",
+    *(f"safety/test_safety_gate{part}.py" for part in ("_reasons", "", "_traffic", "_sweep")),
 )
+_START_PARTS = ("start_plan", "start_conditions", "driver_at_work", "sdo", "driver_start", "driver")
+_START = tuple(f"can/test_can_{part}.py" for part in _START_PARTS)
+_DRIVER = tuple(f"can/test_can_driver{part}.py" for part in ("_conditions", "_at_work", "_start", ""))
 _NODE_PARTS = ("pdo", "conditions", "release", "sync", "nmt", "heartbeat", "emergency")
 _NODE = tuple(f"node/test_node_{part}.py" for part in _NODE_PARTS)
 TARGETS = {
@@ -50,22 +53,17 @@ TARGETS = {
     "pkxyz_ctrl.can.process_pdo": ("can/test_can_codec.py",),
     "pkxyz_ctrl.can.codec": ("can/test_can_codec.py",),
     "pkxyz_ctrl.can.sense_input": ("can/test_can_sense.py",),
-    "pkxyz_ctrl.can.driver": (
-        "can/test_can_driver.py",
-        "can/test_can_driver_start.py",
-        "can/test_can_sdo.py",
-        "loop/test_overrun.py",
-    ),
-    "pkxyz_ctrl.can.driver_rules": ("can/test_can_driver.py", "can/test_can_driver_start.py", "loop/test_overrun.py"),
+    "pkxyz_ctrl.can.driver": (*_DRIVER, "can/test_can_start_conditions.py", "can/test_can_sdo.py"),
+    "pkxyz_ctrl.can.driver_rules": (*_DRIVER, "can/test_can_start_conditions.py"),
     "pkxyz_ctrl.can.sdo": ("can/test_can_sdo.py", "can/test_can_start_plan.py", "can/test_can_start_conditions.py"),
     "pkxyz_ctrl.can.start_plan": _START,
     "pkxyz_ctrl.can.start_sequence": _START,
-    "pkxyz_ctrl.loop.exchange": ("loop/test_controller.py", "loop/test_overrun.py", "loop/test_flood.py"),
-    "pkxyz_ctrl.loop.controller": ("loop/test_controller.py", "loop/test_overrun.py", "loop/test_flood.py"),
+    "pkxyz_ctrl.loop.exchange": ("loop/exchange/test_exchange.py", "loop/exchange/test_room.py"),
+    "pkxyz_ctrl.loop.controller": ("loop/exchange/test_controller_alone.py",),
     "pkxyz_ctrl.learning.store": ("learning/test_learning_store.py", "learning/test_learning.py"),
     "hil.node.drive": _NODE,
     "hil.node.amplifier": (*_NODE, "node/test_node_sdo.py"),
-    "hil.node.rules": ("node/test_node_rules.py",),
+    "hil.node.rules": ("node/test_node_rules.py", "node/test_node_rules_at_rest.py"),
     "hil.recording.journal": ("recording/test_recording.py",),
 }
 

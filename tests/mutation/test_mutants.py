@@ -5,6 +5,7 @@ import math
 from collections.abc import Iterator
 from pathlib import Path
 
+import hypothesis
 import mutate
 import mutation_run
 import pytest
@@ -193,6 +194,30 @@ def test_tests_that_fail_without_a_mutant_are_told(tmp_path: Path, monkeypatch: 
     subject = Subject("subject", tmp_path / "subject.py", (str(tmp_path / "test_subject.py"),))
     with pytest.raises(BaselineError, match="subject"):
         list(run_mutants(subject, mutants(SUBJECT), math.inf, 1))
+
+
+def test_a_slow_example_is_no_failure(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Neither of the first run, which is traced, nor of a mutant on a busy machine, which would count as killed."""
+    slow = """
+import time
+from hypothesis import given, settings, strategies
+from subject import unused
+@settings(max_examples=1)
+@given(strategies.just(1))
+def test_slow(x):
+    time.sleep(0.25)
+    unused(x)
+"""
+    (tmp_path / "subject.py").write_text(SUBJECT)
+    (tmp_path / "test_subject.py").write_text(SUBJECT_TESTS + slow)
+    monkeypatch.syspath_prepend(tmp_path)
+    subject = Subject("subject", tmp_path / "subject.py", (str(tmp_path / "test_subject.py"),))
+    in_unused = [mutant for mutant in mutants(SUBJECT) if mutant.line == 16]
+    hypothesis.settings.load_profile("default")  # as ``mutate.py`` finds it
+    try:
+        assert [result for _, result in run_mutants(subject, in_unused, math.inf, 1)] == ["survived"]
+    finally:
+        hypothesis.settings.load_profile("same every time")
 
 
 def test_a_mutant_is_one_change() -> None:

@@ -183,6 +183,26 @@ def test_words_of_a_refused_write_name_the_object_and_what_is_permitted() -> Non
     assert told.startswith("frame 0x60A [23 44 64 01 05 00 00 00] blocked in PRE_OPERATIONAL: SDO write")
 
 
+@pytest.mark.parametrize(
+    ("data", "words"),
+    [
+        (
+            "21 17 10 00 14 00 00 00",
+            "SDO command 0x21 is neither a read nor an expedited write with its size",
+        ),
+        ("2b 17 10 00 14 00 01 00", "SDO write of 0x1017:00: the bytes behind its 2 are not empty"),
+        ("2b 11 64 01 14 00 00 00", "SDO write of 0x6411:01: not in the list of objects that may be written"),
+        ("23 17 10 00 14 00 00 00", "SDO write of 0x1017:00 (the node's heartbeat): 4 bytes instead of 2"),
+        (
+            "23 44 64 03 78 56 34 f2",
+            "SDO write of 0x6444:03 (error value of a comb): 0xF2345678 is not permitted; permitted: 0, that is 0 V",
+        ),
+    ],
+)
+def test_words_of_each_refusal_of_a_write(data: str, words: str) -> None:
+    assert (reason(of(0x60A, bytes.fromhex(data)), Mode.BOOT) or "").endswith(f"blocked in BOOT: {words}")
+
+
 @pytest.mark.parametrize("count", [-32768, -32767])
 @pytest.mark.parametrize("comb", range(3))
 def test_the_lowest_counts_are_no_small_ones(comb: int, count: int) -> None:

@@ -104,9 +104,11 @@ def test_what_the_model_may_be_off_by_grows_with_the_change_of_force_and_is_forg
             assert implausible_combs(limits[0], UNMOVED, residual_m) == 0b100
 
 
-def test_a_change_of_force_that_is_no_number_allows_nothing() -> None:
+@pytest.mark.parametrize("force_n", [math.nan, math.inf, -math.inf])
+def test_a_change_of_force_that_is_no_number_allows_nothing(force_n: float) -> None:
+    """Were it remembered, an infinite one would allow everything from then on."""
     bench = Bench(limits=only("innovation_count", 1))
-    bench.tick({"commanded_force_n": math.nan})
+    bench.tick({"commanded_force_n": force_n})
     assert bench.tick({"innovation_m": beyond(1, 0.51e-6)}) == Trip.INNOVATION_Y
 
 

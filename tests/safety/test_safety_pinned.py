@@ -12,7 +12,7 @@ from pkxyz_ctrl.safety.gate_rules import PERMITTED, FrameKind
 from pkxyz_ctrl.safety.modes import Mode
 from pkxyz_ctrl.safety.monitors import NodeEvent, SenseStatus
 from pkxyz_ctrl.safety.sdo_rules import write_refusal
-from pkxyz_ctrl.safety.trips import Trip
+from pkxyz_ctrl.safety.trips import LANDS, Trip
 
 LIMITS = GateConfig(count_max=30000, count_slew_max=500, period_us=200).record[0]["writes"]
 
@@ -57,6 +57,11 @@ def test_trip_bits() -> None:
     assert {name: trip.value for name, trip in Trip.__members__.items()} == {
         name: 1 << place for place, name in enumerate(TRIPS)
     }
+
+
+def test_after_which_trips_the_stage_is_led_down() -> None:
+    """After all others the combs go to 0 V at once."""
+    assert {trip.name for trip in Trip if trip in LANDS} == {"SATURATION", "OVERRUN", "SOLVER", "OPERATOR"}
 
 
 def test_bits_of_what_was_wrong_with_a_frame_and_a_node() -> None:
@@ -242,6 +247,7 @@ def test_limits_of_the_monitors() -> None:
     assert (limits["residual_max_m"], limits["unexplained_force_max_n"]) == (0.7e-6, 0.8e-3)
     assert (limits["force_change_max_n"], limits["force_change_share"]) == (40e-6, 0.47)
     assert limits["innovation_share_m_per_n"] == 1.5e-3
+    assert limits["saturation_slack_n"] == 50e-9
     assert limits["force_forget_share"] == pytest.approx(200e-6 / 2e-3, rel=1e-12)
     assert limits["force_trend_share"] == pytest.approx(200e-6 / 0.03, rel=1e-12)
     assert (limits["stroke_min_m"], limits["stroke_max_m"]) == (-2e-6, 27e-6)
