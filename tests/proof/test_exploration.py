@@ -23,7 +23,7 @@ from defective.kernels import (
 )
 from explore import Explored, explore
 from numpy.typing import NDArray
-from product import SHIFT, TICK
+from product import SHIFT, TICK, row_of
 from sides import ControllerSide, NodeSide
 from story import as_text, from_text, tell
 from world import Composition, World
@@ -106,13 +106,13 @@ def test_a_state_with_one_key_has_one_future(configuration: Configuration) -> No
             world.take(generator.choices(choices, weights)[0])
             rows, asked = composition.rows, composition.rows.looks[1]
             assert asked <= len(rows.asked)
-            for by, state, question, row in rows.asked[:asked].tolist():
+            for by, state, question in rows.asked[:asked].tolist():
                 if by < len(live):
                     compared += live[by].bases != rows_by[by].kept.taken[state][1]
-                    answer = live[by].go_on(question)
-                    assert (answer.to, answer.told) == (rows.to[row], rows.told[row])
-                    assert (answer.drive, answer.sync, answer.sense) == tuple(rows.further[row])
-                    assert answer.frames == tuple(rows.frames[row, : rows.sent[row]])
+                    answer, row = live[by].go_on(question), rows.answers[row_of(rows, by, state, question)]
+                    assert (answer.to, answer.told) == (row["to"], row["told"])
+                    assert (answer.drive, answer.sync, answer.sense) == (row["drive"], row["sync"], row["sense"])
+                    assert answer.frames == tuple(row["frames"][: row["sent"]])
             rows.looks[1] = 0
     assert compared > 1000
 

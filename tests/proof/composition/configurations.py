@@ -103,6 +103,7 @@ CONFIGURATIONS: Final = {
         Configuration(
             "outputs and signature", 1, levels=FEW, outputs=BITS, has_signature=True, whole_dialogue=True, by_hand=True
         ),
+        Configuration("outputs, two", 2, kinds=ANY, levels=FEW, outputs=BITS, by_hand=True),
         Configuration("outputs, two losses", 2, kinds=frozenset({"lose"}), levels=FEW, outputs=BITS, by_hand=True),
     )
 }

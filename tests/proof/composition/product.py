@@ -86,9 +86,9 @@ IN_FLIGHT: Final = 10  # words of it, which hold the frames
 
 CONTROLLER_LABEL = np.dtype(
     [
-        ("mode", "i4"), ("driver", "i4"), ("may_energise", "i4"), ("believes", "i4"), ("counts", "i4"),
-        ("choice", "i4"), ("is_landmark", "i4"), ("is_starting", "i4"), ("may_put_out", "i4"),
-        ("goes_by_signature", "i4"),
+        ("mode", "i1"), ("driver", "i1"), ("may_energise", "i1"), ("believes", "i1"), ("counts", "i2"),
+        ("choice", "i2"), ("is_landmark", "i1"), ("is_starting", "i1"), ("may_put_out", "i1"),
+        ("goes_by_signature", "i1"),
     ],
     align=True,
 )  # fmt: skip
@@ -115,27 +115,35 @@ DRIVE_COUNTED, SYNC_COUNTED, SENSE_COUNTED = 1, 2, 3
 _SYNCS: Final = 240
 
 
+SENT_MOST: Final = 7
+ANSWER = np.dtype(
+    [
+        ("key", "i8"),  # side, state and what was asked; -1: free
+        ("to", "i4"),
+        ("told", "i2"),
+        ("drive", "u1"),  # how much further its counters are
+        ("sync", "u1"),
+        ("sense", "u1"),
+        ("sent", "u1"),  # how many frames
+        ("frames", "u2", (SENT_MOST,)),
+    ],
+    align=True,
+)
+assert ANSWER.itemsize == 32  # two in a line of the cache: one miss for all that is read of it
+
+
 class Rows(NamedTuple):
     """What the sides do, as far as anybody asked, and what is known of their states and frames."""
 
-    keys: Array  # hash table: side, state and what was asked; -1 is free
-    places: NDArray[np.int32]  # row of each
-    to: NDArray[np.int32]
-    told: NDArray[np.int32]
-    further: NDArray[np.uint8]  # (n, 3) drive, SYNC and sense counters
-    sent: NDArray[np.uint8]  # how many frames
-    frames: NDArray[np.uint16]  # (n, SENT_MOST)
+    answers: NDArray[np.void]  # hash table
     controllers: NDArray[np.void]
     nodes: NDArray[np.void]
     frame_labels: NDArray[np.void]
     choices: NDArray[np.int16]  # (n, 1 + wishes)
     rules: NDArray[np.void]
     missing: Array  # (3,) side, state, asked
-    asked: Array  # (n, 4) side, state, asked, row: the last ones, where somebody looks
+    asked: Array  # (n, 3) side, state, asked: the last ones, where somebody looks
     looks: Array  # (2,) whether somebody does, and how many there were
-
-
-SENT_MOST: Final = 12
 
 
 @kernel
@@ -144,38 +152,36 @@ def key_of(side: int, state: int, asked: int) -> int:
 
 
 @kernel
-def place_of(keys: Array, key: int) -> int:
-    """Where a key stands in a hash table, or is to stand."""
-    mask = len(keys) - 1
+def place_of(answers: NDArray[np.void], key: int) -> int:
+    """Where the answer with a key stands, or is to stand."""
+    mask = len(answers) - 1
     at = (key * 0x9E3779B97F4A7C1 >> 17) & mask
-    while keys[at] != key and keys[at] != -1:
+    while answers[at]["key"] != key and answers[at]["key"] != -1:
         at = at + 1 & mask
     return at
 
 
 @kernel
-def refill(keys: Array, places: NDArray[np.int32], was: Array, were: NDArray[np.int32]) -> None:
-    """A larger hash table for the same keys."""
-    for at in range(len(was)):
-        if was[at] != -1:
-            to = place_of(keys, was[at])
-            keys[to], places[to] = was[at], were[at]
+def refill(answers: NDArray[np.void], were: NDArray[np.void]) -> None:
+    """A larger hash table for the same answers."""
+    for row in range(len(were)):
+        if were[row]["key"] != -1:
+            answers[place_of(answers, were[row]["key"])] = were[row]
 
 
 @kernel
 def row_of(r: Rows, side: int, state: int, asked: int) -> int:
-    """The row, or MISSING."""
+    """Where the answer stands, or MISSING."""
     key = key_of(side, state, asked)
-    at = place_of(r.keys, key)
-    if r.keys[at] != key:
+    at = place_of(r.answers, key)
+    if r.answers[at]["key"] != key:
         r.missing[0], r.missing[1], r.missing[2] = side, state, asked
         return MISSING
-    row = r.places[at]
     if r.looks[0] != 0:
         last = r.asked[r.looks[1] % len(r.asked)]
-        last[0], last[1], last[2], last[3] = side, state, asked, row
+        last[0], last[1], last[2] = side, state, asked
         r.looks[1] += 1
-    return row
+    return at
 
 
 # -- what the sides do --------------------------------------------------------------------------------------------
@@ -187,16 +193,17 @@ def controller_does(w: np.void, r: Rows, asked: int) -> int:
     row = row_of(r, CONTROLLER, w["controller"], asked)
     if row < 0:
         return MISSING
-    w["controller"] = r.to[row]
-    drive, sync = np.int64(r.further[row, 0]), np.int64(r.further[row, 1])
+    answer = r.answers[row]
+    w["controller"] = answer["to"]
+    drive, sync = np.int64(answer["drive"]), np.int64(answer["sync"])
     if drive != 0 or sync != 0:
         other = row_of(r, NODE, w["node"], SHIFT + drive * _SYNCS + sync)
         if other < 0:
             return MISSING
-        w["node"] = r.to[other]
+        w["node"] = r.answers[other]["to"]
         if not _shift(w, r, drive, sync, 0):
             return MISSING
-    return _said(w, r, row)
+    return _said(w, answer)
 
 
 @kernel
@@ -204,29 +211,30 @@ def node_does(w: np.void, r: Rows, asked: int) -> int:
     row = row_of(r, NODE, w["node"], asked)
     if row < 0:
         return MISSING
-    w["node"] = r.to[row]
-    sense = np.int64(r.further[row, 2])
+    answer = r.answers[row]
+    w["node"] = answer["to"]
+    sense = np.int64(answer["sense"])
     if sense != 0:
         other = row_of(r, CONTROLLER, w["controller"], SHIFT + sense)
         if other < 0:
             return MISSING
-        w["controller"] = r.to[other]
+        w["controller"] = r.answers[other]["to"]
         if not _shift(w, r, 0, 0, sense):
             return MISSING
-    return _said(w, r, row)
+    return _said(w, answer)
 
 
 @kernel
-def _said(w: np.void, r: Rows, row: int) -> int:
-    told = r.told[row]
+def _said(w: np.void, answer: np.void) -> int:
+    told = np.int64(answer["told"])
     if told < 0:
         w["violation"] = -told
         return VIOLATED
-    for place in range(r.sent[row]):
+    for place in range(answer["sent"]):
         if w["on_wire"] == WIRE_MOST:
             w["violation"] = NO_ROOM
             return VIOLATED
-        w["wire"][w["on_wire"]] = r.frames[row, place]
+        w["wire"][w["on_wire"]] = answer["frames"][place]
         w["on_wire"] += 1
     return told
 
@@ -255,7 +263,7 @@ def _shift_each(r: Rows, frames: NDArray[np.uint16], count: int, drive: int, syn
             row = row_of(r, FRAMES, frames[place], further)
             if row < 0:
                 return False
-            frames[place] = r.to[row]
+            frames[place] = r.answers[row]["to"]
     return True
 
 

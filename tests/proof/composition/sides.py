@@ -135,6 +135,7 @@ class ControllerSide:
         self.live.driver.sense.record["syncs_uncountable"] = 4
         self.labels: list[tuple[int, ...]] = []
         self.kept = Kept()
+        self._choices: dict[tuple[int, DriverState], int] = {}  # all that `wishes_of` goes by
         self._references = {counts: reference_for(law, counts) for counts in (*LEVELS, *TOO_FAR)}
         self._known, self._configuration = known, configuration
         self._room_us = bus.can.short_frame_us if configuration.has_room else 0
@@ -271,12 +272,15 @@ class ControllerSide:
         live = self.live
         gate: Any = live.gate.memory[0]
         state, may_energise = live.driver.state, bool(MAY_ENERGISE[live.mode])
-        wishes = tuple(self._known.wishes.number(wish[1:]) for wish in wishes_of(live, self._configuration))
+        choice = self._choices.get((live.mode, state))
+        if choice is None:
+            wishes = tuple(self._known.wishes.number(wish[1:]) for wish in wishes_of(live, self._configuration))
+            choice = self._choices[live.mode, state] = self._known.choices.number(wishes)
         return (
             int(live.mode), state.value, may_energise,
             bool(gate["known"]) and not gate["latched"] and may_energise,
             self._known.counts.number(tuple(gate["count"].tolist())),
-            self._known.choices.number(wishes),
+            choice,
             live.driver.memory["start"]["position"][0, 0] % 6 == 0,
             live.mode < Mode.IDLE and state not in (DriverState.FAILED, DriverState.OFF),
             may_put_out(live.mode), self._goes_by_signature,

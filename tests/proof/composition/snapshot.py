@@ -117,8 +117,18 @@ def _is_constant(kind: str, name: str, value: object) -> bool:
     return callable(value) or _is_ours(value) or isinstance(value, np.ndarray | memoryview)
 
 
-def _rule(kind: str, name: str, x: str) -> str | None:
-    """The expression by which an attribute, that the expression ``x`` reads, enters the key; None: not at all."""
+def _same(copies: dict[int, Any], at: int, held: Any) -> Any:
+    """A copy of what is held: the last one, if that is still alike, so that states share it."""
+    last = copies.get(at)
+    if last != held or type(last) is not type(held):
+        last = copies[at] = held.copy()
+    return last
+
+
+def _rule(kind: str, name: str, x: str, other: str = "{x} if type({x}) in _PLAIN else plain({x})") -> str | None:
+    """The expression by which an attribute, that the expression ``x`` reads, enters the key; None: not at all.
+    ``other``: where no table names it.
+    """
     place = kind, name
     if place in UNREAD or place in SENT_COUNTERS:
         return None
@@ -134,7 +144,7 @@ def _rule(kind: str, name: str, x: str) -> str | None:
     if is_instant and place not in RULES:
         past = -LONG_US if place in AGES else -1
         return f"{x} if {x} is None or {x} > {_NEVER_US} else {x} - now_us if {x} - now_us > {past} else {past}"
-    return RULES.get(place, RULES.get(("", name), "{x} if type({x}) in _PLAIN else plain({x})")).format(x=x)
+    return RULES.get(place, RULES.get(("", name), other)).format(x=x)
 
 
 RULES = {
@@ -166,9 +176,9 @@ def plain(v: Any) -> Any:
     if isinstance(v, Enum):
         return v.value
     if isinstance(v, tuple | list | deque):
-        return tuple(map(plain, v))
+        return tuple([x if type(x) in _PLAIN else plain(x) for x in v])
     if isinstance(v, set | frozenset):
-        return tuple(sorted(map(plain, v)))
+        return tuple(sorted(map(plain, v))) if v else ()
     if isinstance(v, dict):
         return tuple(sorted((plain(k), plain(x)) for k, x in v.items()))
     if callable(v):
@@ -199,7 +209,7 @@ class Snapshot:
         objects = {id(o): o for o, _, _ in attributes}
         called = {key: f"o{n}" for n, key in enumerate(objects)}
         space: dict[str, Any] = {called[key]: o for key, o in objects.items()} | names
-        space |= {"plain": plain, "_PLAIN": _PLAIN}
+        space |= {"plain": plain, "_PLAIN": _PLAIN, "same": _same, "c": dict[int, Any]()}
         reads, writes, unpacks, keys = [], [], [], []
         for n, (o, kind, name) in enumerate(attributes):
             held, place = getattr(o, name), f"{called[id(o)]}.{name}"
@@ -207,13 +217,16 @@ class Snapshot:
                 fields, layout = _layout_of(held.dtype)
                 space |= {f"b{n}": held.view(np.uint8).data, f"u{n}": struct.Struct(layout).unpack}
                 unpacks.append(f"    f{n} = u{n}(b{n})\n")
-                rules = (_rule(kind, f"{name}.{field}", f"f{n}[{k}]") for k, field in enumerate(fields))
+                rules = (_rule(kind, f"{name}.{field}", f"f{n}[{k}]", "{x}") for k, field in enumerate(fields))
                 keys += [f"({rule})" for rule in rules if rule is not None]
                 continue
-            copies = type(held) in _MUTABLE
-            maybe = f" if {place} is not None else None" if held is None else ""
-            writes.append(f"    {place} = s[{len(reads)}]{'.copy()' if copies else ''}")
-            reads.append(f"{place}.copy(){maybe}" if copies else place)
+            at = len(reads)
+            if type(held) in _MUTABLE:
+                writes.append(f"    c[{at}] = s[{at}]; {place} = s[{at}].copy()")
+                reads.append(f"same(c, {at}, {place})")
+            else:
+                writes.append(f"    {place} = s[{at}]")
+                reads.append(place)
             rule = _rule(kind, name, f"s{n}")
             if rule is not None:
                 unpacks.append(f"    s{n} = {place}\n")

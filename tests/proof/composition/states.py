@@ -59,6 +59,10 @@ class ControllerState:
         self._cycle = controller.memory.view(np.uint8)
         self._named = np.flatnonzero(_mask_of(controller.memory.dtype))
         self._start, self._asked = controller.driver.memory["start"][0], controller.exchange[list(_ASKED)]
+        self._start_bytes, always = self._start.view(np.uint8), np.zeros(self._start.itemsize, np.uint8)
+        for name in _START_ALWAYS:
+            _fill(always, self._start.dtype, (name,))
+        self._always = np.flatnonzero(always)
 
     def take(self) -> tuple[Any, ...]:
         other = np.flatnonzero(self._words != self._first).astype(np.uint16)
@@ -79,6 +83,7 @@ class ControllerState:
             int(self._controller.outputs["bits"][0]),  # asked for, and not sent yet
             _start_up(self._start[0], driver.state, bases.now_us),
             min(int(record["safe_cycles"]), self._safe_cycles),
+            self._start_bytes[self._always].tobytes(),
             self._cycle[self._named].tobytes(),
         )
         return hashlib.blake2b(marshal.dumps(parts, 2), digest_size=16).digest()
@@ -99,10 +104,12 @@ class NodeState:
         return self._snapshot.take(), self._dictionary
 
     def put(self, taken: tuple[Any, ...]) -> None:
+        there = self._dictionary  # since `key`, which is the last thing that happens in each state
         attributes, self._dictionary = taken
         self._snapshot.put(attributes)
-        for entry, value in zip(self._entries, self._dictionary[0], strict=True):
-            entry.value = value
+        if self._dictionary[0] is not there[0]:
+            for entry, value in zip(self._entries, self._dictionary[0], strict=True):
+                entry.value = value
 
     def key(self, bases: Bases, counts: tuple[int, int, int]) -> Key:
         """``counts``: what the converters have."""
@@ -115,7 +122,7 @@ class NodeState:
 
 
 def _start_up(record: np.void, state: DriverState, now_us: int) -> Any:
-    told = [record[name].tobytes() for name in _START_ALWAYS]
+    told: list[Any] = []
     if state in _IN_DIALOGUE:
         told += [record[name].tobytes() for name in _START_IN_DIALOGUE]
         told += [record[name][: record["steps"]].tobytes() for name in ("row", "act")]

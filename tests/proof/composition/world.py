@@ -15,6 +15,7 @@ So ticks with and without a heartbeat, with and without a signature to be waited
 other in all orders; between two of a kind driver and node only count.
 """
 
+from struct import Struct
 from typing import Any, Final
 
 import numpy as np
@@ -45,6 +46,7 @@ from states import Bases
 
 from pkxyz_ctrl.can.codec import Counts
 from pkxyz_ctrl.can.driver_rules import DriverState
+from pkxyz_ctrl.compiled.direct_call import direct
 from pkxyz_ctrl.safety.modes import Event, Mode
 
 _COUNTED: Final = {DRIVE: product.DRIVE_COUNTED, SYNC: product.SYNC_COUNTED, SENSE: product.SENSE_COUNTED}
@@ -53,6 +55,8 @@ _NAMES: Final = (
     "deliver", "late", "repeat", "damage", "lose", "vanish", "go", "skip", "cut", "mend", "release", "tick",
 )  # fmt: skip
 _MUCH: Final = 1 << 16
+_ANSWER: Final = Struct("<qihBBBB7H")  # of `product.ANSWER`
+_NO_FRAMES: Final = (0,) * product.SENT_MOST
 _ZERO: Final = Bases()
 
 
@@ -66,16 +70,14 @@ class Composition:
         self._on_wire: set[int] = set()  # frames that are sent, and not only made by damage
         self._labelled = {"frames": 0, "controllers": 0, "nodes": 0, "choices": 0}
         self.asked = 0
-        n = _MUCH
         self.rows = Rows(
-            keys=np.full(4 * n, -1, np.int64), places=np.zeros(4 * n, np.int32),
-            to=np.zeros(n, np.int32), told=np.zeros(n, np.int32), further=np.zeros((n, 3), np.uint8),
-            sent=np.zeros(n, np.uint8), frames=np.zeros((n, product.SENT_MOST), np.uint16),
-            controllers=np.zeros(n, product.CONTROLLER_LABEL), nodes=np.zeros(n, product.NODE_LABEL),
-            frame_labels=np.zeros(n, product.FRAME_LABEL), choices=np.zeros((256, 1 + product.OPTIONS_MOST), np.int16),
-            rules=self._rules(), missing=np.zeros(3, np.int64), asked=np.zeros((1 << 12, 4), np.int64),
-            looks=np.zeros(2, np.int64),
+            answers=_free_answers(_MUCH),
+            controllers=np.zeros(_MUCH, product.CONTROLLER_LABEL), nodes=np.zeros(_MUCH, product.NODE_LABEL),
+            frame_labels=np.zeros(_MUCH, product.FRAME_LABEL),
+            choices=np.zeros((256, 1 + product.OPTIONS_MOST), np.int16), rules=self._rules(),
+            missing=np.zeros(3, np.int64), asked=np.zeros((1 << 12, 3), np.int64), looks=np.zeros(2, np.int64),
         )  # fmt: skip
+        self._place_of = direct(product.place_of, self.rows.answers, 0)
         self._note(self.controller.first)
         self._note(self.node.first)
 
@@ -104,17 +106,14 @@ class Composition:
         """Ask for what was missing."""
         side, state, asked = map(int, self.rows.missing)
         answer = (self.controller.answer, self.node.answer, self._shifted)[side](state, asked)
-        if self.asked + 1 >= len(self.rows.to):
-            self._grow()
-        rows, row = self.rows, self.asked
+        self._make_room()
         self.asked += 1
-        rows.to[row], rows.told[row] = answer.to, answer.told
-        rows.further[row] = answer.drive, answer.sync, answer.sense
-        rows.sent[row] = len(answer.frames)
-        rows.frames[row, : len(answer.frames)] = answer.frames
         key = product.key_of(side, state, asked)
-        at = product.place_of(rows.keys, key)
-        rows.keys[at], rows.places[at] = key, row
+        at, frames = self._place_of(self.rows.answers, key), answer.frames
+        _ANSWER.pack_into(
+            self.rows.answers.data.cast("B"), at * _ANSWER.size, key, answer.to, answer.told,
+            answer.drive, answer.sync, answer.sense, len(frames), *frames, *_NO_FRAMES[len(frames) :],
+        )  # fmt: skip
         self._note(answer)
 
     def _shifted(self, number: int, further: int) -> Answer:
@@ -160,17 +159,23 @@ class Composition:
         labels["frames"], labels["choices"] = len(frames), len(known.choices.things)
         assert len(frames) < product.DIALOGUE
 
-    def _grow(self) -> None:
-        """Twice the room."""
-        was = self.rows
-        longer = {
-            name: np.concatenate((held, np.zeros_like(held)))
-            for name, held in was._asdict().items()
-            if name in ("to", "told", "further", "sent", "frames", "controllers", "nodes")
-        }
-        keys, places = np.full(2 * len(was.keys), -1, np.int64), np.zeros(2 * len(was.keys), np.int32)
-        product.refill(keys, places, was.keys, was.places)
-        self.rows = was._replace(keys=keys, places=places, **longer)
+    def _make_room(self) -> None:
+        """Half of the hash table stays free."""
+        rows = self.rows
+        if 2 * self.asked >= len(rows.answers):
+            answers = _free_answers(2 * len(rows.answers))
+            product.refill(answers, rows.answers)
+            self.rows = rows = rows._replace(answers=answers)
+        for name, side in (("controllers", self.controller), ("nodes", self.node)):
+            held = getattr(rows, name)
+            if side.kept.count >= len(held):
+                self.rows = rows = rows._replace(**{name: np.concatenate((held, np.zeros_like(held)))})
+
+
+def _free_answers(count: int) -> np.ndarray[Any, Any]:
+    answers = np.zeros(count, product.ANSWER)
+    answers["key"] = -1
+    return answers
 
 
 class World:
