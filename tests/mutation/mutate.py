@@ -61,8 +61,8 @@ TARGETS = {
     "pkxyz_ctrl.loop.exchange": ("loop/exchange/test_exchange.py", "loop/exchange/test_room.py"),
     "pkxyz_ctrl.loop.controller": ("loop/exchange/test_controller_alone.py",),
     "pkxyz_ctrl.learning.store": ("learning/test_learning_store.py", "learning/test_learning.py"),
-    "hil.node.drive": _NODE,
-    "hil.node.amplifier": (*_NODE, "node/test_node_sdo.py"),
+    "hil.node.drive": (*_NODE, "node/test_node_rules.py"),
+    "hil.node.amplifier": ("node/test_node_outputs.py", *_NODE, "node/test_node_sdo.py"),
     "hil.node.rules": ("node/test_node_rules.py", "node/test_node_rules_at_rest.py"),
     "hil.recording.journal": ("recording/test_recording.py",),
 }

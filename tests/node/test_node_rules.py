@@ -259,6 +259,12 @@ def test_who_does_something_else_than_its_daily_work_is_left_to_itself() -> None
     twin = Twin()
     twin.rigs[0].node._drive.counter = None
     assert not twin.work.take()
+    rig = Rig()
+    assert rig.write(0x1401, 2, 240, 1) == 0  # at each SYNC, as well
+    rig.start()
+    rig.cycle((0, 0, 0))
+    rig.cycle((0, 0, 0))
+    assert rig.node._drive.is_usual is True
     for index, subindex, value, size in ((0x1401, 2, 255, 1), (0x1601, 1, 0x64110310, 4)):
         rig = Rig()
         assert rig.write(0x1401, 1, 0x80000000 | DRIVE, 4) == 0

@@ -4,7 +4,7 @@ import pytest
 from gate_frames import CONFIG, drive, holding, nmt, sdo_write, sync
 
 from pkxyz_ctrl.can.frame import Frame
-from pkxyz_ctrl.safety import gate_rules
+from pkxyz_ctrl.safety import gate_rules, sdo_rules
 from pkxyz_ctrl.safety.gate import TransmitGate, _words
 from pkxyz_ctrl.safety.gate_rules import FrameKind, Reason
 from pkxyz_ctrl.safety.modes import Mode
@@ -229,6 +229,8 @@ def test_nobody_changes_the_limits_of_a_gate() -> None:
         gate.record["count_max"] = 32767
     with pytest.raises(ValueError, match="read-only"):
         gate_rules._ROWS[0] = 0
+    with pytest.raises(ValueError, match="read-only"):
+        sdo_rules._RULES["low"][0] = 0
     assert gate.config is CONFIG
 
 
