@@ -281,6 +281,14 @@ def test_before_it_is_started_a_driver_is_silent_and_watches_nobody() -> None:
     assert (driver.node_events, driver.state) == (0, DriverState.OFF)
 
 
+def test_what_is_switched_on_has_nothing_to_send_and_heard_of_nobody() -> None:
+    driver = whole(Whole())
+    driver.memory["outgoing"], driver.memory["node_heartbeat_us"] = 3, 4
+    driver_rules.switch_on(driver.memory)
+    assert (driver.memory["outgoing"][0], driver.memory["node_heartbeat_us"][0]) == (0, 0)
+    assert driver.state is DriverState.OFF
+
+
 # -- where heartbeats would meet ---------------------------------------------------------------------------------------
 
 

@@ -56,6 +56,56 @@ def test_outputs_are_written_by_sdo_while_operational_and_not_before() -> None:
     assert rig.node.digital.bits == 6
 
 
+def with_outputs() -> Rig:
+    """At work, its RPDO 1 in use, 5 at the terminals."""
+    rig = Rig()
+    for cob_id in (0x8000_0000 | OUTPUT, OUTPUT):
+        assert rig.write(0x1400, 1, cob_id, 4) == 0
+    rig.start()
+    rig.give(OUTPUT, b"\5")
+    assert rig.node.digital.bits == 0
+    rig.sync()
+    assert rig.node.digital.bits == 5
+    return rig
+
+
+def test_outputs_that_came_are_put_out_at_the_sync_while_operational() -> None:
+    rig = with_outputs()
+    rig.nmt(128)
+    assert rig.node.digital.bits == 0, "their error value"
+    rig.give(OUTPUT, b"\7")
+    rig.start()
+    rig.sync()
+    assert rig.node.digital.bits == 0
+
+
+def test_a_fault_takes_the_outputs_to_their_error_value() -> None:
+    rig = with_outputs()
+    rig.node.amplifier_fault(0x2310)
+    assert rig.node.digital.bits == 0
+
+
+def test_outside_of_operational_no_drive_frame_is_missed() -> None:
+    rig = Rig()
+    rig.energise()
+    rig.nmt(128)
+    rig.forget()
+    rig.run(100_000)
+    assert emergencies(rig) == []
+
+
+def test_a_reset_forgets_what_was_wrong_with_a_drive_frame() -> None:
+    rig = operational()
+    rig.give(DRIVE, bytes(8))
+    assert emergencies(rig) != []
+    rig.nmt(129)
+    rig.run(10_000)
+    rig.forget()
+    rig.start()
+    rig.give(DRIVE, bytes(8))
+    assert emergencies(rig) != [], "it is a new one"
+
+
 def test_the_history_of_errors_is_cleared_by_writing_0() -> None:
     rig = operational()
     rig.give(SYNC, b"\1\2\3")

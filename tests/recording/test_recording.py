@@ -17,6 +17,7 @@ import pytest
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
+from hil.recording.journal import JournalReader, JournalWriter
 from hil.recording.recording import COLUMNS, Recording, RecordingError, RecordingWriter, journal_of, recover
 from pkxyz_ctrl.loop.row import ROW, columns
 
@@ -132,6 +133,22 @@ def test_one_bit_of_a_page_is_noticed(tmp_path, column):
     for read in (lambda: recording[column], lambda: list(recording.blocks([field]))):
         with pytest.raises(RecordingError, match=r"r\.parquet: is damaged: .*(checksum|CRC)"):
             read()
+
+
+def test_a_journal_counts_the_rows_that_the_system_has(tmp_path):
+    writer = JournalWriter(tmp_path / "r.journal", {"seed": 1})
+    assert writer.ticks == 0
+    for count in (1, 2, 700):
+        before = writer.ticks
+        writer.append(random_rows(count))
+        assert writer.ticks == before + count
+    writer.close()
+    with pytest.raises(ValueError, match="closed"):
+        writer.append(random_rows(1))
+    reader = JournalReader(tmp_path / "r.journal")
+    assert (reader.ticks, reader.metadata) == (703, {"seed": 1})
+    assert reader.rows(1, 3).tobytes() == random_rows(2).tobytes()
+    assert len(reader.rows(700, 9_999)) == 3
 
 
 @pytest.fixture(scope="module")
