@@ -14,13 +14,16 @@ from pathlib import Path
 
 import numpy as np
 
-from hil.api.design import design
 from hil.bench.rigs.figure import Figure
 from hil.bench.rigs.running import running
+from hil.lanes.setup import bare_setup
 from hil.operate.memory import StageMemory
 from hil.operate.setpoints import rows_of
 from pkxyz_ctrl.client import place
 from pkxyz_ctrl.client.stage import AsyncStage, connect_async
+from pkxyz_ctrl.config.bus import BusConfig
+from pkxyz_ctrl.config.controller import ControllerConfig
+from pkxyz_ctrl.config.files import load
 
 CLIENTS, LOOKS_S, REPEATS = 8, 6.0, 3
 FIELDS = ("reference_m", "estimate_m", "voltage_v", "disturbance_n")
@@ -79,7 +82,9 @@ async def _first_set_points(stage: AsyncStage) -> list[int]:
     """
     described = place.read(_NAME, "loop")
     assert described is not None
-    law = design(described["controller"], stage=described["stage"], bus=described["bus"]).record
+    controller = load("controllers", described["controller"], ControllerConfig)
+    bus = load("buses", described["bus"], BusConfig)
+    law = bare_setup(described["stage"], "nominal", controller, bus, seed=1, autostart=False).law
     seen_rows = rows_of(law)[0] + 2
     ticks = StageMemory(Path(described["memory"])).reader("ticks")
     if stage.status.activity == "fault":  # ticks that were late while nothing was driven
