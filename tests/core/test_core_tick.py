@@ -17,7 +17,7 @@ def exact(strokes_m):
 
 def after_a_step(strokes_m, start_m):
     position = start_m.copy()
-    size = kinematics.newton_step(stage().geometry[0], strokes_m, position)
+    size = kinematics.newton_step(stage().geometry[0], strokes_m, position, np.empty(3))
     return position, size
 
 
@@ -44,12 +44,21 @@ def test_a_micrometre_of_prediction_error_leaves_nanometres_and_30_nm_less_than_
         assert size == pytest.approx(np.abs(direction).max() * distance, rel=1e-2, abs=1e-20)
 
 
+@settings(max_examples=100)
+@given(STROKES, STROKES)
+def test_a_newton_step_says_how_far_the_strokes_were_off(strokes_m, other_m):
+    residual, position = np.empty(3), exact(other_m)
+    expected = strokes_m - stage().inverse_kinematics(position)
+    kinematics.newton_step(stage().geometry[0], strokes_m, position, residual)
+    assert np.array_equal(residual, expected)
+
+
 def test_where_the_jacobian_is_singular_nothing_moves():
     """Links that lie in the plane have no say over z."""
     geometry = stage().geometry.copy()[0]
     flat = np.array([1e-6, 2e-6, -geometry["height_rest_m"]])
     start = flat.copy()
-    assert kinematics.newton_step(geometry, np.full(3, 5e-6), start) == np.inf
+    assert kinematics.newton_step(geometry, np.full(3, 5e-6), start, np.empty(3)) == np.inf
     assert np.array_equal(start, flat)
 
 
