@@ -9,14 +9,16 @@ _FIXED_WHILE_OPERATIONAL = frozenset(
     (0x1005, 0x1014, 0x1015, 0x1016, 0x1019, 0x1029, 0x2010, 0x2011, 0x2012, 0x6443, 0x6444)
 )
 """What keeps the combs safe and the controller informed; with them the parameters of both PDOs."""
+LOOKED_UP = frozenset((0x1003, 0x2000, 0x2001, 0x2020, 0x6401, 0x6411))
+"""What is not simply there when it is asked for; whoever answers in the node's place leaves these to it."""
 
 
 class NodeObjects:
     """Stands between the SDO server and the dictionary.
 
-    ``refresh(index)`` is called before a value is touched, ``changed(index)`` after one was written; ``may_drive()``
-    tells whether a drive count other than 0 may be set by SDO, ``is_operational()`` whether what the combs' safety
-    rests on is fixed: then nobody, whoever it is on the bus, changes it.
+    ``refresh(index)`` is called before a value of ``LOOKED_UP`` is touched, ``changed(index)`` after one was written;
+    ``may_drive()`` tells whether a drive count other than 0 may be set by SDO, ``is_operational()`` whether what the
+    combs' safety rests on is fixed: then nobody, whoever it is on the bus, changes it.
     """
 
     def __init__(
@@ -39,7 +41,7 @@ class NodeObjects:
     def read(self, index: int, subindex: int) -> bytes:
         entry = self._od.entry(index, subindex)
         entry.check_readable()
-        self._refresh(index)
+        self._look_up(index)
         if index == 0x1003 and subindex > self._count(index):
             raise SdoAbortError(Abort.NO_DATA)  # CiA 301, 7.5.2, object 1003h: there is no such error
         return entry.encode()
@@ -65,9 +67,13 @@ class NodeObjects:
         value = entry.decode(data)
         if isinstance(value, int):
             self._check(entry, value)
-        self._refresh(index)  # of an array only one element is written
+        self._look_up(index)  # of an array only one element is written
         entry.value = value
         self._changed(index)
+
+    def _look_up(self, index: int) -> None:
+        if index in LOOKED_UP:
+            self._refresh(index)
 
     def _check(self, entry: Entry, value: int) -> None:
         index, subindex = entry.index, entry.subindex

@@ -16,8 +16,6 @@ _STEP_MOST_M = 2e-6
 class PathStream:
     """A ``setpoints.Source`` of ``rows`` rows. ``objection``: why what came can't be followed, once something can't."""
 
-    has_outputs = True
-
     def __init__(self, number: int, rows: int, start_m: Array, reach: Reach) -> None:
         self.number = number
         self.rows = max(0, rows - 1)

@@ -35,8 +35,6 @@ class Source(Protocol):
     """Where a set-point goes by itself, in rows since its own start, at rest in the first and from the last on."""
 
     rows: int
-    has_outputs: bool
-    """Whether any row may raise a trigger."""
 
     def sample(self, first: int, count: int) -> Array:
         """(count, 9) from row ``first`` on; before 0 and past the end as these."""
@@ -46,15 +44,15 @@ class Source(Protocol):
         """Whether all rows up to this one can be sampled."""
         ...
 
-    def outputs(self, rows: NDArray[np.int64]) -> NDArray[np.int64]:
-        """Trigger bits (n,) of rows (n,)."""
+    def outputs(self, rows: NDArray[np.int64]) -> NDArray[np.int64] | None:
+        """Trigger bits (n,) of rows (n,); None where there never are any."""
         ...
 
 
 class Standing:
     """At rest at a position (3,)."""
 
-    rows, has_outputs = 0, False
+    rows = 0
 
     def __init__(self, position_m: Array) -> None:
         self._row = np.concatenate([position_m, np.zeros(6)])
@@ -65,14 +63,12 @@ class Standing:
     def has(self, row: int) -> bool:
         return True
 
-    def outputs(self, rows: NDArray[np.int64]) -> NDArray[np.int64]:
-        return np.zeros(len(rows), np.int64)
+    def outputs(self, rows: NDArray[np.int64]) -> None:
+        return None
 
 
 class Going:
     """A motion that was planned in flight."""
-
-    has_outputs = False
 
     def __init__(self, motion: InFlight, period_s: float) -> None:
         self._motion = motion
@@ -85,8 +81,8 @@ class Going:
     def has(self, row: int) -> bool:
         return True
 
-    def outputs(self, rows: NDArray[np.int64]) -> NDArray[np.int64]:
-        return np.zeros(len(rows), np.int64)
+    def outputs(self, rows: NDArray[np.int64]) -> None:
+        return None
 
 
 class Setpoints:
@@ -261,8 +257,8 @@ class Setpoints:
     def _sample(self, count: int) -> None:
         first, at = self._filled, self._filled - self._base
         write_rows(self._rows[at : at + count], self._motion(first, count), first)
-        if self._source.has_outputs:
-            self._rows["output"][at : at + count] = self._source.outputs(self._feed.nearest(first, count))
+        if (outputs := self._source.outputs(self._feed.nearest(first, count))) is not None:
+            self._rows["output"][at : at + count] = outputs
         self._filled = first + count
 
     def _motion(self, first: int, count: int) -> Array:

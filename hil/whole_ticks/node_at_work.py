@@ -4,12 +4,11 @@ import numpy as np
 
 from hil.node.amplifier import AmplifierNode, NmtState
 from hil.node.object_dictionary import Value
+from hil.node.objects import LOOKED_UP
 from hil.node.rules import NEVER_US, NODE, NODE_MEMORY, OBJECTS_MOST, UNKNOWN, crc_start
 from hil.node.sdo_server import SdoServer
 
 _WATCHED_MOST = 1
-_LOOKED_UP = frozenset((0x1003, 0x2000, 0x2001, 0x2020, 0x6401, 0x6411))
-"""Objects whose values the node brings up to date when they are asked for."""
 _SHORT, _SHORT_REPLY = 0xE2, 0x42  # of a reply's command: a value of four bytes at most
 
 
@@ -19,7 +18,7 @@ class NodeAtWork:
     def __init__(self, node: AmplifierNode) -> None:
         self.node = node
         self.record, self.memory = np.zeros(1, NODE), np.zeros(1, NODE_MEMORY)
-        self._entries = [e for e in node.od if e.index not in _LOOKED_UP][:OBJECTS_MOST]
+        self._entries = [e for e in node.od if e.index not in LOOKED_UP][:OBJECTS_MOST]
         self._seen: list[Value | None] = [None] * len(self._entries)  # the values that ``record`` answers with
         self.record["objects_count"] = len(self._entries)
         self.record["request_id"], self.record["reply_id"] = 0x600 + node.node_id, 0x580 + node.node_id

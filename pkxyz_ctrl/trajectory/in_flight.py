@@ -11,7 +11,7 @@ import numpy as np
 import ruckig
 from numba import njit
 
-from pkxyz_ctrl.trajectory.motion import Array, TrajectoryError, at_rest
+from pkxyz_ctrl.trajectory.motion import Array, TrajectoryError
 from pkxyz_ctrl.trajectory.segments import Limits
 
 _NEAREST_M = 1e-12
@@ -22,7 +22,7 @@ _PLANNERS = {axes: ruckig.Ruckig(axes) for axes in (1, 3)}  # keep nothing from 
 
 
 class InFlight:
-    """A ``Motion`` as ruckig planned it: it begins in a state, moving or not, and ends at rest."""
+    """A motion as ruckig planned it: it begins in a state, moving or not, and ends at rest."""
 
     def __init__(self, planned: ruckig.Trajectory, start_m: Array, spans_m: list[float], time_s: float) -> None:
         """``planned`` from the origin, in units of ``spans_m`` of each axis and of a time; of three axes, or of one
@@ -35,18 +35,10 @@ class InFlight:
         self.end_m = self._pieces[:, -1, 1].copy()
         """(3,), where it comes to rest"""
 
-    def end(self) -> Array:
-        """At rest."""
-        return at_rest(self.end_m)
-
-    def sample(self, t_s: Array) -> Array:
-        """(n, 9) at instants (n,); past the end it stands."""
-        out = np.empty((len(t_s), 9))
-        _sample(self._pieces, self.total_s, t_s, out)
-        return out
-
     def rows(self, first: int, step: int, count: int, period_s: float) -> Array:
-        """(count, 9) of the rows ``first``, ``first + step``, ..., which are a period apart; before 0 it stands."""
+        """(count, 9) of the rows ``first``, ``first + step``, ..., which are a period apart; before 0 and past the end
+        it stands.
+        """
         out = np.empty((count, 9))
         _rows(self._pieces, self.total_s, first, step, period_s, out)
         return out
@@ -69,7 +61,7 @@ def _pieces_of(axis: ruckig.Profile) -> list[tuple[float, float, float, float, f
 
 
 @njit(cache=True)
-def _at(pieces: Array, total_s: float, t_s: float, row: Array) -> None:
+def sample(pieces: Array, total_s: float, t_s: float, row: Array) -> None:
     """A row (9,) at an instant of pieces (3, ``_PIECES``, 5)."""
     for axis in range(3):
         last = 0
@@ -84,15 +76,9 @@ def _at(pieces: Array, total_s: float, t_s: float, row: Array) -> None:
 
 
 @njit(cache=True)
-def _sample(pieces: Array, total_s: float, t_s: Array, out: Array) -> None:
-    for n in range(len(out)):
-        _at(pieces, total_s, t_s[n], out[n])
-
-
-@njit(cache=True)
 def _rows(pieces: Array, total_s: float, first: int, step: int, period_s: float, out: Array) -> None:
     for n in range(len(out)):
-        _at(pieces, total_s, max(first + n * step, 0) * period_s, out[n])
+        sample(pieces, total_s, max(first + n * step, 0) * period_s, out[n])
 
 
 def towards(state: Array, target_m: Array, limits: Limits) -> InFlight:

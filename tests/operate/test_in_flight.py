@@ -21,8 +21,15 @@ def three(most: float) -> st.SearchStrategy[tuple[float, float, float]]:
 states = st.tuples(three(10e-6), three(0.4e-3), three(0.1)).map(np.array)
 
 
+def at(motion, t_s):
+    rows = np.empty((len(t_s), 9))
+    for t, row in zip(t_s, rows, strict=True):
+        in_flight.sample(motion._pieces, motion.total_s, t, row)
+    return rows
+
+
 def sampled(motion):
-    return motion.sample(np.append(np.arange(0, motion.total_s, PERIOD_S), motion.total_s))
+    return at(motion, np.append(np.arange(0, motion.total_s, PERIOD_S), motion.total_s))
 
 
 @settings(max_examples=80)
@@ -33,7 +40,7 @@ def test_a_new_target_is_reached_from_any_state_inside_the_limits(state, target)
     assert np.allclose(rows[0].reshape(3, 3), state, rtol=1e-9, atol=[[1e-15], [1e-12], [1e-8]])
     assert np.allclose(rows[-1, 0:3], target, atol=2e-13, rtol=0)
     assert (rows[-1, 3:] == 0).all()
-    assert np.array_equal(motion.end(), [target, np.zeros(3), np.zeros(3)])
+    assert np.array_equal(motion.end_m, target)
     assert np.abs(rows[:, 3:6]).max() <= LIMITS.velocity_m_per_s * (1 + 1e-6)
     assert np.abs(rows[:, 6:9]).max() <= LIMITS.acceleration_m_per_s2 * (1 + 1e-6)
     jerk = np.abs(np.diff(rows[:-1, 6:9], axis=0)) / PERIOD_S
@@ -48,7 +55,7 @@ def test_a_stop_comes_to_rest_and_stays(state):
     last = LIMITS.jerk_m_per_s3 * PERIOD_S**2 / 2  # a step before the end
     assert np.allclose(rows[-2:, 3:6], 0, atol=last * 1.01)
     assert np.allclose(rows[-1, 0:3], motion.end_m, atol=1e-15)
-    assert np.allclose(motion.sample(np.array([motion.total_s + 1.0])), rows[-1:], rtol=0, atol=1e-18)
+    assert np.allclose(at(motion, [motion.total_s + 1.0]), rows[-1:], rtol=0, atol=1e-18)
     assert motion.total_s <= 0.02
 
 
@@ -60,6 +67,14 @@ def test_from_rest_the_way_is_straight(start, target):
         return
     share = (rows[:, 0:3] - start) @ way / (way @ way)
     assert np.allclose(rows[:, 0:3], start + share[:, None] * way, atol=1e-12)
+
+
+def test_rows_are_periods_apart_and_stand_before_and_behind():
+    motion = towards(np.zeros((3, 3)), np.array([1e-6, -2e-6, 3e-6]), LIMITS)
+    rows = motion.rows(-4, 2, 60, 2e-4)
+    assert np.array_equal(rows, at(motion, np.maximum(np.arange(-4, 116, 2), 0) * 2e-4))
+    assert (rows[:3] == 0).all()
+    assert np.allclose(rows[-1], [*motion.end_m, *np.zeros(6)], rtol=0, atol=1e-18)
 
 
 def test_a_state_faster_than_the_limits_is_brought_inside_them():
@@ -95,7 +110,7 @@ def test_rows_are_those_that_ruckig_itself_samples(state, target):
         theirs = np.array([trajectory.at_time(t / time_s) for t in t_s[t_s < motion.total_s]])  # (n, 3, axes)
         theirs = (theirs * spans_m / np.array([[1.0], [time_s], [time_s**2]])).reshape(-1, 9)
         theirs[:, 0:3] += start_m
-        ours = motion.sample(t_s)[t_s < motion.total_s]
+        ours = at(motion, t_s)[t_s < motion.total_s]
         assert np.allclose(ours[:, 0:3], theirs[:, 0:3], rtol=0, atol=1e-12 * np.abs(spans_m).max() + 1e-20)
         assert np.allclose(ours[:, 3:6], theirs[:, 3:6], rtol=0, atol=1e-10 * LIMITS.velocity_m_per_s)
         assert np.allclose(ours[:, 6:9], theirs[:, 6:9], rtol=0, atol=1e-9 * LIMITS.acceleration_m_per_s2)
