@@ -11,6 +11,7 @@ from hil.bus.unix_bus import UnixBus
 from hil.lanes.ending import Ending
 from hil.lanes.live_reference import LiveReference
 from hil.lanes.setup import Setup
+from hil.lanes.standstill import WaitingPort
 from hil.lanes.streamed_reference import StreamedReference
 from pkxyz_ctrl.can import cob_id
 from pkxyz_ctrl.can.frame import Frame
@@ -121,6 +122,8 @@ class WallRig:
         self.clock = WallClock()
         self.can_port = CanPort(self._bus, self.clock, can_config.sense_deadline_us // 2)
         self.port = _LoggedPort(self.can_port, self.clock, recorder, can_config.driver.node_id)
+        waiting = WaitingPort(self.port, self.clock, self.setup.bus)
+        self._port_of_ticks = waiting if can_config.standstill_max_us else self.port
         self.controller = Controller(
             law, setup.bus, wall_gate(setup.gate), self.port.send, self.can_port.discard_unsent,
             lambda: self.can_port.complaint,
@@ -134,6 +137,7 @@ class WallRig:
             setup.bus.period_us,
             latest_start_us=can_config.sense_deadline_us // 2,
             guard_us=self._guard_us,
+            standstill_us=can_config.standstill_max_us,
             late_frames=self._take_late_frames,
             leave=self._leave,
         )
@@ -228,13 +232,13 @@ class WallRig:
 
         rows = None if live is None else live.rows
         reference: Reference = streamed if rows is None else lambda tick: rows
-        run(self.ticks, self.port, controller, reference, ticks, record)
+        run(self.ticks, self._port_of_ticks, controller, reference, ticks, record)
 
     def operate(self, reference: Reference, after: Callable[[int], object]) -> None:
         """Run until somebody ends it: set-points are handed in, and ``after`` is called after each tick. Raises
         ``Ended``.
         """
-        run(self.ticks, self.port, self.controller, reference, NO_END, after)
+        run(self.ticks, self._port_of_ticks, self.controller, reference, NO_END, after)
 
     def close(self) -> None:
         """0 V, pre-operational, off the bus, and an ordinary process again."""

@@ -2,7 +2,7 @@
 
 Time is that of the frames: a SYNC acts when it was on the bus, by its time stamp, not when this process woke up. Where
 nothing comes, alarms (heartbeats, their supervision) ring by the machine's clock. So the node's clock is the
-discrete-event clock of lockstep, pulled along.
+discrete-event clock of lockstep, pulled along. On a bus whose loop lets time stand still, so does it (``standstill``).
 """
 
 import struct
@@ -14,10 +14,12 @@ import numpy as np
 
 from hil.bus.clock import Lockstep
 from hil.lanes.setup import Setup
+from hil.lanes.standstill import AmplifierTime
 from hil.node.amplifier import NmtState
 from hil.node.wired import wired_node
 from hil.plant.on_bus import PlantOnBus
 from hil.plant.truth import TRUTH_BYTES
+from pkxyz_ctrl.can import cob_id
 from pkxyz_ctrl.can.codec import Counts
 from pkxyz_ctrl.config.bus import CanConfig
 from pkxyz_ctrl.io.can_port import CanPort
@@ -71,26 +73,31 @@ class WallPlant:
         self.plant = PlantOnBus(setup.new_plant()) if truth is None else WitnessedPlant(setup.new_plant(), truth)
         self._port = CanPort(bus, self.wall)
         self.node = wired_node(can_config, self.clock, self._port.send, self.plant, switch=self.plant.switch)
+        self._time = AmplifierTime(setup.bus.period_us, can_config.standstill_max_us)
         self._on_change = on_change
         self._shown = (NmtState.INITIALISING, False)
 
     def serve(self, leave: Callable[[], object]) -> None:
         """Serve until ``leave``, called at least every 20 ms, raises."""
-        clock, wall, port, node = self.clock, self.wall, self._port, self.node
+        clock, wall, port, node, time = self.clock, self.wall, self._port, self.node, self._time
         node.power_on()
         moved_us = 0
         while True:
             leave()
             due_us = clock.next_event_us()
             idle_us = wall.now_us + _IDLE_US
-            frame = port.receive(idle_us if due_us is None else min(idle_us, due_us))
+            frame = port.receive(idle_us if due_us is None else min(idle_us, time.wall_us(due_us)))
             if frame is not None:
-                t_us = max(clock.now_us, wall.now_us - _BACKLOG_US, min(port.last_us, wall.now_us))
+                wall_us = wall.now_us
+                stamp_us = max(wall_us - _BACKLOG_US, min(port.last_us, wall_us))
+                if frame.can_id == cob_id.SYNC:
+                    time.sync(stamp_us, wall_us)
+                t_us = max(clock.now_us, time.time_us(stamp_us))
                 clock.run_until(t_us)
                 node.on_frame(frame, t_us)
                 self._show()
                 continue
-            if due_us is not None and due_us <= wall.now_us:
+            if due_us is not None and due_us <= time.time_us(wall.now_us):
                 clock.run_until(due_us)
             if wall.now_us > moved_us + _IDLE_US:
                 moved_us = wall.now_us
@@ -99,7 +106,7 @@ class WallPlant:
 
     def _move_on(self) -> None:
         """Where no SYNC comes, keep the plant from falling behind: it would have to catch up at the next."""
-        t_us = max(self.clock.now_us, self.wall.now_us - _IN_FLIGHT_US)
+        t_us = max(self.clock.now_us, self._time.time_us(self.wall.now_us) - _IN_FLIGHT_US)
         self.clock.run_until(t_us)
         self.plant.exchange(t_us, None, sample=False)
 

@@ -59,6 +59,7 @@ def fill(
     to["blind_ticks"] = round(BLIND_S * 1e6 / period_us)
     to["sense_deadline_us"], to["heartbeat_deadline_us"] = can.sense_deadline_us, can.heartbeat_deadline_us
     to["guard_us"], to["latest_start_us"] = period_us // GUARDS_PER_PERIOD, can.sense_deadline_us // 2
+    to["standstill_us"] = can.standstill_max_us
     to["spin_us"], to["company_us"], to["silent_us"] = SPIN_US, round(company_s * 1e6), SILENT_US
     to["priority"] = FIFO_PRIORITY
     to["node_heartbeat_id"] = cob_id.HEARTBEAT_BASE + can.driver.node_id

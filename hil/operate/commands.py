@@ -152,6 +152,7 @@ SESSION = np.dtype(
         ("path_row", "<f8"),  # where on the path, in its rows; NaN off it
         ("commands", "<u8"),  # taken out of the memory so far
         ("missed", "<i8"),  # ticks, since the loop began, in which somebody waited for one
+        ("stood_us", "<i8"),  # for so long time stood still, as a stage that is simulated waits for the computer
         ("frames", "<i8"),  # sent and received
         ("wire_ns", "<i8"),  # that these took on the wire; a frame as long as the first of its length
     ],

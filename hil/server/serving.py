@@ -34,6 +34,10 @@ it takes otherwise such a one is told half a minute later what became of a comma
 """
 
 
+STANDSTILL_US = 100_000
+"""For so long at once the time of a stage that is simulated waits for the computer."""
+
+
 @dataclass(frozen=True)
 class Served:
     """What to serve, by names or files."""
@@ -175,11 +179,13 @@ def _start(children: _Children, served: Served) -> None:
     )  # fmt: skip
 
 
-def bus_of_its_own(name: str, shipped: str) -> str:
-    """A shipped bus among processes, with a folder that no other stage uses: the file of it."""
+def bus_of_its_own(name: str, shipped: str, standstill_us: int = STANDSTILL_US) -> str:
+    """A shipped bus among processes, with a folder that no other stage uses: the file of it. With ``standstill_us`` 0
+    in real time.
+    """
     folder = place.folder() / f"{name}.wire"
     bus = tomlkit.parse(find("buses", shipped).read_text(encoding="utf-8"))
-    bus["can"]["channel"] = str(folder)  # type: ignore[index]
+    bus["can"] |= {"channel": str(folder), "standstill_max_us": standstill_us}  # type: ignore[operator]
     file = place.folder() / f"{name}.bus.toml"
     file.write_text(tomlkit.dumps(bus), encoding="utf-8")
     return str(file)

@@ -53,6 +53,7 @@ def status_of(tick: np.void, description: dict[str, Any], bus_load: float) -> di
         "voltage_v": voltage, "headroom_v": most_v - max(voltage), "saturated": bool(row["saturated"]),
         "outputs": [name for name, bit in BITS.items() if int(row["output_acting"]) & bit],
         "progress": float(session["progress"]), "missed_ticks": int(session["missed"]),
+        "stood_still_s": int(session["stood_us"]) * 1e-6,
         "frames": int(session["frames"]), "bus_load": round(bus_load, 4),
     }  # fmt: skip
 

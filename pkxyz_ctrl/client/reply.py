@@ -64,6 +64,8 @@ class Status:
     """whether lengths are along the sample's axes, and those are not the stage's"""
     missed_ticks: int
     """since the loop began; not while the amplifier is off or in a fault, when nothing waits for a tick"""
+    stood_still_s: float
+    """for how long the time of a simulated stage has waited for the computer; with hardware always 0"""
     bus_load: float
     """0 to 1"""
     last_fault: str
@@ -82,7 +84,7 @@ class Status:
         values["outputs"] = tuple(values["outputs"] or ())
         plain: dict[str, Any] = {"homed": False, "driven": False, "in_position": False, "missed_ticks": 0}
         plain |= {"quiet": False, "in_sample_axes": False}
-        plain |= dict.fromkeys(("t_s", "headroom_v", "progress", "bus_load"), 0.0)
+        plain |= dict.fromkeys(("t_s", "headroom_v", "progress", "stood_still_s", "bus_load"), 0.0)
         return cls(**{name: plain.get(name, "") if value is None else value for name, value in values.items()})
 
 

@@ -32,6 +32,10 @@ class CanConfig(FrozenModel):
     """
     heartbeat_deadline_us: Annotated[int, Field(gt=0)]
     """After the start of a tick: until when a drive frame and our heartbeat behind it end before the next SYNC."""
+    standstill_max_us: Annotated[int, Field(ge=0, le=1_000_000)] = 0
+    """For so long at once the loop's time stands still where the loop or the amplifier's answer is late, so that
+    neither has missed anything. Only for an amplifier that is simulated beside the loop: real time waits for nobody.
+    """
     driver: DriverConfig
 
     @property
@@ -42,6 +46,15 @@ class CanConfig(FrozenModel):
         else:
             bits, fast_s = 33, 44 / self.data_bitrate_bit_per_s
         return math.ceil((bits / self.nominal_bitrate_bit_per_s + fast_s) * 1e6)
+
+    @model_validator(mode="after")
+    def _only_processes_wait(self) -> Self:
+        if self.standstill_max_us and self.interface != "pkxyz-unix":
+            raise ValueError(
+                f"standstill_max_us is for interface pkxyz-unix, where the amplifier may be simulated; what is behind "
+                f"{self.interface} does not wait: leave it out"
+            )
+        return self
 
     @model_validator(mode="after")
     def _rates_match(self) -> Self:

@@ -98,6 +98,7 @@ SETTINGS = np.dtype(
         ("heartbeat_deadline_us", "i8"),
         ("guard_us", "i8"),  # a tick that ends later than this before the next one gives that up
         ("latest_start_us", "i8"),  # a tick that is woken later than this is given up
+        ("standstill_us", "i8"),  # for so long time waits for a tick, or an answer, that is late; 0: it goes on
         ("spin_us", "i8"),  # how long before an instant sleeping ends
         ("company_us", "i8"),  # for which an empty bus is given time
         ("silent_us", "i8"),  # after a fault, for so long without its heartbeat, the amplifier is gone
@@ -133,6 +134,7 @@ STATE = np.dtype(
         ("begun_ns", "i8"),  # where its clock is 0, of CLOCK_MONOTONIC
         ("reference_tick", "i8"),  # where on the path it is
         ("ticks", "i8"),  # that were run
+        ("stood_us", "i8"),  # for so long time stood still
         ("heartbeat_us", "i8"),  # when the node said last that it is there
         ("phase", "i4"),
         ("outcome", "i4"),

@@ -11,10 +11,13 @@ _HISTOGRAM_US = 2000
 
 
 class WallClock:
-    """``runtime.Clock`` that runs by itself: integer microseconds of CLOCK_MONOTONIC since it was made."""
+    """``runtime.Clock`` that runs by itself: integer microseconds of CLOCK_MONOTONIC since it was made, less those for
+    which it stood still.
+    """
 
     def __init__(self, spin_us: int = SPIN_US) -> None:
         self._origin_ns = time.monotonic_ns()
+        self._stood_ns = 0
         self._spin_us = spin_us
 
     @property
@@ -31,6 +34,18 @@ class WallClock:
         while monotonic_ns() < end_ns:
             pass
 
+    def stand_at(self, t_us: int) -> None:
+        """It is ``t_us`` again, where it has become later."""
+        stood_ns = time.monotonic_ns() - t_us * 1000 - self._origin_ns
+        if stood_ns > 0:
+            self._origin_ns += stood_ns
+            self._stood_ns += stood_ns
+
+    @property
+    def stood_us(self) -> int:
+        """For how long the clock stood still, in all."""
+        return self._stood_ns // 1000
+
     def spend(self, compute_us: int) -> None:
         """Computing takes the time that it takes."""
 
@@ -44,6 +59,8 @@ class TickClock:
     - A tick that is woken so late that no answer could come in time, more than ``latest_start_us``, is given up: it
       waits for the next, and the loop counts it as skipped.
     - So is a tick whose predecessor ended less than ``guard_us`` before it began: two drive frames would be too near.
+    - For ``standstill_us`` the clock stands still instead, and no tick is given up. Nor does what is computed come so
+      late that the next tick would be.
 
     ``lateness_us`` counts wake-ups by whole microseconds of lateness, the last entry all beyond.
     """
@@ -55,6 +72,7 @@ class TickClock:
         *,
         latest_start_us: int,
         guard_us: int,
+        standstill_us: int = 0,
         late_frames: Callable[[int], object] = lambda until_us: None,
         leave: Callable[[], object] = lambda: None,
     ) -> None:
@@ -63,10 +81,11 @@ class TickClock:
         self._period_us = period_us
         self._latest_start_us = latest_start_us
         self._guard_us = guard_us
+        self._standstill_us = standstill_us
         self._late_frames = late_frames
         self._leave = leave
         self.lateness_us = [0] * _HISTOGRAM_US
-        self.spend = clock.spend
+        self._begun_us = 0
 
     @property
     def now_us(self) -> int:
@@ -79,7 +98,9 @@ class TickClock:
         while True:
             self._leave()
             behind_us = clock.now_us + self._guard_us - t_us
-            if behind_us > 0:
+            if 0 < behind_us <= self._standstill_us:
+                clock.stand_at(t_us - self._guard_us)
+            elif behind_us > 0:
                 t_us += -(-behind_us // period_us) * period_us
             last_look_us = t_us - self._guard_us // 2
             self._late_frames(last_look_us)
@@ -88,8 +109,18 @@ class TickClock:
             clock.wait_until(t_us)
             late_us = clock.now_us - t_us
             lateness[late_us if late_us < _HISTOGRAM_US else -1] += 1
-            if late_us <= self._latest_start_us:
-                return
+            if self._latest_start_us < late_us <= self._standstill_us:
+                clock.stand_at(t_us)
+            elif late_us > self._latest_start_us:
+                continue
+            self._begun_us = t_us
+            return
+
+    def spend(self, compute_us: int) -> None:
+        """Computing takes the time that it takes, unless time may stand still."""
+        spent_at_most_us = self._period_us - 2 * self._guard_us
+        if self._standstill_us and self._clock.now_us < self._begun_us + spent_at_most_us + self._standstill_us:
+            self._clock.stand_at(self._begun_us + spent_at_most_us)
 
 
 def percentile_us(histogram: list[int], share: float) -> int:

@@ -114,6 +114,13 @@ MISTAKES = [
     ),
     ("stages", "flexures.out_of_plane_chains", 2, "flexures.out_of_plane_chains: input should be 1 or 3 (got 2)"),
     ("buses", "delay_periods", 3, "delay_periods: input should be less than or equal to 2 (got 3)"),
+    (
+        "buses",
+        "can.standstill_max_us",
+        1000,
+        "can: standstill_max_us is for interface pkxyz-unix, where the amplifier "
+        "may be simulated; what is behind pkxyz-sim does not wait: leave it out",
+    ),
     ("buses", "can.driver.node_id", 128, "can.driver.node_id: input should be less than or equal to 127 (got 128)"),
     ("stages", "name", "", "name: string should have at least 1 character (got '')"),
     # not a number

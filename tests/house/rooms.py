@@ -115,7 +115,7 @@ HOUSE: Mapping[str, Room] = MappingProxyType({
     "hil.bench": Room((
         "pkxyz_ctrl.*", "hil.bus", "hil.plant", "hil.recording", "hil.lanes", "hil.native", "hil.runs",
         "hil.studies.spread", "hil.studies.margins", "hil.studies.identify", "hil.studies.tune", "hil.studies.wafer",
-        "hil.studies", "hil.bench.rigs",
+        "hil.studies", "hil.operate", "hil.server", "hil.bench.rigs",
     )),
     "hil.api": Room((
         "pkxyz_ctrl.*", "hil.recording", "hil.lanes", "hil.runs", "hil.studies.spread", "hil.studies.margins",

@@ -20,11 +20,13 @@ class Scripted:
     def __init__(self, late_us):
         self.now_us = 0
         self._late_us = iter(late_us)
-        self.spend = None
 
     def wait_until(self, t_us):
         if t_us > self.now_us:
             self.now_us = t_us + next(self._late_us, 0)
+
+    def stand_at(self, t_us):
+        self.now_us = min(self.now_us, t_us)
 
 
 def test_wall_clock_never_returns_early_and_counts_microseconds():
@@ -105,6 +107,45 @@ def test_a_punctual_loop_skips_nothing_and_a_late_one_no_more_than_it_must():
         scripted.now_us = begun_us + max(work, scripted.now_us - begun_us)
         clock.wait_until(begun_us + 1000)
         assert (begun_us - 1000) // 1000 + (scripted.now_us - begun_us - 1000) // 1000 == expected
+
+
+@settings(max_examples=200)
+@given(
+    late_us=st.lists(st.integers(0, 50_000), max_size=60),
+    work_us=st.lists(st.integers(1, 50_000), min_size=1, max_size=25),
+)
+def test_where_time_may_stand_still_no_tick_is_given_up_and_none_begins_or_ends_late(late_us, work_us):
+    scripted = Scripted(late_us)
+    clock = TickClock(scripted, PERIOD_US, latest_start_us=LATEST_US, guard_us=GUARD_US, standstill_us=50_000)
+    computed_us = 0
+    for tick, work in enumerate(work_us, 1):
+        t_us = tick * PERIOD_US
+        clock.wait_until(t_us)
+        assert t_us <= scripted.now_us <= t_us + LATEST_US
+        assert t_us - computed_us >= 2 * GUARD_US
+        scripted.now_us += work
+        clock.spend(0)
+        computed_us = scripted.now_us
+        assert computed_us <= t_us + PERIOD_US - 2 * GUARD_US
+
+
+@pytest.mark.parametrize(("late_us", "skipped"), [(5000, 0), (5001, 5)])
+def test_time_does_not_stand_still_for_longer_than_it_may(late_us, skipped):
+    scripted = Scripted([0, late_us])
+    clock = TickClock(scripted, PERIOD_US, latest_start_us=LATEST_US, guard_us=GUARD_US, standstill_us=5000)
+    clock.wait_until(1000)
+    assert scripted.now_us == 1000 + 1000 * (skipped + bool(skipped))
+
+
+def test_a_clock_that_stood_still_goes_on_from_there_and_says_for_how_long():
+    clock = WallClock()
+    clock.wait_until(5000)
+    clock.stand_at(2000)
+    assert 2000 <= clock.now_us < 5000
+    assert clock.stood_us >= 3000
+    stood_us = clock.stood_us
+    clock.stand_at(10**9)  # not yet
+    assert clock.stood_us == stood_us
 
 
 def test_late_frames_are_taken_before_the_tick_and_leaving_ends_the_loop():

@@ -54,19 +54,12 @@ def refused(capsys, monkeypatch, *words):
 class Server:
     """``err``: what it said on its standard error."""
 
-    def __init__(self, law: Path, bus: Path, *more: str) -> None:
-        words = ["serve", *more, "--controller", str(law), "--bus", str(bus), "--port", "0", "--json"]
-        words += [
-            "--silence-s",
-            "0.25",
-            "--saves",
-            str(law.parent / "runs"),
-            "--settings",
-            str(law.parent / "settings"),
-        ]
+    def __init__(self, folder: Path, *more: str) -> None:
+        words = ["serve", *more, "--port", "0", "--json", "--silence-s", "0.25"]
+        words += ["--saves", str(folder / "runs"), "--settings", str(folder / "settings")]
         self._command = [sys.executable, "-m", "hil", *words]
         self.process: subprocess.Popen[str]
-        self.err = law.parent / "err"
+        self.err = folder / "err"
 
     def start(self) -> None:
         with self.err.open("wb") as err:
@@ -82,14 +75,20 @@ class Server:
 
 
 @contextlib.contextmanager
-def served(folder: Path, *words: str, bus: str = "unix_1k") -> Iterator[Server]:
-    """One that is found by its default name while this lasts; whatever becomes of the test, it is ended."""
+def served(folder: Path, *words: str, bus: str | None = "unix_1k") -> Iterator[Server]:
+    """One that is found by its default name while this lasts; whatever becomes of the test, it is ended.
+
+    In real time, patiently; with ``bus`` None as it is shipped, its stage simulated.
+    """
     if compiler() is not None:  # once, and not while somebody waits for the stage
         choose_kernel_cache()
         compiled()
     before = os.environ.get("XDG_RUNTIME_DIR")
     os.environ["XDG_RUNTIME_DIR"] = str(folder)
-    server = Server(patient_law(folder, "youla"), patient_bus(folder / "bus.toml", bus), *words)
+    if bus is not None:
+        patient = patient_law(folder, "youla"), patient_bus(folder / "bus.toml", bus)
+        words += ("--controller", str(patient[0]), "--bus", str(patient[1]))
+    server = Server(folder, *words)
     try:
         server.start()
         yield server

@@ -41,7 +41,7 @@ class DeskRig(OperatedRig):
         self.session._say = memory.writer("answers").write
         place.write("stage", "loop", {"pid": 1, "memory": str(memory.path), "period_us": 200, "voltage_max_v": 200.0})
         monkeypatch.setattr(place, "_is_alive", lambda pid: True)
-        self.loop = OperatedLoop(self.session, memory, _NoFrames())  # type: ignore[arg-type]
+        self.loop = OperatedLoop(self.session, memory, _NoFrames(), lambda: 0)  # type: ignore[arg-type]
 
         async def plan(function: Any, *arguments: Any) -> Any:
             return function(*arguments)
@@ -282,7 +282,7 @@ def test_what_is_asked_while_the_loop_starts_is_answered(tmp_path, monkeypatch):
     rig.ask(client, do="take_control")
     rig.ask(client, do="move", tag="early", x_m=1e-6)
     memory = StageMemory(tmp_path / "memory")
-    rig.loop = OperatedLoop(rig.session, memory, _NoFrames())  # type: ignore[arg-type]
+    rig.loop = OperatedLoop(rig.session, memory, _NoFrames(), lambda: 0)  # type: ignore[arg-type]
 
     def script() -> Script:
         yield

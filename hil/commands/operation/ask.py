@@ -216,5 +216,7 @@ def _show(status: Any, as_json: bool) -> None:
         setpoint, position = status.setpoint_m[n] * 1e6, status.position_m[n] * 1e6
         print(f"{axis}: set-point {setpoint:10.4f} um, position {position:10.4f} um")
     print(f"headroom {status.headroom_v:.1f} V, {status.missed_ticks} missed ticks, bus load {status.bus_load:.0%}")
+    if status.stood_still_s:
+        print(f"time has stood still for {status.stood_still_s:.3g} s, as a simulated stage waits for the computer")
     if status.last_fault:
         print(f"last fault: {status.last_fault}")

@@ -58,10 +58,10 @@ class Counted:
 
 
 class OperatedLoop:
-    """What joins a session to the memory, tick by tick."""
+    """What joins a session to the memory, tick by tick. ``stood_us``: how long time has stood still."""
 
-    def __init__(self, session: Session, memory: StageMemory, counted: Counted) -> None:
-        self._session, self._counted = session, counted
+    def __init__(self, session: Session, memory: StageMemory, counted: Counted, stood_us: Callable[[], int]) -> None:
+        self._session, self._counted, self._stood_us = session, counted, stood_us
         self._ticks, self._frames = memory.writer("ticks"), memory.writer("frames")
         self._commands = memory.reader("commands", from_start=True)  # what was asked while the amplifier started, too
         self._path = memory.reader("path", from_start=True)
@@ -90,6 +90,7 @@ class OperatedLoop:
         self._session.tell()
         state = self._session.state
         state["commands"] = self._commands.next - 1
+        state["stood_us"] = self._stood_us()
         state["frames"], state["wire_ns"] = self._counted.frames, self._counted.wire_ns
         self._tick_bytes[: ROW.itemsize] = row
         self._tick["session"] = state
@@ -138,7 +139,8 @@ def operate(setup: Setup, settings: Settings, name: str, files: dict[str, str], 
             place.write(name, "loop", description(setup, settings, memory, files))
             say(rig.go_real_time())
             rig.start(say)
-            rig.operate(session.stage.setpoints, OperatedLoop(session, memory, counted).after)
+            operated = OperatedLoop(session, memory, counted, lambda: rig.clock.stood_us)
+            rig.operate(session.stage.setpoints, operated.after)
         except Ended as end:
             return end.signal_number
         finally:

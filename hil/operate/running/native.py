@@ -92,7 +92,8 @@ def operate_natively(
         try:
             setpoints = Sheets(setup.bus.period_us, *rows_of(ordered.law), mapped.shared["operated"]["sheets"][0, 0])
             session = session_of(setup, settings, ordered, memory, setpoints)
-            beside = _Beside(ordered, setpoints, OperatedLoop(session, memory, counted), counted, RingBytes(mapped))
+            operated = OperatedLoop(session, memory, counted, lambda: int(loop.state["stood_us"]))
+            beside = _Beside(ordered, setpoints, operated, counted, RingBytes(mapped))
             loop.begin(say, COMPANY_S, wake=wake)
             place.write(name, "loop", description(setup, settings, memory, files))
             say(text_of(loop.state["real_time"]))

@@ -4,7 +4,7 @@
 #include <errno.h>
 #include <time.h>
 
-static int64_t begun_ns, spin_ns;
+static int64_t begun_ns, spin_ns, stood_ns;
 
 void clock_begin(int64_t spin_us)
 {
@@ -27,6 +27,20 @@ int64_t clock_monotonic_ns(void)
 int64_t clock_now_us(void)
 {
     return (clock_monotonic_ns() - begun_ns) / 1000;
+}
+
+void clock_stand_at(int64_t t_us)
+{
+    const int64_t begun_at_least_ns = clock_monotonic_ns() - t_us * 1000;
+    if (begun_at_least_ns > begun_ns) {
+        stood_ns += begun_at_least_ns - begun_ns;
+        begun_ns = begun_at_least_ns;
+    }
+}
+
+int64_t clock_stood_us(void)
+{
+    return stood_ns / 1000;
 }
 
 void clock_wait_until(int64_t t_us)

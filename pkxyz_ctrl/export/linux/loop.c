@@ -13,7 +13,7 @@
 #include "ring.h"
 #include "ticks.h"
 
-enum { POLL_US = 1000, LANDED_TICKS = 2, LOOK_US = 20000, LAST_FRAMES_US = 20000 };
+enum { POLL_US = 1000, LANDED_TICKS = 2, LOOK_US = 20000, LAST_FRAMES_US = 20000, STANDS_US = 100 };
 enum { UNPOLLED_MOST_US = 20000 }; /* of a start-up in which frame after frame comes, none of them the one awaited */
 
 /* Until somebody else is on the bus, where that is known: a plant that was begun in the same moment takes a while. */
@@ -56,19 +56,42 @@ static int is_amplifier_gone(const pkxyz_shared_settings *settings, const pkxyz_
     return controller_mode() == PKXYZ_MODE_FAULT && clock_now_us() - state->heartbeat_us > settings->silent_us;
 }
 
-/* One period that begins at t_us. The frame that is awaited may be late by so much and no more, whatever else comes. */
+/* Whether the frame that is awaited came by then. Other frames do not put that off, however many there are. */
+static int take_until(int64_t deadline_us)
+{
+    frame came;
+    while (port_receive(deadline_us, &came)) {
+        if (controller_take(&came, clock_now_us()))
+            return 1;
+        if (clock_now_us() > deadline_us)
+            break;
+    }
+    return 0;
+}
+
+/* An amplifier that is simulated beside us is waited for, if it has answered the last time: time stands still before the
+   deadline, for so long and no longer. */
+static void await(const pkxyz_shared_settings *settings, int64_t deadline_us)
+{
+    static int has_answered;
+    int came = take_until(deadline_us);
+    for (int64_t stood_us = 0; !came && has_answered && stood_us < settings->standstill_us; stood_us += STANDS_US) {
+        clock_stand_at(deadline_us - STANDS_US);
+        came = take_until(deadline_us);
+    }
+    has_answered = came;
+}
+
+/* One period that begins at t_us. */
 static void exchange(const pkxyz_shared_settings *settings, const pkxyz_reference *rows, int32_t rows_count, int64_t t_us,
                      int32_t overrun)
 {
-    const int64_t deadline_us = t_us + settings->sense_deadline_us;
-    frame came;
     controller_sync(t_us);
-    while (port_receive(deadline_us, &came))
-        if (controller_take(&came, clock_now_us()) || clock_now_us() > deadline_us)
-            break;
+    await(settings, t_us + settings->sense_deadline_us);
     if (settings->is_operated)
         orders_take(&rows, &rows_count);
     controller_compute(rows, rows_count, overrun);
+    ticks_computed(t_us);
     controller_finish(clock_now_us(), t_us + settings->heartbeat_deadline_us);
 }
 
@@ -99,6 +122,7 @@ static int run(pkxyz_shared *shared)
         if (tick == settings->ticks - 1 && controller_is_closed())
             controller_request(PKXYZ_EVENT_DISABLE);
         state->ticks = tick + 1;
+        state->stood_us = clock_stood_us();
         state->reference_tick = memory->cycle->reference_tick;
         if (settings->is_operated)
             orders_leave();

@@ -46,7 +46,9 @@ int ticks_wait_until(int64_t t_us)
         if (is_over())
             return 0;
         const int64_t behind_us = clock_now_us() + settings->guard_us - t_us;
-        if (behind_us > 0)
+        if (behind_us > 0 && behind_us <= settings->standstill_us)
+            clock_stand_at(t_us - settings->guard_us);
+        else if (behind_us > 0)
             t_us += (behind_us + settings->period_us - 1) / settings->period_us * settings->period_us;
         const int64_t last_look_us = t_us - settings->guard_us / 2;
         port_look();
@@ -56,7 +58,17 @@ int ticks_wait_until(int64_t t_us)
         clock_wait_until(t_us);
         const int64_t late_us = clock_now_us() - t_us;
         count(late_us);
-        if (late_us <= settings->latest_start_us)
-            return 1;
+        if (late_us > settings->latest_start_us && late_us <= settings->standstill_us)
+            clock_stand_at(t_us);
+        else if (late_us > settings->latest_start_us)
+            continue;
+        return 1;
     }
+}
+
+void ticks_computed(int64_t t_us)
+{
+    const int64_t at_latest_us = t_us + settings->period_us - 2 * settings->guard_us;
+    if (clock_now_us() < at_latest_us + settings->standstill_us)
+        clock_stand_at(at_latest_us);
 }

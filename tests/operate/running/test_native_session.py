@@ -220,7 +220,7 @@ def said_by(bench, *words, **environment):
         if line.startswith(("the loop is ", "real time")):
             run.terminate()
             break
-    run.communicate(timeout=60)
+    run.communicate(timeout=600)  # what is being compiled is compiled to its end
     return lines, run.returncode
 
 
