@@ -307,7 +307,8 @@ class AsyncStage:
                 if not answers.empty():
                     (await link.until(answers, FINAL)).require_done()
                 try:
-                    block = await asyncio.wait_for(queue.get(), 0.5)
+                    async with asyncio.timeout(0.5):  # ``wait_for`` forgets to be cancelled where a block comes then
+                        block = await queue.get()
                 except TimeoutError:
                     continue
                 if block is None:
