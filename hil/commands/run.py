@@ -35,14 +35,14 @@ if TYPE_CHECKING:
 Bus = Annotated[
     str | None,
     typer.Option(
-        help="Name or file of the bus to meet on, instead of the scenario's. Where that is simulated: unix_2k, and for "
-        "`run` whichever of unix_2k and unix_1k this machine keeps up with."
+        help="Name or file of the bus to meet on, instead of the scenario's. Where that is simulated: unix_2k, in "
+        "a time that waits for the computer."
     ),
 ]
 Native = Annotated[
     bool, typer.Option("--native", help="By the loop in C, compiled here the first time, instead of Python's.")
 ]
-_MEETING_BUSES = ("unix_2k", "unix_1k")  # on one channel: a plant on one of them serves a controller on the other, too
+_MEETING_BUS = "unix_2k"
 
 
 def run(
@@ -84,9 +84,7 @@ def run(
     require_seconds(duration_s)
     say_if_compiling(quiet=as_json)
     try:
-        loaded = _met(
-            scenario, measured=True, stage=stage, controller=controller, bus=bus, learning=learning, adapted=adapted
-        )
+        loaded = _met(scenario, stage=stage, controller=controller, bus=bus, learning=learning, adapted=adapted)
     except Ended as end:
         raise typer.Exit(128 + end.signal_number) from None
     loaded = _lasting(loaded, duration_s)
@@ -187,25 +185,23 @@ def learning_of(learn: bool, apply: str | None, refresh: str | None) -> dict[str
     return asked[0] if asked else None
 
 
-def _met(scenario: str, *, measured: bool = False, **instead: Any) -> Any:
+def _met(scenario: str, **instead: Any) -> Any:
     """The scenario on the bus that was given, else on its own, unless that is simulated and ends with its process: then
-    on the first of those for one machine, or if ``measured`` the first that this machine keeps up with.
+    on one between processes, in a time that waits for the computer.
     """
+    from hil.lanes.standstill import waiting
     from hil.runs.scenario import load_scenario
-    from hil.studies.fitting_bus import fastest_that_fits
-    from pkxyz_ctrl.config.bus import BusConfig
-    from pkxyz_ctrl.config.files import load
 
     loaded = load_scenario(scenario, **instead)
     can_config = loaded.bus.can
     if instead["bus"] is not None or (can_config is not None and can_config.interface != "pkxyz-sim"):
         return loaded
-    meeting, why = load("buses", _MEETING_BUSES[0], BusConfig), "as without --bus"
-    if measured:
-        buses = (load("buses", name, BusConfig) for name in _MEETING_BUSES)
-        meeting, why = fastest_that_fits(buses, loaded.controller.monitors.overrun_count)
-    note(f"the scenario's bus, {loaded.bus.name}, is simulated; meeting on {meeting.name}: {why}")
-    return load_scenario(scenario, **instead | {"bus": meeting.name})
+    note(
+        f"the scenario's bus, {loaded.bus.name}, is simulated; meeting on {_MEETING_BUS}, in a time that waits for "
+        f"this computer: both with --bus {_MEETING_BUS}, or another, for real time"
+    )
+    met = load_scenario(scenario, **instead | {"bus": _MEETING_BUS})
+    return dataclasses.replace(met, bus=waiting(met.bus))
 
 
 def require_seconds(duration_s: float | None) -> None:
@@ -231,6 +227,8 @@ def _show(summary: "Summary", folder: Path) -> None:
         f"{summary.scenario} on {summary.bus}: {rows.ticks} ticks, {loop.missed_ticks} missed, woken "
         f"{late['p50']} us late in the middle, {late['p99_9']} us at p99.9, {late['max']} us at most"
     )
+    if loop.stood_still_s:
+        print(f"time stood still for {loop.stood_still_s:.3g} s, as a simulated stage waits for the computer")
     said = (*error_lines(rows, loop.errors_are_of), *lacking_lines(loop.protections_lacking), *loss_lines(loop))
     for line in said:
         print(line)

@@ -13,14 +13,22 @@ from pkxyz_ctrl.config.bus import BusConfig
 from pkxyz_ctrl.io.clocks import WallClock
 from pkxyz_ctrl.loop.runtime import Port
 
+STANDSTILL_US = 100_000
+"""For so long at once the time of an amplifier that is only simulated waits for the computer, where nobody says."""
 _STANDS_US = 100
 """Before the deadline of an answer time stands for so long, again and again, until it comes."""
+
+
+def waiting(bus: BusConfig) -> BusConfig:
+    """A bus between processes, in a time that waits."""
+    assert bus.can is not None
+    return bus.model_copy(update={"can": bus.can.model_copy(update={"standstill_max_us": STANDSTILL_US})})
 
 
 class WaitingPort:
     """The loop's port of ``bus`` once it runs: an answer to a SYNC that is late holds up the time.
 
-    An amplifier that has not answered the last time is not waited for.
+    An amplifier that did not answer the last time is not waited for.
     """
 
     def __init__(self, port: Port, clock: WallClock, bus: BusConfig) -> None:
@@ -29,7 +37,7 @@ class WaitingPort:
         self._port, self._clock = port, clock
         self._stands_most_us = bus.can.standstill_max_us
         self._sense_id = cob_id.sense(driver.node_id, driver.sense_pdo)
-        self._has_answered = False
+        self._has_answered = True
         self._deadline_us = self._stood_us = 0
         self.send, self.unsent = port.send, port.unsent
 

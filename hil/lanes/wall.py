@@ -154,6 +154,11 @@ class WallRig:
         return self.ticks.lateness_us
 
     @property
+    def stood_us(self) -> int:
+        """For how long time stood still."""
+        return self.clock.stood_us
+
+    @property
     def complaint(self) -> str:
         """``; ...``: what stands in the way of frames."""
         return self.can_port.complaint

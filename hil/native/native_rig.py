@@ -43,6 +43,10 @@ class NativeRig:
         return lateness
 
     @property
+    def stood_us(self) -> int:
+        return int(self._state["stood_us"])
+
+    @property
     def complaint(self) -> str:
         return self.controller.complaint
 

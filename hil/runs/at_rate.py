@@ -61,6 +61,7 @@ class _Watched:
     refused_frames: int = 0
     dropped_frames: int | None = None
     blocked_frames: int = 0
+    stood_us: int = 0
     learner: Learner | None = None
     adaptation: NDArray[np.void] | None = None
 
@@ -120,6 +121,7 @@ def _run_into(
         dropped_frames=watched.dropped_frames,
         blocked_frames=watched.blocked_frames,
         lost_rows=recorder.lost_rows,
+        stood_still_s=watched.stood_us * 1e-6,
         lateness_us={name: percentile_us(late, share) for name, share in _SHARES.items()},
     )
     summary = begun.end(rows, loop, watched.learner, watched.adaptation, interrupted=bool(watched.ended_by))
@@ -161,6 +163,7 @@ def _run(rig: WallRig | NativeRig, watched: _Watched, say: Callable[[str], objec
             watched.refused_frames = rig.refused_frames
             watched.dropped_frames = rig.dropped_frames
             watched.blocked_frames = rig.controller.gate.blocked_frames
+            watched.stood_us = rig.stood_us
             watched.adaptation = rig.controller.memory["tick"]["adaptation"].copy()
             watched.learner = rig.learner
 

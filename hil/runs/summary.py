@@ -13,7 +13,7 @@ if TYPE_CHECKING:  # who draws a run loads none of it
     from hil.runs.period_errors import PeriodFigures
     from hil.runs.scenario import Scenario
 
-_AT_RATE = ("refused_frames", "dropped_frames", "blocked_frames", "lost_rows", "lateness_us")
+_AT_RATE = ("refused_frames", "dropped_frames", "blocked_frames", "lost_rows", "stood_still_s", "lateness_us")
 
 
 @dataclass(frozen=True)
@@ -40,6 +40,8 @@ class LoopFigures:
     """frames that our own gate held back; wall lane"""
     lost_rows: int | None = None
     """rows that the recording's writer was too slow for; wall lane"""
+    stood_still_s: float | None = None
+    """for how long time waited for the computer, as it does for a stage that is only simulated; wall lane"""
     lateness_us: Mapping[str, int] | None = None
     """of the wake-ups: p50, p99_9, max; wall lane"""
 

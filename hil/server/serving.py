@@ -16,6 +16,7 @@ from pathlib import Path
 import tomlkit
 import uvicorn
 
+from hil.lanes.standstill import STANDSTILL_US
 from hil.server.app import app_of
 from hil.server.desk import Desk
 from hil.server.link import Link
@@ -32,10 +33,6 @@ SENT_AHEAD_BYTES = 32_768
 """That the system keeps for one who reads slowly: a third of a second of the page's telemetry. With the megabytes that
 it takes otherwise such a one is told half a minute later what became of a command, and its pings come too late.
 """
-
-
-STANDSTILL_US = 100_000
-"""For so long at once the time of a stage that is simulated waits for the computer."""
 
 
 @dataclass(frozen=True)

@@ -1,19 +1,18 @@
 """What ``pkxyz run`` tells while it runs, and which bus it takes where the scenario's is simulated."""
 
 import io
+import json
+import signal
+import subprocess
 import sys
+import time
 
 import numpy as np
 import pytest
+from command_line import ROOT
 
 from hil.cli import main
-from hil.lanes.ending import Ended
 from hil.screen.live_status import LiveStatus
-from hil.studies import fitting_bus
-from hil.studies.fitting_bus import fastest_that_fits
-from hil.studies.latency import Latency
-from pkxyz_ctrl.config.bus import BusConfig
-from pkxyz_ctrl.config.files import ConfigError, load
 from pkxyz_ctrl.loop.row import ROW
 from pkxyz_ctrl.safety.modes import Mode
 from pkxyz_ctrl.safety.trips import Trip
@@ -61,35 +60,29 @@ def test_on_a_terminal_a_line_moves_and_is_gone_in_the_end():
     assert last.split("\r")[-2].strip() == ""
 
 
-def measured_with(missed, monkeypatch, ended_by=0):
-    """``missed``: by period in us, what the measurement finds."""
-    real_time = "real time: nothing; not permitted: SCHED_FIFO"
-
-    def measure(period_us, seconds):
-        ticks = round(seconds * 1e6 / period_us)
-        return Latency(period_us, real_time, ticks, missed[period_us], [], [], None, ended_by=ended_by)
-
-    monkeypatch.setattr(fitting_bus, "measure", measure)
-    return fastest_that_fits([load("buses", name, BusConfig) for name in ("unix_2k", "unix_1k")], overrun_count=10)
-
-
-def test_the_fastest_bus_that_the_machine_keeps_up_with_is_taken(monkeypatch):
-    bus, why = measured_with({500: 5}, monkeypatch)
-    assert bus.name == "unix_2k"
-    assert "5 of 2000 ticks at 2 kHz" in why
-    bus, why = measured_with({500: 6, 1000: 0}, monkeypatch)
-    assert bus.name == "unix_1k"
-    assert "6 of 2000 ticks at 2 kHz, 0 of 1000 ticks at 1 kHz" in why
-
-
-def test_where_none_fits_it_is_said_in_a_line_with_what_to_do(monkeypatch):
-    with pytest.raises(
-        ConfigError, match=r"61 of 2000.*40 of 1000.*not permitted: SCHED_FIFO.*--bus.*pkxyz sil"
-    ) as caught:
-        measured_with({500: 61, 1000: 40}, monkeypatch)
-    assert "\n" not in str(caught.value)
-    with pytest.raises(Ended):
-        measured_with({500: 0}, monkeypatch, ended_by=2)
+@pytest.mark.at_rate
+@pytest.mark.parametrize("more", [(), ("--native",)])
+def test_plant_and_run_meet_without_a_bus_and_a_computer_that_stands_still_changes_nothing(more, tmp_path, monkeypatch):
+    monkeypatch.setenv("XDG_RUNTIME_DIR", str(tmp_path))
+    monkeypatch.setenv("PYTHONPATH", str(ROOT))
+    words, pipe = [sys.executable, "-m", "hil.cli"], subprocess.PIPE
+    plant = subprocess.Popen([*words, "plant", "--json"], cwd=tmp_path, stdout=pipe, text=True)
+    try:
+        with subprocess.Popen([*words, "run", "--json", *more], cwd=tmp_path, stdout=pipe, text=True) as run:
+            assert any('"driven": true' in line for line in plant.stdout)
+            for _ in range(10):
+                plant.send_signal(signal.SIGSTOP)
+                time.sleep(0.03)
+                plant.send_signal(signal.SIGCONT)
+                time.sleep(0.03)
+            summary = json.loads(run.stdout.read())
+    finally:
+        plant.kill()
+    assert run.returncode == 0
+    assert summary["ok"]
+    assert summary["missed_ticks"] == 0
+    assert 0.2 < summary["stood_still_s"] < 3
+    assert summary["faults"] == []
 
 
 @pytest.mark.parametrize("bus", ["unix_1k", "socketcan_fd"])

@@ -107,8 +107,8 @@ def test_an_answer_that_is_late_comes_in_time():
     assert late.now_us <= 850
 
 
-def test_an_amplifier_that_falls_silent_is_waited_for_once():
-    late = Late((100, SENSE))
+def test_an_amplifier_that_falls_silent_is_waited_for_once_until_it_answers_again():
+    late = Late((100, SENSE), (90_000, SENSE), (99_000, SENSE))
     port = waiting(late)
     port.receive(350)
     late.machine_us = 500
@@ -117,6 +117,10 @@ def test_an_amplifier_that_falls_silent_is_waited_for_once():
     assert STANDS_US <= waited_us <= STANDS_US + 200
     assert port.receive(late.now_us + 350) is None
     assert late.machine_us <= 850 + waited_us + 450
+    late.machine_us = 90_000
+    assert port.receive(late.now_us + 350) is SENSE
+    assert port.receive(late.now_us + 350) is SENSE
+    assert late.machine_us == 99_000
 
 
 def test_other_frames_are_handed_on_and_nothing_that_is_due_at_once_is_waited_for():
@@ -130,7 +134,7 @@ def test_other_frames_are_handed_on_and_nothing_that_is_due_at_once_is_waited_fo
     assert late.now_us <= 350
 
 
-def test_an_amplifier_that_has_not_answered_yet_is_not_waited_for():
+def test_an_amplifier_is_waited_for_from_the_first_tick_on():
     late = Late((2000, SENSE))
-    assert waiting(late).receive(350) is None
-    assert late.machine_us == 350
+    assert waiting(late).receive(350) is SENSE
+    assert late.machine_us == 2000

@@ -35,6 +35,7 @@ from hil.commands import run as run_cli
 from hil.lanes import in_process as lanes
 from hil.lanes.ending import Ending
 from hil.lanes.lane import Lane
+from hil.lanes.standstill import STANDSTILL_US
 from hil.lanes.wall import WallRig, wall_gate
 from hil.lanes.wall_plant import TRUTH
 from hil.recording.recording import Recording
@@ -231,6 +232,8 @@ def test_run_and_plant_meet_on_the_scenarios_bus_unless_it_is_simulated(bench, m
     assert capsys.readouterr().err == ""
     met = run_cli._met("raster", bus=None)
     assert met.bus.name == "unix_2k"
+    assert met.bus.can.standstill_max_us == STANDSTILL_US
+    assert load_scenario("raster", bus="unix_2k").bus.can.standstill_max_us == 0
     assert "fd_5k, is simulated; meeting on unix_2k" in capsys.readouterr().err
     with pytest.raises(ConfigError, match="is simulated"):  # asked for by name, it is refused
         run_cli.run("raster", bus="fd_5k")

@@ -11,7 +11,7 @@ import psutil
 import pytest
 from command_line import alive, driven, served
 
-from hil.server.serving import STANDSTILL_US
+from hil.lanes.standstill import STANDSTILL_US
 from pkxyz_ctrl.client import place
 
 pytestmark = pytest.mark.at_rate

@@ -69,11 +69,11 @@ static int take_until(int64_t deadline_us)
     return 0;
 }
 
-/* An amplifier that is simulated beside us is waited for, if it has answered the last time: time stands still before the
-   deadline, for so long and no longer. */
+/* An amplifier that is simulated beside us is waited for, unless it did not answer the last time: time stands still
+   before the deadline, for so long and no longer. */
 static void await(const pkxyz_shared_settings *settings, int64_t deadline_us)
 {
-    static int has_answered;
+    static int has_answered = 1;
     int came = take_until(deadline_us);
     for (int64_t stood_us = 0; !came && has_answered && stood_us < settings->standstill_us; stood_us += STANDS_US) {
         clock_stand_at(deadline_us - STANDS_US);
