@@ -299,8 +299,7 @@ class AsyncStage:
     async def telemetry(self, *fields: str) -> AsyncIterator[Block]:
         """Blocks of rows as they come, every tick of them: fields such as "reference_m", "estimate_m", "voltage_v"."""
         link = self._connection
-        queue = link.listen()
-        tag, answers = link.asked()
+        queue, (tag, answers) = link.listen(), link.asked()
         await link.say({"do": "subscribe", "fields": ["tick", *fields], "precision": "f8", "tag": tag})
         try:
             while True:

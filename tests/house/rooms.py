@@ -90,7 +90,7 @@ HOUSE: Mapping[str, Room] = MappingProxyType({
         "pkxyz_ctrl.*", "hil.bus", "hil.recording", "hil.lanes", "hil.operate", "hil.native",
     )),
     "hil.runs": Room(("sim.config", "pkxyz_ctrl.*", "hil.recording", "hil.faults", "hil.lanes", "hil.native")),
-    "hil.server": Room(("pkxyz_ctrl.*", "hil.bus", "hil.recording", "hil.operate", "hil.runs")),
+    "hil.server": Room(("pkxyz_ctrl.*", "hil.bus", "hil.recording", "hil.lanes", "hil.operate", "hil.runs")),
     # many times, for one question
     "hil.studies.spread": Room(("pkxyz_ctrl.*",)),
     "hil.studies.margins": Room(("pkxyz_ctrl.*", "hil.lanes")),
