@@ -70,7 +70,6 @@ def run(
     Ctrl-C, SIGTERM and errors leave the combs at 0 V. Errors of position are those of the estimate.
     """
     load_can_quickly()
-    from hil.lanes.ending import Ended
     from hil.lanes.lane import Lane
     from hil.lanes.wall import require_real_bus
     from hil.pictures.run import draw
@@ -83,10 +82,7 @@ def run(
     learning = learning_of(learn, apply, refresh)
     require_seconds(duration_s)
     say_if_compiling(quiet=as_json)
-    try:
-        loaded = _met(scenario, stage=stage, controller=controller, bus=bus, learning=learning, adapted=adapted)
-    except Ended as end:
-        raise typer.Exit(128 + end.signal_number) from None
+    loaded = _met(scenario, stage=stage, controller=controller, bus=bus, learning=learning, adapted=adapted)
     loaded = _lasting(loaded, duration_s)
     can_config = require_real_bus(loaded.bus)
     if report is not None:

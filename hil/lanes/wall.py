@@ -122,8 +122,8 @@ class WallRig:
         self.clock = WallClock()
         self.can_port = CanPort(self._bus, self.clock, can_config.sense_deadline_us // 2)
         self.port = _LoggedPort(self.can_port, self.clock, recorder, can_config.driver.node_id)
-        waiting = WaitingPort(self.port, self.clock, self.setup.bus)
-        self._port_of_ticks = waiting if can_config.standstill_max_us else self.port
+        waits = can_config.standstill_max_us > 0
+        self._port_of_ticks = WaitingPort(self.port, self.clock, setup.bus) if waits else self.port
         self.controller = Controller(
             law, setup.bus, wall_gate(setup.gate), self.port.send, self.can_port.discard_unsent,
             lambda: self.can_port.complaint,

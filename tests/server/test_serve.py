@@ -159,6 +159,7 @@ def test_a_fault_leaves_its_rows_and_frames_and_is_named(server):
         end_s = time.monotonic() + 20
         while stage.next_status().saved == saved_before and time.monotonic() < end_s:
             pass
+        assert stage.status.saved != saved_before
         folder = Path(stage.status.saved)
         assert folder.parent == server.err.parent / "runs"
         kept = Recording.open(folder / "recording.parquet")
