@@ -4,8 +4,8 @@ import numpy as np
 from numba import njit
 from numpy.typing import NDArray
 
-from pkxyz_ctrl.core import adaptation, feedback, kinematics, linear_law, set_point_model, youla
-from pkxyz_ctrl.core.elasticity import energy_gradient
+from pkxyz_ctrl.core import adaptation, feedback, linear_law, set_point_model, youla
+from pkxyz_ctrl.core.elasticity import energy_gradient, gradient_and_pulls
 from pkxyz_ctrl.core.linear3 import inverse3
 
 Array = NDArray[np.float64]
@@ -17,35 +17,59 @@ or a plan that somebody made from the estimate; without one the filter's state a
 A plan answers to set-points, too. For the others ``set_point_model`` does, and what feeds back sees none of them.
 """
 
+COMING = np.dtype(
+    [
+        ("row", "f8", (9,)),  # of the reference
+        ("pulls", "f8", (3, 3)),  # ``kinematics.pulls`` there
+        ("holding_n", "f8", (3,)),  # at the platform, what holds it there, and ...
+        ("needed_n", "f8", (3,)),  # ... what moves it along, too
+    ],
+    align=True,
+)
+"""Feed-forward in the middle of an interval of action: of the next one, so that it is worked out once for both ticks
+that ask for it.
+"""
+
+
+@njit(cache=True, error_model="numpy")
+def _look_ahead(law: np.void, begin: Array, end: Array, coming: np.void) -> None:
+    """Write what the interval between two rows (9,) takes into ``coming``, a record of ``COMING``."""
+    row, holding, needed = coming["row"], coming["holding_n"], coming["needed_n"]
+    feedback.ahead(law["feedback"], begin, end, row)
+    gradient_and_pulls(law["geometry"], law["elasticity"], row[0:3], holding, coming["pulls"])
+    for i in range(3):
+        needed[i] = holding[i]
+    feedback.add_motion(law["feedback"], row, needed)
+
 
 @njit(cache=True, error_model="numpy")
 def ask(law: np.void, memory: np.void, now: Array, after: Array, later: Array) -> float:
     """Write the demand (3,) at the platform for the reference rows (9,) at the start and the end of the interval of
     action, and a period after that. Returns the feedback's authority. ``law``, ``memory``: the tick's.
     """
-    geometry, gains, scratch, demand = law["geometry"], law["feedback"], memory["scratch"], memory["demand_n"]
+    gains, scratch, demand = law["feedback"], memory["scratch"], memory["demand_n"]
     j, inverse, row = scratch["pulls"], scratch["inverse"], scratch["row"]
-    following, kind = scratch["next_n"], law["kind"]
-    set_points, model, aim = law["set_points"], memory["set_point_model"], scratch["aim"]
-    set_point_model.approach(set_points, model, gains["period_s"], now, after, later, aim)
-    feedback.ahead(gains, aim[1], aim[2], row)
-    feedforward(law, row, following)
-    feedback.ahead(gains, aim[0], aim[1], row)
-    kinematics.pulls(geometry, row[0:3], j)
+    following, kind, coming = scratch["next_n"], law["kind"], memory["coming"]
+    set_points, model, aim = law["set_points"], memory["set_point_model"], memory["set_point_model"]["aim"]
+    if not set_point_model.approach(set_points, model, gains["period_s"], now, after, later):
+        _look_ahead(law, aim[0], aim[1], coming)
+    for i in range(3):
+        demand[i] = coming["needed_n"][i]
+        for k in range(3):
+            j[i, k] = coming["pulls"][i, k]
     inverse3(j, inverse)
-    energy_gradient(geometry, law["elasticity"], row[0:3], demand)
-    share = feedback.authority(gains, inverse, demand)
-    feedback.add_motion(gains, row, demand)
+    share = feedback.authority(gains, inverse, coming["holding_n"])
     learnt, online = memory["adaptation"], law["adaptation"]["on"] != 0
     if online:
         adaptation.note(
-            law["adaptation"], learnt, geometry, law["elasticity"], gains["damping_n_s_per_m"], aim[0], row, inverse, j,
-            demand,
+            law["adaptation"], learnt, law["geometry"], law["elasticity"], gains["damping_n_s_per_m"], aim[0],
+            coming["row"], inverse, j, demand,
         )  # fmt: skip
+    _look_ahead(law, aim[1], aim[2], coming)
     last, before = memory["feedforward_n"], scratch["w_n"]
     known = memory["feedforward_known"] != 0
     for i in range(3):
-        following[i] = following[i] if known else demand[i]
+        following[i] = coming["needed_n"][i] if known else demand[i]
         before[i] = last[i] if known else demand[i]
         last[i] = demand[i]
     feedback.sampled_target(gains, aim[0], demand, before, row)

@@ -76,23 +76,87 @@ def _elevation_change(geometry: np.void, dz: float, delta: float) -> float:
 
 
 @njit(cache=True, error_model="numpy")
+def _springs(
+    geometry: np.void, elasticity: np.void, i: int, x: float, y: float, s: float, c: float, drop: float
+) -> tuple[float, float]:
+    """Force in N along chain i's direction of action that its springs need, and across it, from what ``crank`` and
+    ``link`` say.
+    """
+    force = elasticity["slider_n_per_m"][i] * stroke(geometry, i, x, y, s, c, drop)
+    return force, (force * s + elasticity["crank_n_m_per_rad"][i] * arcsine(s / geometry["crank_m"])) / c
+
+
+@njit(cache=True, error_model="numpy")
 def energy_gradient(geometry: np.void, elasticity: np.void, position_m: Array, out: Array) -> None:
     """dV/dx (3,) in N: the force at the platform that holds it at ``position_m``."""
     e, n = geometry["e"], geometry["n"]
-    k1, k2 = elasticity["slider_n_per_m"], elasticity["crank_n_m_per_rad"]
     x, y = position_m[0], position_m[1]
     z, delta, drop = link(geometry, position_m[2])
     fx = fy = pull = 0.0
     for i in range(3):
         s, c = crank(geometry, i, x, y)
-        force = k1[i] * stroke(geometry, i, x, y, s, c, drop)
-        across = (force * s + k2[i] * arcsine(s / geometry["crank_m"])) / c
+        force, across = _springs(geometry, elasticity, i, x, y, s, c, drop)
         fx += force * e[i, 0] + across * n[i, 0]
         fy += force * e[i, 1] + across * n[i, 1]
         pull += force
     out[0] = fx
     out[1] = fy
     out[2] = (pull * z + elasticity["link_n_m_per_rad"] * _elevation_change(geometry, position_m[2], delta)) / delta
+
+
+@njit(cache=True, error_model="numpy")
+def gradient_and_pulls(geometry: np.void, elasticity: np.void, position_m: Array, out: Array, pulls_out: Array) -> None:
+    """``energy_gradient`` (3,) and ``kinematics.pulls`` (3,3) at one position, whose cranks and links both need."""
+    e, n = geometry["e"], geometry["n"]
+    x, y = position_m[0], position_m[1]
+    z, delta, drop = link(geometry, position_m[2])
+    slope = z / delta
+    fx = fy = pull = 0.0
+    for i in range(3):
+        s, c = crank(geometry, i, x, y)
+        tangent = s / c
+        pulls_out[i, 0] = e[i, 0] + n[i, 0] * tangent
+        pulls_out[i, 1] = e[i, 1] + n[i, 1] * tangent
+        pulls_out[i, 2] = slope + geometry["lift"]
+        force, across = _springs(geometry, elasticity, i, x, y, s, c, drop)
+        fx += force * e[i, 0] + across * n[i, 0]
+        fy += force * e[i, 1] + across * n[i, 1]
+        pull += force
+    out[0] = fx
+    out[1] = fy
+    out[2] = (pull * z + elasticity["link_n_m_per_rad"] * _elevation_change(geometry, position_m[2], delta)) / delta
+
+
+@njit(cache=True, error_model="numpy")
+def gradient_and_forces(
+    geometry: np.void, elasticity: np.void, position_m: Array, comb_force_n: Array, other_n: Array, out: Array,
+    other_out: Array,
+) -> tuple[float, float, float]:  # fmt: skip
+    """``energy_gradient``, returned, and what two sets of comb forces (3,) do to the platform at the same position,
+    (3,) in N each: J^T F (Eq. 23), and their lift. Cranks and links are the same for all three.
+    """
+    e, n = geometry["e"], geometry["n"]
+    x, y = position_m[0], position_m[1]
+    z, delta, drop = link(geometry, position_m[2])
+    wx = wy = held = fx = fy = pull = gx = gy = other_pull = 0.0
+    for i in range(3):
+        s, c = crank(geometry, i, x, y)
+        spring, spring_across = _springs(geometry, elasticity, i, x, y, s, c, drop)
+        across, other_across = comb_force_n[i] * s / c, other_n[i] * s / c
+        wx += spring * e[i, 0] + spring_across * n[i, 0]
+        wy += spring * e[i, 1] + spring_across * n[i, 1]
+        held += spring
+        fx += comb_force_n[i] * e[i, 0] + across * n[i, 0]
+        fy += comb_force_n[i] * e[i, 1] + across * n[i, 1]
+        pull += comb_force_n[i]
+        gx += other_n[i] * e[i, 0] + other_across * n[i, 0]
+        gy += other_n[i] * e[i, 1] + other_across * n[i, 1]
+        other_pull += other_n[i]
+    wz = (held * z + elasticity["link_n_m_per_rad"] * _elevation_change(geometry, position_m[2], delta)) / delta
+    out[0], out[1], out[2] = fx, fy, pull * z / delta + geometry["lift"] * pull
+    other_out[0], other_out[1] = gx, gy
+    other_out[2] = other_pull * z / delta + geometry["lift"] * other_pull
+    return wx, wy, wz
 
 
 @njit(cache=True, error_model="numpy")

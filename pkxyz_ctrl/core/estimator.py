@@ -15,8 +15,7 @@ import numpy as np
 from numba import njit
 from numpy.typing import NDArray
 
-from pkxyz_ctrl.core.elasticity import energy_gradient
-from pkxyz_ctrl.core.kinematics import platform_forces
+from pkxyz_ctrl.core.elasticity import gradient_and_forces
 
 Array = NDArray[np.float64]
 
@@ -30,6 +29,7 @@ ESTIMATOR = np.dtype(
         ("operating_point_m", "f8", (3,)),  # x_0
         ("sense_delay_s", "f8"),  # tau
         ("half_period_s", "f8"),  # T/2
+        ("decoupled", "i4"),  # 1: no axis acts on another, so Phi, Gamma and K_0 are diagonal, block by block
     ],
     align=True,
 )
@@ -94,15 +94,19 @@ def net_input(
     before; ``apart_n`` (3,) and ``apart_old_n`` of them, at the platform, do not count.
     """
     stiffness, origin = estimator["stiffness_n_per_m"], estimator["operating_point_m"]
-    energy_gradient(geometry, elasticity, position_m, w)
-    internal = (w[0], w[1], w[2])
-    platform_forces(geometry, position_m, force_n, force_old_n, w, w_change)
+    ix, iy, iz = gradient_and_forces(geometry, elasticity, position_m, force_n, force_old_n, w, w_change)
+    x, y, z = position_m[0] - origin[0], position_m[1] - origin[1], position_m[2] - origin[2]
+    if estimator["decoupled"] != 0:
+        ix, iy, iz = ix - stiffness[0, 0] * x, iy - stiffness[1, 1] * y, iz - stiffness[2, 2] * z
+    else:
+        ix = ix - stiffness[0, 0] * x - stiffness[0, 1] * y - stiffness[0, 2] * z
+        iy = iy - stiffness[1, 0] * x - stiffness[1, 1] * y - stiffness[1, 2] * z
+        iz = iz - stiffness[2, 0] * x - stiffness[2, 1] * y - stiffness[2, 2] * z
     for i in range(3):
-        inside = internal[i]
-        for k in range(3):
-            inside -= stiffness[i, k] * (position_m[k] - origin[k])
         w_change[i] += apart_n[i] - apart_old_n[i] - w[i]
-        w[i] -= inside + apart_n[i]
+    w[0] -= ix + apart_n[0]
+    w[1] -= iy + apart_n[1]
+    w[2] -= iz + apart_n[2]
 
 
 @njit(cache=True, error_model="numpy")
@@ -110,13 +114,21 @@ def predict(estimator: np.void, s: Array, w: Array, w_change: Array, out: Array)
     """Time update over one period: write the state (9,) that follows from ``s`` and the input of ``net_input`` to
     ``out``, another array.
     """
-    transition, gamma, gamma_lag = estimator["transition"], estimator["input"], estimator["input_lag"]
+    phi, gamma, lag = estimator["transition"], estimator["input"], estimator["input_lag"]
+    if estimator["decoupled"] != 0:
+        for i in range(3):
+            x, v, d, f, change = s[i], s[3 + i], s[6 + i], w[i], w_change[i]
+            out[i] = phi[i, i] * x + phi[i, 3 + i] * v + phi[i, 6 + i] * d + (gamma[i, i] * f + lag[i, i] * change)
+            r = 3 + i
+            out[r] = phi[r, i] * x + phi[r, 3 + i] * v + phi[r, 6 + i] * d + (gamma[r, i] * f + lag[r, i] * change)
+            out[6 + i] = d
+        return
     for i in range(6):
         total = 0.0
         for k in range(9):
-            total += transition[i, k] * s[k]
+            total += phi[i, k] * s[k]
         for k in range(3):
-            total += gamma[i, k] * w[k] + gamma_lag[i, k] * w_change[k]
+            total += gamma[i, k] * w[k] + lag[i, k] * w_change[k]
         out[i] = total
     for i in range(6, 9):
         out[i] = s[i]

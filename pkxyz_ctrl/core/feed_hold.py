@@ -39,6 +39,14 @@ def advance(direction: int, age: int, ramp_ticks: int) -> tuple[float, float, fl
 
 
 @njit(cache=True, error_model="numpy")
+def row(rows: Records, index: int, out: Array) -> None:
+    """Row (9,) of a path at full speed at one of its rows; before the first and past the last these."""
+    motion = rows[min(max(index, 0), len(rows) - 1)]["motion"]
+    for i in range(9):
+        out[i] = motion[i]
+
+
+@njit(cache=True, error_model="numpy")
 def sample(rows: Records, phase: float, speed: float, change_per_tick: float, period_s: float, out: Array) -> None:
     """Row (9,) of a path at a phase between two of its rows, constant jerk between them, at a path speed.
     ``rows`` (n,) of a record with ``motion`` (9,).

@@ -23,6 +23,7 @@ FEEDBACK = np.dtype(
         ("period_s", "f8"),
         ("ripple_s_per_kg", "f8"),  # what a sampled velocity lacks for each newton that a held force grows by in a tick
         ("lead_s", "f8"),  # from the start of the interval to its effective middle: T/2 + amplifier time constant
+        ("decoupled", "i4"),  # 1: K_x, K_v and C are diagonal
         ("ripple_of_held", "i4"),  # 1: the ripple is that of the feed-forward as it is held, 0: of the smooth one
         ("authority_force_n", "f8"),  # least holding force from which the feedback has its full gain
     ],
@@ -83,6 +84,10 @@ def add_motion(feedback: np.void, row: Array, out: Array) -> None:
     """Add damping and inertia of a reference row (9,) to the force ``out`` (3,): C v + m a."""
     damping, mass = feedback["damping_n_s_per_m"], feedback["mass_kg"]
     vx, vy, vz = row[3], row[4], row[5]
+    if feedback["decoupled"] != 0:
+        for i in range(3):
+            out[i] += mass * row[6 + i] + damping[i, i] * row[3 + i]
+        return
     for i in range(3):
         out[i] += mass * row[6 + i] + (damping[i, 0] * vx + damping[i, 1] * vy + damping[i, 2] * vz)
 
@@ -132,6 +137,11 @@ def add_feedback(
     ``reference`` a row (9,).
     """
     kx, kv = feedback["position_gain_n_per_m"], feedback["velocity_gain_n_s_per_m"]
+    if feedback["decoupled"] != 0:
+        for i in range(3):
+            off_m, off_m_per_s = origin_m[i] + predicted[i] - reference[i], predicted[3 + i] - reference[3 + i]
+            out[i] -= share * (predicted[6 + i] + (kx[i, i] * off_m + kv[i, i] * off_m_per_s))
+        return
     for i in range(3):
         total = predicted[6 + i]
         for k in range(3):

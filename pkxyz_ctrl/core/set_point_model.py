@@ -31,6 +31,7 @@ SET_POINTS = np.dtype(
         ("position_gain_n_per_m", "f8", (3, 3)),  # K_s, as of the feedback
         ("velocity_gain_n_s_per_m", "f8", (3, 3)),
         ("jump_step_m", "f8"),  # most that the reference jumps in a tick
+        ("decoupled", "i4"),  # 1: K_s is diagonal
     ],
     align=True,
 )
@@ -45,6 +46,9 @@ SET_POINT_MODEL = np.dtype(
         ("applied_n", "f8", (3,)),  # comb forces of the last tick
         ("short_m", "f8", (3,)),  # where is aimed less where the reference has jumped to
         ("short_later_m", "f8", (3,)),  # a period later
+        ("aim", "f8", (3, 9)),  # rows to be led along: at both ends of the interval of action, and a period after that
+        ("expected", "f8", (2, 9)),  # rows of the reference that the next tick begins with, if nothing else is wanted
+        ("foreseen", "i4"),  # 1: ``aim`` and ``expected`` are those of the last tick
     ],
     align=True,
 )
@@ -61,30 +65,45 @@ def set_out(estimator: np.void, model: np.void, position_m: Array) -> None:
         model["feedback_n"][i] = 0.0
         model["applied_n"][i] = 0.0
         model["short_m"][i] = 0.0
+    model["foreseen"] = 0
+    for i in range(3):
         for age in range(DELAY_MAX + 1):
             model["sample_m"][age, i] = position_m[i]
 
 
 @njit(cache=True, error_model="numpy")
-def approach(
-    set_points: np.void, model: np.void, period_s: float, now: Array, after: Array, later: Array, aim: Array
-) -> None:
-    """Write the rows ``aim`` (3,9) to be led along: the reference at the start and the end of the interval of action
-    and a period after that, less what is still missing of its jumps.
+def approach(set_points: np.void, model: np.void, period_s: float, now: Array, after: Array, later: Array) -> bool:
+    """Write the rows ``aim`` to be led along: the reference at the start and the end of the interval of action and a
+    period after that, less what is still missing of its jumps. Returns whether the reference went on as it was
+    foreseen: then the first two rows are those that came after the first in the last tick.
     """
-    short, following = model["short_m"], model["short_later_m"]
+    short, following, aim, expected = model["short_m"], model["short_later_m"], model["aim"], model["expected"]
+    goes_on = model["foreseen"] != 0
     for i in range(9):
-        aim[0, i], aim[1, i], aim[2, i] = now[i], after[i], later[i]
+        goes_on = goes_on and now[i] == expected[0, i] and after[i] == expected[1, i]
+    if goes_on:
+        for i in range(9):
+            aim[0, i], aim[1, i] = aim[1, i], aim[2, i]
+        for i in range(3):
+            short[i] = following[i]
+    else:
+        for i in range(9):
+            aim[0, i], aim[1, i] = now[i], after[i]
+        for i in range(3):
+            aim[0, i] += short[i]
+            short[i] -= jump(period_s, now, after, i)
+        _step(set_points, short)
+        for i in range(3):
+            aim[1, i] += short[i]
+    for i in range(9):
+        aim[2, i], expected[0, i], expected[1, i] = later[i], after[i], later[i]
     for i in range(3):
-        aim[0, i] += short[i]
-        short[i] -= jump(period_s, now, after, i)
-    _step(set_points, short)
-    for i in range(3):
-        aim[1, i] += short[i]
         following[i] = short[i] - jump(period_s, after, later, i)
     _step(set_points, following)
     for i in range(3):
         aim[2, i] += following[i]
+    model["foreseen"] = 1
+    return bool(goes_on)
 
 
 @njit(cache=True, error_model="numpy")

@@ -25,7 +25,7 @@ from pkxyz_ctrl.core import (
     youla,
 )
 from pkxyz_ctrl.core import estimator as filtering
-from pkxyz_ctrl.core.demand import LINEAR, OPEN_LOOP, PREDICTIVE, ask
+from pkxyz_ctrl.core.demand import COMING, LINEAR, OPEN_LOOP, PREDICTIVE, ask
 from pkxyz_ctrl.core.elasticity import ELASTICITY
 from pkxyz_ctrl.core.linear3 import multiply3_transposed
 
@@ -71,7 +71,6 @@ SCRATCH = np.dtype(
         ("inverse", "f8", (3, 3)),
         ("state", "f8", (9,)),
         ("row", "f8", (9,)),
-        ("aim", "f8", (3, 9)),
         ("next_n", "f8", (3,)),
         ("position_m", "f8", (3,)),
         ("w_n", "f8", (3,)),
@@ -99,7 +98,6 @@ MEMORY = np.dtype(
         ("residual_m", "f8", (3,)),  # strokes measured less those of the predicted position
         ("measurement_m", "f8", (3,)),
         ("seen_m", "f8", (3,)),  # the measurement, or the estimate in its place
-        ("linear", linear_law.LINEAR_STATE),
         ("set_point_model", set_point_model.SET_POINT_MODEL),
         ("plan_n", "f8", (3,)),  # force at the platform that a plan adds to the feed-forward of this tick
         ("plan_known", "i4"),
@@ -112,11 +110,13 @@ MEMORY = np.dtype(
         ("force_n", "f8", (3,)),
         ("feedforward_n", "f8", (3,)),  # of the last tick, if the loop was closed then
         ("held_n", "f8", (3,)),  # the same with what makes up for its being held
+        ("coming", COMING),
         ("feedforward_known", "i4"),
         ("active_set_steps", "i4"),
         ("landing", "i4"),  # 1: the stage is led down; instead of the feedback acts ...
         ("landing_share", "f8"),  # ... so much of its last force
         ("scratch", SCRATCH),
+        ("linear", linear_law.LINEAR_STATE),  # large: before what every tick looks at, it would put that out of reach
         ("youla", youla.YOULA_STATE),  # last but one: without taps nobody looks at its ring
         ("adaptation", adaptation.ADAPTATION_STATE),  # last: without adaptation nobody looks at it
     ],
@@ -137,10 +137,7 @@ def measure(law: np.void, memory: np.void, sense_count: NDArray[np.int32]) -> No
         capacitance[i] = sense["offset_f"] + sense["farad_per_count"] * sense_count[i] - memory["sense_zero_f"][i]
         stroke[i] = (capacitance[i] - sense["rest_f"]) * metre_per_farad[i]
         position[i] = origin[i] + predicted[i]
-    kinematics.strokes(law["geometry"], position, residual)
-    for i in range(3):
-        residual[i] = stroke[i] - residual[i]
-    kinematics.newton_step(law["geometry"], stroke, position)
+    kinematics.newton_step(law["geometry"], stroke, position, residual)
 
 
 @njit(cache=True, error_model="numpy")
@@ -313,11 +310,16 @@ def unexplained_force(law: np.void, memory: np.void, out_n: Array) -> None:
     """
     inverse, disturbance = memory["scratch"]["inverse"], memory["estimate"]["filtered"]
     innovation, stiffness = memory["estimate"]["innovation_m"], law["estimator"]["stiffness_n_per_m"]
+    x, y, z = innovation[0], innovation[1], innovation[2]
+    if law["estimator"]["decoupled"] != 0:
+        held_x, held_y, held_z = stiffness[0, 0] * x, stiffness[1, 1] * y, stiffness[2, 2] * z
+    else:
+        held_x = stiffness[0, 0] * x + stiffness[0, 1] * y + stiffness[0, 2] * z
+        held_y = stiffness[1, 0] * x + stiffness[1, 1] * y + stiffness[1, 2] * z
+        held_z = stiffness[2, 0] * x + stiffness[2, 1] * y + stiffness[2, 2] * z
+    wx, wy, wz = disturbance[6] + held_x, disturbance[7] + held_y, disturbance[8] + held_z
     for i in range(3):
-        out_n[i] = 0.0
-        for k in range(3):
-            held = stiffness[k, 0] * innovation[0] + stiffness[k, 1] * innovation[1] + stiffness[k, 2] * innovation[2]
-            out_n[i] += inverse[k, i] * (disturbance[6 + k] + held)
+        out_n[i] = inverse[0, i] * wx + inverse[1, i] * wy + inverse[2, i] * wz
     if law["adaptation"]["on"] != 0:
         adaptation.discount(memory["adaptation"], inverse, out_n)
 

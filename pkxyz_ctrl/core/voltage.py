@@ -38,8 +38,8 @@ def force_limits(drive: np.void, count_last: CountVector, lower_n: Array, upper_
         drive["force_gain_n_per_v2"],
     )
     for i in range(3):
-        low = scale * max(0, count_last[i] - slew)
-        high = scale * min(most, count_last[i] + slew)
+        low = scale * np.int32(max(0, count_last[i] - slew))  # a processor of 32 bits turns 64 into a double by a call
+        high = scale * np.int32(min(most, count_last[i] + slew))
         lower_n[i] = gain[i] * low * low
         upper_n[i] = gain[i] * high * high
 
@@ -61,7 +61,8 @@ def counts_for_forces(
         if drive["noise_shaping"] != 0 and wanted > 0.0:
             wanted += carry_v[i]
         low, high = max(0, count_last[i] - slew), min(most, count_last[i] + slew)
-        nearest = np.int32(wanted / scale + 0.5) if wanted < scale * (high + 1) else high  # 0 for the least: -0.5
+        above = scale * np.int32(high + 1)
+        nearest = np.int32(wanted / scale + 0.5) if wanted < above else high  # 0 for the least: -0.5
         count[i] = min(max(nearest, low), high)
         carry_v[i] = min(max(wanted - scale * count[i], -scale), scale)
 

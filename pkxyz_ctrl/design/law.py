@@ -116,6 +116,15 @@ def _fill_estimator(
     law["operating_point_m"] = model.position_m
     law["sense_delay_s"] = stage.sense_delay_s
     law["half_period_s"] = 0.5 * bus.period_s
+    law["decoupled"] = _are_diagonal(
+        *(law[name][0] for name in ("transition", "input", "input_lag", "stiffness_n_per_m"))
+    )
+
+
+def _are_diagonal(*matrices: Array) -> bool:
+    """Whether all of these are, block of (3,3) by block: then the tick leaves out what is multiplied by 0."""
+    blocks = (np.moveaxis(m.reshape(m.shape[0] // 3, 3, m.shape[1] // 3, 3), 2, 1) for m in matrices)
+    return all(not block[..., ~np.eye(3, dtype=bool)].any() for block in blocks)
 
 
 def _fill_feedback(
@@ -123,6 +132,8 @@ def _fill_feedback(
 ) -> None:
     law["position_gain_n_per_m"], law["velocity_gain_n_s_per_m"] = regulator_gain(sampled, controller.regulator)
     law["damping_n_s_per_m"] = model.damping_n_s_per_m
+    gains = (law["position_gain_n_per_m"][0], law["velocity_gain_n_s_per_m"][0])
+    law["decoupled"] = _are_diagonal(*gains, model.damping_n_s_per_m)
     law["mass_kg"] = model.mass_kg
     law["period_s"] = bus.period_s
     law["ripple_s_per_kg"] = bus.period_s / (12.0 * model.mass_kg)
@@ -135,6 +146,7 @@ def _fill_feedback(
 def _fill_set_points(law: Any, controller: ControllerConfig, sampled: SampledStage) -> None:
     config = controller.set_points
     law["position_gain_n_per_m"], law["velocity_gain_n_s_per_m"] = regulator_gain(sampled, config)
+    law["decoupled"] = _are_diagonal(law["position_gain_n_per_m"][0], law["velocity_gain_n_s_per_m"][0])
     finds_its_way = controller.law == "mpc"  # plans inside the limits
     law["jump_step_m"] = math.inf if finds_its_way else config.jump_speed_m_per_s * sampled.period_s
 

@@ -14,12 +14,17 @@ from pkxyz_ctrl.export.targets import Target
 _SOFT_DOUBLE = re.compile(r"__aeabi_(d\w+|\w*2d|cd\w+|f2d)")
 _LIBRARY = re.compile(r"(__aeabi_)?mem(set|clr|cpy|move)[48]?")
 # of mangled names: where a tick's time goes, all else is to be small; of that what stands apart, not to be made small
-# with its callers; and what of it is seldom called, or so long that its loops had better stay loops
+# with its callers, nor to have its stack held while others work; and what of it is seldom called, or so long that its
+# loops had better stay loops
 _IN_A_HURRY = re.compile(r"10pkxyz_ctrl4core")
 _APART = re.compile(
     r"10adaptation(5learn|8_compare|5begin)B|10linear_law(7advance|12add_feedback)B|5youla12add_feedbackB"
+    r"|9estimator11predict_farB|9feed_hold3rowB|5cycle7observeB"
 )
-_SELDOM = re.compile(r"10adaptation(5learn|5begin|8set_base|8_compare|5clear)B")
+_SELDOM = re.compile(
+    r"10adaptation(5learn|5begin|8set_base|8_compare|5clear)B|9estimator11predict_farB|10allocation7_searchB"
+    r"|9feed_hold6sampleB"
+)
 _ROUNDS = 2  # of the passes: what a callee turned out to return is known to its caller in the second
 
 

@@ -156,12 +156,7 @@ def observe(law_array: Records, memory_array: Records, reference: Records) -> No
     if memory["suspects"] != 0:
         for i in range(3):
             memory["tick"]["estimate"]["innovation_m"][i] = memory["rejected_innovation_m"][i]
-    delay = law["tick"]["delay_periods"]
-    set_points.reference_row(law, memory, reference, 0, memory["here"])
-    set_points.asked_for(memory, reference)
-    set_points.reference_row(law, memory, reference, delay, memory["now"])
-    set_points.reference_row(law, memory, reference, delay + 1, memory["after"])
-    set_points.reference_row(law, memory, reference, delay + 2, memory["later"])
+    set_points.reference_rows(law, memory, reference)
     quiet = law["quiet_holds"] != 0 or memory["input"]["quiet"] != 0
     youla.ask(memory["tick"]["youla"], quiet, memory["here"], memory["later"])
 
@@ -298,9 +293,8 @@ def _monitor(law: np.void, memory: np.void, saturated: int) -> int:
         obs["sense_count"][i] = seen["sense_count"][i]
         obs["stroke_m"][i] = state["stroke_m"][i]
         obs["innovation_m"][i] = state["estimate"]["innovation_m"][i]
-        obs["voltage_step_v"][i] = law["tick"]["drive"]["volt_per_count"] * (
-            state["count"][0, i] - state["count"][1, i]
-        )
+        step = np.int32(state["count"][0, i] - state["count"][1, i])  # see ``voltage.force_limits``
+        obs["voltage_step_v"][i] = law["tick"]["drive"]["volt_per_count"] * step
     trips = check(law["limits"], memory["monitors"], obs) | seen["trips"]
     if trips != 0 and memory["mode"] != _FAULT:
         is_landing = memory["mode"] == _LANDING

@@ -52,6 +52,7 @@ def take_over(law_array: Records, memory_array: Records, change_array: Records) 
     for i in range(3):  # not every law keeps it
         held_n[i] = state["feedforward_n"][i] + held_n[i]
     law_array[0] = change["law"]
+    state["set_point_model"]["foreseen"] = 0  # by the old law
     youla.clear(state["youla"])
     state["youla"]["faded"] = 0
     for k in range(ORDER_MAX):

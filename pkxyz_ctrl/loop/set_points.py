@@ -33,23 +33,35 @@ def reference_row(law: np.void, memory: np.void, reference: Records, ahead: int,
         at = memory["reference_tick"] - base + ahead + memory["phase"]
         feed_hold.sample(reference, at, 1.0, 0.0, law["period_us"] * 1e-6, out)
     elif memory["mode"] == _TRACKING:
-        index = memory["reference_tick"] - base + ahead
-        motion = reference[min(max(index, 0), len(reference) - 1)]["motion"]
-        for i in range(_ROW_LENGTH):
-            out[i] = motion[i]
+        feed_hold.row(reference, memory["reference_tick"] - base + ahead, out)
     else:
         for i in range(_ROW_LENGTH):
             out[i] = memory["setpoint"][i]
 
 
 @njit(cache=True, error_model="numpy")
-def asked_for(memory: np.void, reference: Records) -> None:
-    """Note the position asked for at this sample, for the record; while the path stops or starts, with its shift."""
-    on_time = memory["feed"] == feed_hold.STEADY and memory["phase"] == 0.0
-    from_row = memory["mode"] == _TRACKING and on_time
-    index = min(max(memory["reference_tick"] - reference[0]["tick"], 0), len(reference) - 1)
+def reference_rows(law: np.void, memory: np.void, reference: Records) -> None:
+    """Write the rows that count in this tick: at its sample, at both ends of the interval in which its force acts, and
+    a period after that. Beside them the position asked for at the sample, for the record: without a learnt shift,
+    unless the path stops or starts.
+    """
+    delay, here, asked = law["tick"]["delay_periods"], memory["here"], memory["asked_m"]
+    if memory["mode"] == _TRACKING and memory["feed"] == feed_hold.STEADY and memory["phase"] == 0.0:  # in short
+        at = memory["reference_tick"] - reference[0]["tick"]
+        feed_hold.row(reference, at, here)
+        feed_hold.row(reference, at + delay, memory["now"])
+        feed_hold.row(reference, at + delay + 1, memory["after"])
+        feed_hold.row(reference, at + delay + 2, memory["later"])
+        position = reference[min(max(at, 0), len(reference) - 1)]["asked_m"]
+        for i in range(3):
+            asked[i] = position[i]
+        return
+    reference_row(law, memory, reference, 0, here)
+    reference_row(law, memory, reference, delay, memory["now"])
+    reference_row(law, memory, reference, delay + 1, memory["after"])
+    reference_row(law, memory, reference, delay + 2, memory["later"])
     for i in range(3):
-        memory["asked_m"][i] = reference[index]["asked_m"][i] if from_row else memory["here"][i]
+        asked[i] = here[i]
 
 
 @njit(cache=True, error_model="numpy")
@@ -102,6 +114,7 @@ def begin_landing(memory: np.void) -> None:
     for i in range(3):
         memory["landing_from"][i] += model["short_m"][i]
         model["short_m"][i] = 0.0
+    model["foreseen"] = 0
     memory["landing_age"] = -1
     memory["tick"]["landing"] = 1
 

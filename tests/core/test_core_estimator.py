@@ -7,10 +7,13 @@ from loop_rig import MIDDLE, bus, controller, new_tick_memory, stage, tick_law
 from scipy.integrate import solve_ivp
 from scipy.stats import chi2
 
+from pkxyz_ctrl.config.calibration import Calibration
 from pkxyz_ctrl.core import estimator as filtering
 from pkxyz_ctrl.core import tick
+from pkxyz_ctrl.design.law import design_law
 from pkxyz_ctrl.design.laws.estimator_gain import measurement_matrix, measurement_noise, process_noise
 from pkxyz_ctrl.design.model.plant_model import amplifier_time_constant_s, linearise, sample
+from pkxyz_ctrl.stage import Stage
 
 SIZE = np.repeat([1e-6, 1e-3, 1e-4], 3)  # of position, velocity and disturbance, for comparing relative to something
 
@@ -56,6 +59,34 @@ def test_steps_equal_those_of_filterpy(bus_name, delay_s):
         twin.predict_steadystate(np.concatenate([w, w_change])[:, None])
         assert np.abs((out - twin.x[:, 0]) / SIZE).max() <= 1e-12 * np.abs(twin.x[:, 0] / SIZE).max()
         state["predicted"][:] = out
+
+
+@pytest.mark.parametrize("bus_name", ["fd_5k", "local_20k"])
+def test_what_is_multiplied_by_nothing_may_be_left_out(bus_name):
+    """Axes that do not act on each other give the same bits with and without the products by 0."""
+    law, rng = tick_law(bus_name), np.random.default_rng(3)
+    record, geometry, elasticity = law["estimator"], law["geometry"], law["elasticity"]
+    assert record["decoupled"] == 1
+    for _ in range(200):
+        s, force, old, apart = rng.normal(size=9) * SIZE, *(np.abs(rng.normal(size=(3, 3))) * 1e-4)
+        found = []
+        for decoupled in (1, 0):
+            record["decoupled"] = decoupled
+            at, w, w_change, out = np.empty(3), np.empty(3), np.empty(3), np.empty(9)
+            filtering.midway(record, s, at)
+            filtering.net_input(geometry, elasticity, record, at, force, old, apart, 0.5 * apart, w, w_change)
+            filtering.predict(record, s, w, w_change, out)
+            found.append(np.concatenate([w, w_change, out]).tobytes())
+        assert found[0] == found[1]
+
+
+def test_axes_of_a_stage_whose_chains_differ_act_on_each_other():
+    """... so nothing may be left out there."""
+    config = stage().config.model_copy(update={"calibration": Calibration(slider_stiffness=(1.02, 1.0, 0.97))})
+    law = design_law(Stage(config), controller(), bus(), autostart=True)["tick"][0]
+    assert law["estimator"]["transition"][0, 1] != 0.0
+    for name in ("estimator", "feedback", "set_points"):
+        assert law[name]["decoupled"] == 0
 
 
 @pytest.mark.parametrize("delay_periods", [1, 2])

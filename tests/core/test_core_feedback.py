@@ -86,6 +86,24 @@ def test_authority_where_a_comb_would_have_to_push_is_none():
     assert authority_at(strokes) == 0.0
 
 
+@pytest.mark.parametrize("name", ["feedback", "set_points"])
+def test_what_is_multiplied_by_nothing_may_be_left_out(name):
+    """Axes that do not act on each other give the same bits with and without the products by 0."""
+    law, rng = tick_law(), np.random.default_rng(5)
+    gains, regulator, origin = law["feedback"], law[name], law["estimator"]["operating_point_m"]
+    assert gains["decoupled"] == regulator["decoupled"] == 1
+    for _ in range(200):
+        row, state = rng.normal(size=(2, 9)) * np.repeat([1e-6, 1e-3, 1e-1], 3)
+        force_n, share, found = rng.normal(size=3) * 1e-4, rng.random(), []
+        for decoupled in (1, 0):
+            gains["decoupled"] = regulator["decoupled"] = decoupled
+            moved, fed_back = force_n.copy(), force_n.copy()
+            feedback.add_motion(gains, row, moved)
+            feedback.add_feedback(regulator, origin, state, row, share, fed_back)
+            found.append(moved.tobytes() + fed_back.tobytes())
+        assert found[0] == found[1]
+
+
 def on_the_reference(row):
     """Law and memory of a tick whose estimate and model lie on the reference, whose comb forces are free of limits and
     whose reference acts at once: what ``act`` then commands is its feed-forward alone."""

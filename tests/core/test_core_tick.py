@@ -17,7 +17,7 @@ def exact(strokes_m):
 
 def after_a_step(strokes_m, start_m):
     position = start_m.copy()
-    size = kinematics.newton_step(stage().geometry[0], strokes_m, position)
+    size = kinematics.newton_step(stage().geometry[0], strokes_m, position, np.empty(3))
     return position, size
 
 
@@ -44,12 +44,21 @@ def test_a_micrometre_of_prediction_error_leaves_nanometres_and_30_nm_less_than_
         assert size == pytest.approx(np.abs(direction).max() * distance, rel=1e-2, abs=1e-20)
 
 
+@settings(max_examples=100)
+@given(STROKES, STROKES)
+def test_a_newton_step_says_how_far_the_strokes_were_off(strokes_m, other_m):
+    residual, position = np.empty(3), exact(other_m)
+    expected = strokes_m - stage().inverse_kinematics(position)
+    kinematics.newton_step(stage().geometry[0], strokes_m, position, residual)
+    assert np.array_equal(residual, expected)
+
+
 def test_where_the_jacobian_is_singular_nothing_moves():
     """Links that lie in the plane have no say over z."""
     geometry = stage().geometry.copy()[0]
     flat = np.array([1e-6, 2e-6, -geometry["height_rest_m"]])
     start = flat.copy()
-    assert kinematics.newton_step(geometry, np.full(3, 5e-6), start) == np.inf
+    assert kinematics.newton_step(geometry, np.full(3, 5e-6), start, np.empty(3)) == np.inf
     assert np.array_equal(start, flat)
 
 
@@ -101,6 +110,23 @@ def test_starting_the_filter_somewhere_means_at_rest_there():
         assert state[:3] + law["estimator"]["operating_point_m"] == pytest.approx(at, rel=1e-12)
         assert not state[3:].any()
     assert not memory["estimate"]["innovation_m"].any()
+
+
+def test_what_nothing_explains_is_said_comb_by_comb():
+    """B^-T (d + K_0 e), with the same bits where the products by 0 are left out."""
+    law, memory, rng, found = tick_law(), new_tick_memory(), np.random.default_rng(6), []
+    disturbance_n, innovation_m = rng.normal(size=3) * 1e-6, rng.normal(size=3) * 1e-9
+    inverse = np.linalg.inv(stage().jacobian(exact(MIDDLE)))
+    memory["estimate"]["filtered"][6:], memory["estimate"]["innovation_m"][:] = disturbance_n, innovation_m
+    memory["scratch"]["inverse"][:] = inverse
+    assert law["estimator"]["decoupled"] == 1
+    for decoupled in (1, 0):
+        law["estimator"]["decoupled"], out = decoupled, np.empty(3)
+        tick.unexplained_force(law, memory, out)
+        found.append(out)
+    expected = inverse.T @ (disturbance_n + law["estimator"]["stiffness_n_per_m"] @ innovation_m)
+    assert found[0] == pytest.approx(expected, rel=1e-12)
+    assert found[0].tobytes() == found[1].tobytes()
 
 
 @pytest.mark.parametrize("field", ["ahead", "force_n", "demand_n"])

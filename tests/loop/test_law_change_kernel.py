@@ -27,6 +27,7 @@ def plainly(present, memory, new, heard):
     youla.clear(state["youla"])
     state["youla"]["faded"] = 0
     state["linear"]["x"] = heard
+    state["set_point_model"]["foreseen"] = 0
     return adapts_alike
 
 

@@ -263,7 +263,7 @@ def test_the_linear_equivalent_is_what_the_tick_does(name, delay_periods, stroke
     expected = lqg_equivalent(stage(), designed, strokes_m)
     numbers = designed["tick"].copy()[0]
     numbers["drive"]["volt_per_count"] /= 50_000
-    numbers["drive"]["count_max"], numbers["drive"]["count_slew_max"] = 2**31 - 1, 2**30
+    numbers["drive"]["count_max"], numbers["drive"]["count_slew_max"] = 2**31 - 2, 2**30  # and one more is a count
     numbers["drive"]["noise_shaping"] = 0
     memory, at = new_tick_memory(), stage().forward_kinematics(strokes_m)
     memory["count"][:] = np.round(stage().holding_voltages(at) / numbers["drive"]["volt_per_count"])
