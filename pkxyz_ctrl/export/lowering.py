@@ -22,8 +22,7 @@ _APART = re.compile(
     r"|9estimator11predict_farB|9feed_hold3rowB|5cycle7observeB"
 )
 _SELDOM = re.compile(
-    r"10adaptation(5learn|5begin|8set_base|8_compare|5clear)B|9estimator11predict_farB|10allocation7_searchB"
-    r"|9feed_hold6sampleB"
+    r"10adaptation(5learn|5begin|8set_base|8_compare|5clear)B|9estimator11predict_farB|9feed_hold6sampleB"
 )
 _ROUNDS = 2  # of the passes: what a callee turned out to return is known to its caller in the second
 

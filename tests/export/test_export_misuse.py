@@ -20,7 +20,7 @@ from pkxyz_ctrl.loop.exchange import EXCHANGE
         (("--ticks", "10"), "ticks"),
         (("--target", "cortex-m4"), "a period of 200 us is too short for cortex-m4, where the longest tick takes 3700"),
         (("--controller", "robust_20k", "--bus", "local_20k", "--target", "host"), "bus 'local_20k' has no [can]"),
-        (("--controller", "robust_20k", "--bus", "local_20k"), "give a bus of 80 us or more, or another target"),
+        (("--controller", "robust_20k", "--bus", "local_20k"), "give a bus of 101 us or more, or another target"),
     ],
 )
 def test_what_does_not_go_is_said_in_a_line(tmp_path, capsys, monkeypatch, words, says):
