@@ -100,9 +100,16 @@ class Reader(_Ring):
     def read_block(self, most: int) -> NDArray[np.void]:
         """Up to ``most`` next records (n,), copies; none where there is none, or it is not whole."""
         block = self._straight(most)
-        if 0 < len(block) < most and len(rest := self._straight(most - len(block))):
-            return np.concatenate([block, rest])
-        return block
+        is_at_front = (self.next - 1) % self.slots == 0
+        if not 0 < len(block) < most or not is_at_front or not len(rest := self._straight(most - len(block))):
+            return block
+        both = np.empty(len(block) + len(rest), block.dtype)  # np.concatenate looks at each field of a record anew
+        both[: len(block)], both[len(block) :] = block, rest
+        return both
+
+    def skip(self) -> None:
+        """Leave out what there is, as nobody wants it."""
+        self.next = max(self.next, self.newest + 1)
 
     def latest(self) -> NDArray[np.void] | None:
         """The newest whole record, (1,), whatever was read before; None if there is none."""

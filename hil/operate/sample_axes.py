@@ -4,6 +4,7 @@ The stage's own are kept in every record of the loop; whoever stands between the
 """
 
 import math
+from functools import lru_cache
 from typing import Annotated
 
 import numpy as np
@@ -89,6 +90,16 @@ class Turn:
     def way_to_sample(self, way: Array) -> Array:
         """Ways, velocities (..., 3)."""
         return way if self.is_plain else way @ self._back.T
+
+
+def turn_of(matrix: Array) -> Turn:
+    """``Turn`` of a matrix (3, 4) that was most likely asked for before. Raises ``ValueError``."""
+    return _turn(np.ascontiguousarray(matrix, np.float64).tobytes())
+
+
+@lru_cache(maxsize=4)
+def _turn(matrix: bytes) -> Turn:
+    return Turn(np.frombuffer(matrix).reshape(3, 4))
 
 
 def _about_z(angle: float) -> Array:

@@ -3,7 +3,6 @@
 import asyncio
 import contextlib
 import hmac
-import inspect
 import logging
 from collections.abc import AsyncIterator, Awaitable, Callable
 from pathlib import Path
@@ -26,7 +25,11 @@ PAGE = Path(__file__).parent / "page"
 CLIENTS_MOST = 32
 _ASKED_MOST = 1000
 """Messages of a client that wait for those before them."""
-_LOOK_S, _SHOW_S, _STATUS_S = 0.02, 1 / 30, 0.1
+_LOOK_S = 1 / 60
+"""It looks as often for answers while somebody waits for one, else whenever it shows."""
+_SHOW_EACH, _STATUS_EACH = 2, 6
+_KEEP_S = 0.2
+_ROWS_MOST = 2000
 _LOG = logging.getLogger(__name__)
 _HEADERS = [
     (b"content-security-policy", b"default-src 'self'; style-src 'self' 'unsafe-inline'; img-src 'self' data: blob:"),
@@ -58,6 +61,9 @@ class OnlyOurHost:
                 await WebSocket(scope, receive, send).close(4403)
             else:
                 await PlainTextResponse("not from here", 403)(scope, receive, send)
+            return
+        if scope["type"] == "websocket":
+            await self._app(scope, receive, send)
             return
 
         async def with_headers(message: Any) -> None:
@@ -109,7 +115,7 @@ def app_of(desk: Desk, token: str, hosts: frozenset[str]) -> Starlette:
 
     @contextlib.asynccontextmanager
     async def lifespan(app: Starlette) -> AsyncIterator[None]:
-        tasks = [asyncio.create_task(repeat(period, each)) for period, each in _rounds(desk)]
+        tasks = [asyncio.create_task(go_rounds(desk)), asyncio.create_task(keep_faults(desk))]
         try:
             yield
         finally:
@@ -144,27 +150,54 @@ async def _speak(socket: WebSocket, client: Client) -> None:
                 await socket.send_text(said)
 
 
-def _rounds(desk: Desk) -> list[tuple[float, Callable[[], object]]]:
-    return [
-        (_LOOK_S, desk.look), (_SHOW_S, lambda: desk.show_telemetry(2000)), (_STATUS_S, desk.tell_status),
-        (_STATUS_S, desk.keep_fault),
-    ]  # fmt: skip
-
-
-async def repeat(period_s: float, each: Callable[[], object]) -> None:
-    """Again and again. One that fails is told with its trace, once until one succeeds, and does not end the others."""
-    failed = False
+async def go_rounds(desk: Desk) -> None:
+    """Look, show and tell again and again, in one awakening as far as possible."""
+    look, show, tell = (
+        Round("look for answers", desk.look),
+        Round("show telemetry", lambda: desk.show_telemetry(_ROWS_MOST)),
+        Round("tell where the stage is", desk.tell_status),
+    )
+    passed = 0
     while True:
+        await look.go()
+        if passed % _SHOW_EACH == 0:
+            await show.go()
+        if passed % _STATUS_EACH == 0:
+            await tell.go()
+        step = 1 if desk.is_waited_for else _SHOW_EACH - passed % _SHOW_EACH
+        await _next_period(_LOOK_S, step)
+        passed += step
+
+
+async def keep_faults(desk: Desk) -> None:
+    """It takes its time, and nobody waits for it."""
+    keep = Round("keep what was around a fault", desk.keep_fault)
+    while True:
+        await keep.go()
+        await asyncio.sleep(_KEEP_S)
+
+
+class Round:
+    """What is done again and again. Where it fails it is told with its trace, once until it succeeds, and ends
+    nothing.
+    """
+
+    def __init__(self, what: str, work: Callable[[], Awaitable[None] | None]) -> None:
+        self._what, self._work = what, work
+        self._failed = False
+
+    async def go(self) -> None:
+        """Once."""
         try:
-            done = each()
-            if inspect.isawaitable(done):
-                await done
-            failed = False
+            if (slow := self._work()) is not None:
+                await slow
+            self._failed = False
         except Exception:
-            if not failed:
-                _LOG.exception("a round of the server failed, and is tried again every %g s", period_s)
-            failed = True
-        await asyncio.sleep(period_s)
+            if not self._failed:
+                _LOG.exception("the server could not %s, and goes on trying", self._what)
+            self._failed = True
 
 
-Plan = Callable[..., Awaitable[Any]]
+async def _next_period(period_s: float, count: int) -> None:
+    """Until the loop's clock has passed so many whole periods."""
+    await asyncio.sleep(count * period_s - asyncio.get_running_loop().time() % period_s)

@@ -63,8 +63,8 @@ class Desk:
         self._jog_direction = [0.0, 0.0, 0.0]
         self._numbers = 0
         self._bus_load = BusLoad()
+        self._heeds_silence = False
         self._setting = Setting(link, planner, store or SettingsStore(), self._settings_changed)
-        self._ranges: tuple[list[float], list[list[float | None]]] = ([], [])
 
     # -- clients -------------------------------------------------------------------------------------------------------
 
@@ -276,12 +276,16 @@ class Desk:
             raise AskedWrongError("control was given away while it was prepared")
 
     def _settings_changed(self) -> None:
-        self._ranges = ([], [])
         for client in self.clients:
             client.tell(self._hello(client))
             client.tell({"settings": self._setting.told()})
 
     # -- what the loop says --------------------------------------------------------------------------------------------
+
+    @property
+    def is_waited_for(self) -> bool:
+        """Whether the loop has something to answer or to be fed with, or would do something if it heard nothing."""
+        return self._heeds_silence or self._feeding is not None or any(client.tags for client in self.clients)
 
     def look(self) -> None:
         """Hand on what has come from the loop, and feed it."""
@@ -322,8 +326,7 @@ class Desk:
 
     async def keep_fault(self) -> None:
         """Save what was around a fault, once that is over."""
-        newest = self.link.newest()
-        if self._fault_us < 0 or newest is None:
+        if self._fault_us < 0 or (newest := self.link.newest()) is None:
             return
         since_s = (int(newest["row"]["t_us"]) - self._fault_us) * 1e-6
         if since_s < AFTER_S and self.link.is_alive:
@@ -356,7 +359,9 @@ class Desk:
         else:
             load = self._bus_load.at(newest)
             status = status_of(newest, self.link.description, load) | {"alive": self.link.is_alive}
-            status["range_m"] = self._ranges_at(newest["session"]["target_m"])
+            status["range_m"] = self._planner.ranges(newest["session"]["target_m"])
+            parks = status["driven"] and self.link.description.get("on_silence") == "park"
+            self._heeds_silence = parks or status["running_id"] != 0
         status |= {
             "last_fault": self.last_fault,
             "saved": self.saved,
@@ -366,12 +371,6 @@ class Desk:
         text = json.dumps({"status": status}, allow_nan=False)
         for client in self.clients:
             client.tell_status(text)
-
-    def _ranges_at(self, target_m: np.ndarray) -> list[list[float | None]]:
-        """How far each axis can go; looked for when the target is another."""
-        if self._ranges[0] != target_m.tolist():
-            self._ranges = (target_m.tolist(), self._planner.ranges(target_m.copy()))
-        return self._ranges[1]
 
     # -- telemetry -----------------------------------------------------------------------------------------------------
 
@@ -386,14 +385,14 @@ class Desk:
 
     def show_telemetry(self, most: int) -> None:
         """New rows to whoever asked for them."""
-        if self.link.newest() is None:
+        if not self.link.is_joined:
             return
         ticks, before = self.link.ticks, self.link.ticks.lost
-        rows = ticks.read_block(most)
         looking = [client for client in self.clients if client.fields]
-        if not len(rows) or not looking:
-            return
-        moment = Moment(int(rows["row"]["tick"][0]), of_sample(rows))
-        for client in looking:
-            client.lost += ticks.lost - before
-            client.show(moment)
+        if not looking:
+            ticks.skip()
+        elif len(rows := ticks.read_block(most)):
+            moment = Moment(int(rows["row"]["tick"][0]), of_sample(rows))
+            for client in looking:
+                client.lost += ticks.lost - before
+                client.show(moment)

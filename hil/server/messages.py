@@ -6,7 +6,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from hil.operate.sample_axes import Turn
+from hil.operate.sample_axes import turn_of
 from hil.server.paths import StagePath
 from pkxyz_ctrl.loop.row import ROW
 
@@ -89,9 +89,9 @@ def of_sample(ticks: NDArray[np.void]) -> dict[str, NDArray[Any]]:
     were in each tick. Forces, voltages and what belongs to combs stay the stage's.
     """
     rows, matrices = ticks["row"], ticks["session"]["matrix"]
-    turns = [(0, len(ticks), Turn(matrices[0]))]
+    turns = [(0, len(ticks), turn_of(matrices[0]))]
     if (matrices != matrices[0]).any():
-        turns = [(n, n + 1, Turn(matrix)) for n, matrix in enumerate(matrices)]
+        turns = [(n, n + 1, turn_of(matrix)) for n, matrix in enumerate(matrices)]
     fields: dict[str, NDArray[Any]] = {name: rows[name] for name in FIELDS - _OF_SESSION.keys()}
     fields |= {name: ticks["session"][of] for name, of in _OF_SESSION.items()}
     if all(turn.is_plain for *_, turn in turns):

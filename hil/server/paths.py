@@ -126,6 +126,7 @@ class Planner:
         }
         """what the files say, for people"""
         self._reach = Reach(self.stage, self._drive)
+        self._ranges: tuple[list[float], list[list[float | None]]] = ([], [])
 
     @property
     def turn(self) -> Turn:
@@ -134,7 +135,7 @@ class Planner:
 
     @turn.setter
     def turn(self, turn: Turn) -> None:
-        self._reach.turn = turn
+        self._reach.turn, self._ranges = turn, ([], [])
 
     def body(self, position_m: Array) -> dict[str, Any]:
         """What the combs hold: outlines in the sample's three planes through a position of the stage, or through the
@@ -150,10 +151,15 @@ class Planner:
 
     def ranges(self, target_m: Array) -> list[list[float | None]]:
         """Least and greatest target of each axis that the combs can hold with the others at theirs, in m of the sample;
-        ``target_m`` (3,) is of the stage.
+        ``target_m`` (3,) is of the stage. Looked for when the target is another.
         """
-        found = [self._reach.range_along(target_m, axis) for axis in range(3)]
-        return [[None, None] if low_high is None else list(low_high) for low_high in found]
+        if self._ranges[0] != target_m.tolist():
+            found = [self._reach.range_along(target_m.copy(), axis) for axis in range(3)]
+            ranges: list[list[float | None]] = [
+                [None, None] if low_high is None else list(low_high) for low_high in found
+            ]
+            self._ranges = (target_m.tolist(), ranges)
+        return self._ranges[1]
 
     def of_scenario(self, name: str, pixels: int = 0) -> StagePath:
         """The reference of a shipped scenario, with so many pixels on each line: names only, as a client can't be let

@@ -15,6 +15,7 @@ from pathlib import Path
 
 import tomlkit
 import uvicorn
+import uvloop
 
 from hil.lanes.standstill import STANDSTILL_US
 from hil.server.app import app_of
@@ -27,7 +28,7 @@ from pkxyz_ctrl.client.protocol import TEXT_MAX_BYTES
 from pkxyz_ctrl.config.files import ConfigError, find
 from pkxyz_ctrl.config.refused import reason
 
-_ENDS_S = 3.0
+_ENDS_S, _ENDED_S = 3.0, 0.2
 _LOOPBACK = ("127.0.0.1", "localhost", "::1")
 SENT_AHEAD_BYTES = 32_768
 """That the system keeps for one who reads slowly: a third of a second of the page's telemetry. With the megabytes that
@@ -148,13 +149,14 @@ def _run(server: uvicorn.Server, bound: socket.socket, children: _Children) -> i
         serving = asyncio.create_task(server.serve([bound]))
         ended = None
         while not serving.done() and ended is None:
-            await asyncio.sleep(0.1)
+            await asyncio.sleep(_ENDED_S)
             ended = children.ended
         server.should_exit = True
         await serving
         return ended
 
-    ended = asyncio.run(main())
+    with asyncio.Runner(loop_factory=uvloop.new_event_loop) as runner:
+        ended = runner.run(main())
     if ended is not None:
         print(f"pkxyz: the {ended} has ended by itself; the combs are at 0 V", file=sys.stderr)
         return 1

@@ -6,7 +6,7 @@ from typing import Any
 import numpy as np
 
 from hil.operate.commands import ACTIVITY_WORDS, Activity
-from hil.operate.sample_axes import Turn
+from hil.operate.sample_axes import turn_of
 from pkxyz_ctrl.config.triggers import BITS
 from pkxyz_ctrl.safety.modes import LOOP_CLOSED, MODE_FACTS, Mode
 
@@ -33,7 +33,7 @@ class BusLoad:
 def status_of(tick: np.void, description: dict[str, Any], bus_load: float) -> dict[str, Any]:
     """Plain data of a record of ``TICK``; lengths in m, in the sample's coordinates; voltages in V."""
     row, session = tick["row"], tick["session"]
-    turn = Turn(session["matrix"])
+    turn = turn_of(session["matrix"])
     setpoint, position, target = (
         turn.to_sample(place) for place in (row["reference_m"], row["estimate_m"], session["target_m"])
     )
