@@ -245,7 +245,7 @@ SNAPSHOT = np.dtype(
 OPERATED = np.dtype(
     [
         ("orders", ORDERS, (1,)),
-        ("looked", "i8"),  # newest snapshot that the session has looked at
+        ("looked", "i8"),  # newest snapshot that the session has looked at; what followed from it was ordered before
         ("newest", "i8"),  # snapshot
         ("snapshots", SNAPSHOT, (SNAPSHOTS,)),  # of the ends of the last ticks
         ("change", CHANGE, (1,)),

@@ -218,3 +218,24 @@ def test_a_stage_without_voltage_waits_for_a_session_as_long_as_it_takes(library
     for _ in range(BLIND_TICKS + 10):
         side.tick()
     assert side.library.alone_asked() == 0
+
+
+def test_beside_hardware_no_tick_waits_for_the_session(library, setup):
+    side = Side(library, setup)
+    side.tick()
+    assert library.alone_awaited(3) == 0
+
+
+def test_in_simulation_time_stands_still_until_the_session_has_looked_and_not_for_one_that_stays_away(library, setup):
+    side = Side(library, setup)
+    side.shared["settings"]["standstill_us"] = 1000
+    assert library.alone_awaited(7) == 7
+    assert library.alone_awaited(1) == 0  # it has looked
+    side.tick()
+    assert library.alone_awaited(0) == 20  # for 1000 us, 50 at once
+    side.tick()
+    assert library.alone_awaited(5) == 0  # once
+    side.step(0, lambda setpoints: None)
+    assert library.alone_awaited(5) == 0  # it is back, so ...
+    side.tick()
+    assert library.alone_awaited(5) == 5

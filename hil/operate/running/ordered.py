@@ -53,7 +53,7 @@ class Ordered(Teller):
         self._port, self._obeyed = port.copy(), slot["obeyed"][0].copy()
         if int(slot["begun"]) != newest:  # being written over: the next one comes soon
             return False
-        self.seen = self._operated["looked"] = newest
+        self.seen = newest
         return True
 
     def answered(self, setpoints: Sheets) -> bool:
@@ -128,3 +128,4 @@ class Ordered(Teller):
             self._bits = 0
             self._number += 1
             orders["number"] = self._number
+        self._operated["looked"] = self.seen

@@ -88,8 +88,10 @@ static void exchange(const pkxyz_shared_settings *settings, const pkxyz_referenc
 {
     controller_sync(t_us);
     await(settings, t_us + settings->sense_deadline_us);
-    if (settings->is_operated)
+    if (settings->is_operated) {
+        orders_await();
         orders_take(&rows, &rows_count);
+    }
     controller_compute(rows, rows_count, overrun);
     ticks_computed(t_us);
     controller_finish(clock_now_us(), t_us + settings->heartbeat_deadline_us);

@@ -5,21 +5,24 @@
 #include <string.h>
 #include <unistd.h>
 
+#include "clock.h"
 #include "controller.h"
 #include "ending.h"
 
 enum { LOOKED_AHEAD = 2 }; /* rows, behind the delay */
+enum { STANDS_US = 50 };
 
 static pkxyz_shared *shared;
 static const pkxyz_shared_sheet *sheet;
 static pkxyz_shared_obeyed obeyed;
-static int wake_descriptor = -1;
+static int wake_descriptor = -1, has_looked = 1;
 
 void orders_begin(pkxyz_shared *with, int wake)
 {
     shared = with;
     wake_descriptor = wake;
     sheet = 0;
+    has_looked = 1;
     obeyed = (pkxyz_shared_obeyed){0};
 }
 
@@ -84,12 +87,27 @@ static void obey(const pkxyz_shared_orders *orders)
     take_outputs(orders);
 }
 
+/* How many ticks the session has not looked at yet. */
+static int64_t unseen(void)
+{
+    const pkxyz_shared_operated *operated = shared->operated;
+    return operated->newest - atomic_load_explicit((const _Atomic int64_t *)&operated->looked, memory_order_acquire);
+}
+
 /* Whether nobody could stop or release the stage any more: whoever would is there, but looks at nothing. */
 static int is_alone(void)
 {
-    const pkxyz_shared_operated *operated = shared->operated;
-    const int64_t looked = atomic_load_explicit((const _Atomic int64_t *)&operated->looked, memory_order_relaxed);
-    return controller_is_closed() && operated->newest - looked > shared->settings->blind_ticks;
+    return controller_is_closed() && unseen() > shared->settings->blind_ticks;
+}
+
+void orders_await(void)
+{
+    const int64_t now_us = clock_now_us(), most_us = shared->settings->standstill_us;
+    for (int64_t stood_us = 0; unseen() > 0 && has_looked && stood_us < most_us; stood_us += STANDS_US) {
+        clock_wait_until(now_us + STANDS_US);
+        clock_stand_at(now_us);
+    }
+    has_looked = unseen() == 0;
 }
 
 /* Whether the law finds every row of this tick that it looks at, or the set-point stands behind the last one. */
