@@ -208,6 +208,9 @@ class Setpoints:
         step()
         self.objection = None
 
+    def _catch_up(self) -> None:
+        """With the loop, if that has gone on meanwhile."""
+
     def _renew(self, row: int) -> None:
         """Rows from ``row`` on are about to become other ones."""
 
@@ -218,6 +221,8 @@ class Setpoints:
         count = -(-rows // step) + 1
         if (why := judge(motion.rows(0, step, count, self._period_s), step)) is not None:
             raise TrajectoryError(why)
+        if self.has_arrived:  # a motion from rest may begin whenever it is ready
+            self._catch_up()
         self._set_out(Going(motion, self._period_s), target_m, self.free_row - 1)
 
     def _brake(self, limits: Limits) -> None:

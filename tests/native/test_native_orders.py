@@ -56,7 +56,8 @@ class Side:
         self.ordered = Ordered(setup, self.shared)
         self.shared["config"], self.shared["memory"] = self.ordered.record, self.ordered.exchange
         self.shared["settings"]["blind_ticks"] = BLIND_TICKS
-        self.setpoints = Sheets(200, *rows_of(self.ordered.law), self.shared["operated"]["sheets"][0])
+        sheets = self.shared["operated"]["sheets"][0]
+        self.setpoints = Sheets(200, *rows_of(self.ordered.law), sheets, self.ordered.present_row)
         self.memory = self.shared["memory"][0]
         self.keep = mapped
         self.delay = rows_of(self.ordered.law)[0]
@@ -115,6 +116,16 @@ def fine(rows, periods):
     return None
 
 
+def slowly(side, ticks):
+    """A judge who takes so many ticks."""
+
+    def judge(rows, periods):
+        for _ in range(ticks):
+            side.tick()
+
+    return judge
+
+
 step = st.tuples(
     st.integers(1, 12),  # ticks between two steps
     st.sampled_from([0, 0, 0, 0, 1, 1, 2, 3, 5, 9, 20, 60]),  # ticks that pass while it decides
@@ -129,9 +140,9 @@ def test_whatever_is_asked_and_however_late_no_set_point_jumps(library, setup, s
     side = Side(library, setup)
     for between, late, what, where in schedule:
 
-        def asked(setpoints, what=what, where=where):
+        def asked(setpoints, what=what, where=where, late=late):
             if what == "go":
-                setpoints.go(np.array([where, -where, 2e-6]), LIMITS, fine)
+                setpoints.go(np.array([where, -where, 2e-6]), LIMITS, slowly(side, late // 2))
             elif what == "brake":
                 setpoints.brake(LIMITS)
             elif what == "stop":
@@ -166,6 +177,23 @@ def test_a_sheet_that_is_late_is_refused_and_made_again_from_the_free_row(librar
     assert side.ordered._obeyed["refusals"] == 1
     assert np.allclose(side.played[-1], back, rtol=0, atol=1e-15)
     assert np.array(side.played)[:, 0].max() > 1e-9  # it had set out
+    require_smooth(side.played)
+
+
+@pytest.mark.parametrize("ticks", [1, 7, 40, 300, 1100])
+def test_a_motion_from_rest_begins_as_soon_as_it_is_planned_however_long_that_took(library, setup, ticks):
+    side, target = Side(library, setup), np.array([2e-6, 0.0, 1e-6])
+    side.step(0, lambda setpoints: None)
+    side.tick()
+    assert side.step(0, lambda setpoints: setpoints.go(target, LIMITS, slowly(side, ticks)))
+    begun = len(side.played)
+    for _ in range(400):
+        side.tick()
+        side.step(0, lambda setpoints: None)
+    assert side.ordered._obeyed["refusals"] == 0
+    moved = np.flatnonzero(np.diff(np.array(side.played), axis=0).any(axis=1))
+    assert begun <= moved[0] <= begun + side.delay + 3  # behind what the law has seen
+    assert np.allclose(side.played[-1], target, rtol=0, atol=1e-15)
     require_smooth(side.played)
 
 

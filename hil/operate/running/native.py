@@ -90,7 +90,8 @@ def operate_natively(
         loop = LoopProcess(program, setup, can, mapped, ordered, held, ending)
         memory = StageMemory.made(name, round(KEPT_S / setup.bus.period_s))
         try:
-            setpoints = Sheets(setup.bus.period_us, *rows_of(ordered.law), mapped.shared["operated"]["sheets"][0, 0])
+            sheets = mapped.shared["operated"]["sheets"][0, 0]
+            setpoints = Sheets(setup.bus.period_us, *rows_of(ordered.law), sheets, ordered.present_row)
             session = session_of(setup, settings, ordered, memory, setpoints)
             operated = OperatedLoop(session, memory, counted, lambda: int(loop.state["stood_us"]))
             beside = _Beside(ordered, setpoints, operated, counted, RingBytes(mapped))

@@ -56,6 +56,10 @@ class Ordered(Teller):
         self.seen = newest
         return True
 
+    def present_row(self) -> int:
+        """Row of the reference that the loop is at by now, if it tracks."""
+        return int(self.memory["reference_tick"][0]) + int(self._operated["newest"]) - self.seen
+
     def answered(self, setpoints: Sheets) -> bool:
         """Whether the loop has answered all orders, and none of them has to be given again."""
         if int(self._obeyed["number"]) != self._number:

@@ -49,9 +49,14 @@ class Sheets(Setpoints):
     one before has otherwise, as long as the loop has not answered; None if it has this one.
     """
 
-    def __init__(self, period_us: int, delay_periods: int, ramp_rows: int, sheets: NDArray[np.void]) -> None:
+    def __init__(
+        self, period_us: int, delay_periods: int, ramp_rows: int, sheets: NDArray[np.void],
+        present_row: Callable[[], int],
+    ) -> None:  # fmt: skip
+        """``present_row``: which row the loop is at, as it says now."""
         self._pages: list[Any] = [sheets[0], sheets[1]]
         self.page = self.row = self._base = self._filled = 0
+        self._present_row = present_row
         self.changed_from: int | None = None
         self._before: _Before | None = None
         self._steps: list[Callable[[], None]] = []
@@ -106,6 +111,10 @@ class Sheets(Setpoints):
             self._renew(_NEVER)
             self._begin(row)
         super().advance(row)
+
+    def _catch_up(self) -> None:
+        if (row := self._present_row()) > self.row:
+            self.advance(row)
 
     def _plan_ahead(self, rows: int) -> None:
         """Whatever is asked for begins so many rows behind those that the law has seen, as it takes its time."""

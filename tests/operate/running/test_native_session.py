@@ -173,9 +173,13 @@ def test_a_session_that_is_killed_leaves_a_stage_that_is_led_down(bench, changes
             next_with(observer, DRIVE)
             os.kill(operator.session, signal.SIGKILL)
             seen, end_s = [], time.monotonic() + 20
-            while place._is_alive(loop) and time.monotonic() < end_s:
-                if (message := observer.recv(0.05)) is not None:
+            is_there = True
+            while is_there and time.monotonic() < end_s:
+                is_there = place._is_alive(loop)  # before what it left is taken
+                message = observer.recv(0.05)
+                while message is not None:
                     seen.append(message)
+                    message = observer.recv(0)
         assert changes("pre-operational", False)[-2]["driven"]
     assert not any(message.arbitration_id == EMCY and any(message.data) for message in seen)
     most = [max(np.frombuffer(m.data[:6], "<i2").tolist()) for m in seen if m.arbitration_id == DRIVE]
