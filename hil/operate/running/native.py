@@ -1,4 +1,4 @@
-"""The loop in C, and beside it the session, in a process that it waits for in nothing.
+"""The loop in C, and beside it the session, in a process that it waits for in nothing but simulated time.
 
 Once a tick, if it is in time, the session looks at what the tick left and hands in what is decided. The loop leads the
 stage down and ends where set-points run out while it moves, and where nobody reads the pipe any more.
