@@ -142,6 +142,7 @@ def test_the_first_refusal_is_kept_until_it_is_cleared() -> None:
     assert first is not None
     reason(of(0x60A, b""), gate=gate)
     assert gate.latched == first
+    assert (reason(of(0x080, b"\0"), gate=gate) or "").endswith("SYNC must be empty, or one byte, 1..240")  # of itself
     told = reason(drive(6, 5, 5, 0), gate=gate)
     assert told is not None
     assert told.endswith(f"blocked in TRACKING: the gate is latched since this {first}")
@@ -168,6 +169,8 @@ WORD = int.from_bytes(bytes.fromhex("fe ff 03 00 ff 7f 07 ab"), "little", signed
         (Reason.DRIVE_COUNTER, "drive PDO has alive counter 7 instead of 9"),
         (Reason.DRIVE_CRC, "drive PDO has a wrong CRC, 0xAB"),
         (Reason.SDO_LENGTH, "SDO request has 5 bytes instead of 8"),
+        (Reason.OUTPUT_LENGTH, "the digital outputs' PDO has 5 bytes instead of 1"),
+        (Reason.OUTPUT_BITS, "digital outputs 0xFE beyond 0x1F"),
     ],
 )
 def test_words_of_a_reason(what: int, words: str) -> None:
