@@ -105,6 +105,17 @@ def test_a_record_of_an_earlier_round_is_not_taken_for_a_new_one():
     assert reader.read() is None
 
 
+def test_what_nobody_wants_is_left_out_and_does_not_count_as_lost():
+    memory = ring(8)
+    writer, reader = Writer(memory, RECORD, 8), Reader(memory, RECORD, 8)
+    for n in range(1, 14):
+        writer.write(record(n))
+        if n in (3, 12):
+            reader.skip()
+    assert reader.read_block(9)["n"].tolist() == [13]
+    assert reader.lost == 0
+
+
 def test_the_newest_and_those_before_it():
     memory = ring(8)
     writer, reader = Writer(memory, RECORD, 8), Reader(memory, RECORD, 8)

@@ -3,6 +3,8 @@
 import asyncio
 
 import pytest
+from operated_rig import Script
+from test_desk import DeskRig, switched_on
 
 from hil.server.app import Round
 
@@ -29,3 +31,28 @@ def test_a_round_that_fails_is_told_once_and_tried_again(caplog, is_slow):
     asyncio.run(some_rounds())
     assert ["call 1" in caplog.text, "call 2" in caplog.text, "call 6" in caplog.text] == [True, False, True]
     assert [record.levelname for record in caplog.records] == ["ERROR", "ERROR"]
+
+
+def test_the_loop_is_looked_at_often_while_it_has_something_to_say_or_would_stop_in_silence(tmp_path, monkeypatch):
+    rig = DeskRig(tmp_path, monkeypatch)
+    client = rig.desk.enter()
+
+    def script() -> Script:
+        assert not rig.desk.is_waited_for
+        yield from switched_on(rig, client)
+        rig.desk.tell_status()
+        assert not rig.desk.is_waited_for  # it holds
+        rig.ask(client, do="move", x_m=2e-6)
+        assert rig.desk.is_waited_for
+        yield from rig.wait_s(0.002)
+        rig.desk.tell_status()
+        rig.desk.leave(client)
+        assert rig.desk.is_waited_for  # whoever asked is gone, and it still moves
+        yield from rig.wait_s(0.2)
+        rig.desk.tell_status()
+        assert not rig.desk.is_waited_for
+        rig.desk.link.description["on_silence"] = "park"
+        rig.desk.tell_status()
+        assert rig.desk.is_waited_for
+
+    rig.play(script())
