@@ -17,9 +17,6 @@ from pathlib import Path
 
 from chromium import Browser
 
-sys.path.append(str(Path(__file__).parents[1] / "rigs"))
-from patience import patient_bus, patient_law
-
 import pkxyz_ctrl
 from pkxyz_ctrl.client.reply import RefusedError
 
@@ -166,9 +163,7 @@ def main() -> None:
     begin_s = time.monotonic()
     faulthandler.dump_traceback_later(_STUCK_S, exit=False)
     folder = Path(tempfile.mkdtemp(prefix="pkxyz-served-"))
-    law, bus = patient_law(folder, "youla"), patient_bus(folder / "bus.toml", "unix_2k")
-    words = ["--controller", str(law), "--bus", str(bus), "--silence-s", "0.25", "--saves", str(folder / "runs")]
-    words += ["--settings", str(folder / "settings")]
+    words = ["--silence-s", "0.25", "--saves", str(folder / "runs"), "--settings", str(folder / "settings")]
     serving = subprocess.Popen(
         [sys.executable, "-m", "hil", "serve", "--name", "page", "--port", "0", "--json", *words],
         stdout=subprocess.PIPE, text=True,

@@ -68,10 +68,10 @@ function show(value) {
   const facts = value.t_s === undefined ? [] : [
     ["in position", value.in_position ? "yes" : "no"], ["axes", value.in_sample_axes ? "sample" : "stage"], ["homed", value.homed ? "yes" : "no"],
     ["outputs", (value.outputs || []).join(", ") || "none"],
-    ["bus load", `${(100 * value.bus_load).toFixed(0)} %`], ["missed ticks", value.missed_ticks], ...(value.stood_still_s ? [["time stood still", `${value.stood_still_s.toPrecision(2)} s`]] : []),
+    ["bus load", `${(100 * value.bus_load).toFixed(0)} %`], ["missed ticks", value.missed_ticks], ...(value.stood_still_s ? [["stood still", `${value.stood_still_s.toPrecision(2)} s`]] : []),
     ["running", clock(value.t_s)], ["clients", value.clients],
   ];
-  at("facts").replaceChildren(...facts.map(([name, v]) => { const d = document.createElement("div"); const b = document.createElement("b"); b.textContent = v; d.append(b, name); return d; }));
+  at("facts").replaceChildren(...facts.map(([name, v]) => { const d = document.createElement("div"); d.dataset.fact = name; const b = document.createElement("b"); b.textContent = v; d.append(b, name); return d; }));
   combs(value);
   at("fault").hidden = !value.last_fault;
   at("fault-words").textContent = (value.last_fault || "") + (value.saved ? `\nThe 2 s before it: ${value.saved}` : "");
