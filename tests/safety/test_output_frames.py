@@ -6,6 +6,7 @@ import pytest
 from gate_frames import CONFIG, drive, sdo_write, sync
 
 from pkxyz_ctrl.can.frame import Frame
+from pkxyz_ctrl.safety import gate_rules
 from pkxyz_ctrl.safety.gate import TransmitGate
 from pkxyz_ctrl.safety.modes import Mode
 
@@ -43,6 +44,12 @@ def test_one_between_two_syncs() -> None:
     assert "a second frame with digital outputs" in (made.check(outputs(0), Mode.TRACKING, 20) or "")
     fresh = TransmitGate(WITH)
     assert "no SYNC went out" in (fresh.check(outputs(1), Mode.TRACKING, 20) or "")
+
+
+def test_a_gate_that_has_forgotten_waits_for_a_sync() -> None:
+    made = gate()
+    gate_rules.forget(made.memory)
+    assert "no SYNC went out" in (made.check(outputs(1), Mode.TRACKING, 10) or "")
 
 
 @pytest.mark.parametrize("data", [b"", b"\1\0", bytes(8)])
