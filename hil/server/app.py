@@ -26,7 +26,7 @@ CLIENTS_MOST = 32
 _ASKED_MOST = 1000
 """Messages of a client that wait for those before them."""
 _LOOK_S = 1 / 60
-"""It looks as often for answers while somebody waits for one, else whenever it shows."""
+"""Between two looks for answers while somebody waits for one; else it looks whenever it shows."""
 _SHOW_EACH, _STATUS_EACH = 2, 6
 _KEEP_S = 0.2
 _ROWS_MOST = 2000

@@ -101,7 +101,7 @@ class Link:
         """Give a command. Raises ``BusyError`` where too many wait, or there is no loop."""
         if self._memory is None:
             raise BusyError("the loop is not there yet")
-        newest = self._newest
+        newest = self.newest()
         taken = int(newest["session"]["commands"]) if newest is not None else 0
         if (waiting := self._commands.written - taken) > _WAITING_MOST:
             raise BusyError(f"{waiting} commands still wait for the loop")

@@ -28,7 +28,7 @@ from pkxyz_ctrl.client.protocol import TEXT_MAX_BYTES
 from pkxyz_ctrl.config.files import ConfigError, find
 from pkxyz_ctrl.config.refused import reason
 
-_ENDS_S, _ENDED_S = 3.0, 0.2
+_ENDS_S, _LOOKS_S = 3.0, 0.2
 _LOOPBACK = ("127.0.0.1", "localhost", "::1")
 SENT_AHEAD_BYTES = 32_768
 """That the system keeps for one who reads slowly: a third of a second of the page's telemetry. With the megabytes that
@@ -149,14 +149,13 @@ def _run(server: uvicorn.Server, bound: socket.socket, children: _Children) -> i
         serving = asyncio.create_task(server.serve([bound]))
         ended = None
         while not serving.done() and ended is None:
-            await asyncio.sleep(_ENDED_S)
+            await asyncio.sleep(_LOOKS_S)
             ended = children.ended
         server.should_exit = True
         await serving
         return ended
 
-    with asyncio.Runner(loop_factory=uvloop.new_event_loop) as runner:
-        ended = runner.run(main())
+    ended = uvloop.run(main())
     if ended is not None:
         print(f"pkxyz: the {ended} has ended by itself; the combs are at 0 V", file=sys.stderr)
         return 1

@@ -56,3 +56,21 @@ def test_the_loop_is_looked_at_often_while_it_has_something_to_say_or_would_stop
         assert rig.desk.is_waited_for
 
     rig.play(script())
+
+
+def test_a_client_that_asks_for_much_is_not_refused_what_the_loop_has_taken_since_the_last_look(tmp_path, monkeypatch):
+    rig = DeskRig(tmp_path, monkeypatch)
+    client = rig.desk.enter()
+    rig.desk.look()
+    rig.ask(client, do="take_control")
+    rig.every_tick.clear()
+
+    def script() -> Script:
+        for _ in range(150):
+            rig.ask(client, do="quiet", on=True)
+            yield
+        rig.desk.look()
+        answers = [a["state"] for a in rig.heard(client)["answer"] if a["verb"] == "quiet"]
+        assert sorted(answers) == ["accepted"] * 150 + ["done"] * 150
+
+    rig.play(script())
