@@ -85,7 +85,7 @@ def test_of_ten_thousand_settles_none_is_said_that_is_not(plant, stage, window_m
 
     false, later, ended = judged(window_m, 3.0)
     assert false == 0
-    assert 0.95 < later <= 1.3
+    assert 0.95 < later <= 1.2
     assert ended == 1.0
     if plant == "mild":
         assert judged(10e-9, 0.0)[0] > 4 * judged(10e-9, 3.0)[0]
