@@ -105,7 +105,8 @@ COMMAND = np.dtype(
         ("id", "<u8"),  # of the command, chosen by who writes it; larger than every earlier one
         ("verb", "<i4"),
         ("relative", "<i4"),  # MOVE: 1 for a way, 0 for a point
-        ("target_m", "<f8", (3,)),  # MOVE: NaN leaves an axis where its target is. JOG: direction, one of them not 0
+        ("target_m", "<f8", (3,)),  # MOVE: NaN leaves an axis where its target is. JOG: direction, one of them not 0.
+        # PATH: where it ends, in the stage's coordinates
         ("velocity_m_per_s", "<f8"),  # 0 for the limits in force
         ("acceleration_m_per_s2", "<f8"),
         ("jerk_m_per_s3", "<f8"),
@@ -122,7 +123,7 @@ COMMAND = np.dtype(
         ("count", "<i8"),
         ("path", "<u8"),  # PATH: number of the path whose rows are streamed ...
         ("rows", "<u8"),  # ... and how many it has
-        ("start_m", "<f8", (3,)),  # ... and where it begins
+        ("start_m", "<f8", (3,)),  # ... and where it begins, in the stage's coordinates
     ],
     align=True,
 )
@@ -144,7 +145,7 @@ SESSION = np.dtype(
         ("in_position", "<i4"),
         ("homed", "<i4"),
         ("running_id", "<u8"),  # of the command that moves the stage, 0 for none
-        ("target_m", "<f8", (3,)),  # where the motion ends, in the stage's coordinates
+        ("target_m", "<f8", (3,)),  # where the motion ends, a path too, in the stage's coordinates
         ("matrix", "<f8", (3, 4)),  # of the sample's coordinates, as of ``SampleAxes.matrix``
         ("uncertainty_m", "<f8", (3,)),  # standard deviation of the estimate
         ("law", f"S{NAME_BYTES}"),

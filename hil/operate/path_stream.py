@@ -11,15 +11,19 @@ Array = NDArray[np.float64]
 _KEPT_ROWS = 8192
 _STEP_MOST_M = 2e-6
 """Between two rows: what no path that was planned within its limits does; a jump belongs into a move."""
+_NEAR_M = 1e-12
 
 
 class PathStream:
-    """A ``setpoints.Source`` of ``rows`` rows. ``objection``: why what came can't be followed, once something can't."""
+    """A ``setpoints.Source`` of ``rows`` rows, from ``start_m`` (3,) to ``end_m`` (3,). ``objection``: why what came
+    can't be followed, once something can't.
+    """
 
-    def __init__(self, number: int, rows: int, start_m: Array, reach: Reach) -> None:
+    def __init__(self, number: int, rows: int, start_m: Array, end_m: Array, reach: Reach) -> None:
         self.number = number
         self.rows = max(0, rows - 1)
         """number of the last row, where the path is at rest"""
+        self.start_m, self.end_m = start_m, end_m
         self.objection: str | None = None
         self._reach = reach
         self._kept = np.zeros((_KEPT_ROWS, 9))
@@ -46,12 +50,18 @@ class PathStream:
         if not np.isfinite(rows).all() or float(np.abs(np.diff(rows[:, 0:3], axis=0)).max()) > _STEP_MOST_M:
             self.objection = f"row {first} of the path jumps, or is not a number"
             return
-        self.objection = self._reach.motion_refusal(rows)
+        self.objection = self._reach.motion_refusal(rows) or self._end_objection(motion[self.rows - first :])
         if self.objection is None:
             places = np.arange(first, first + len(motion)) % _KEPT_ROWS
             self._kept[places], self._outputs[places] = motion, outputs
             self._before = motion[-1].copy()
             self._known = first + len(motion)
+
+    def _end_objection(self, motion: Array) -> str | None:
+        """Against rows (n, 9) of the path from its last on, if they have come."""
+        if not len(motion) or float(np.abs(motion[0, 0:3] - self.end_m).max()) <= _NEAR_M:
+            return None
+        return f"the path does not end where it was said to, at {self._reach.where(self.end_m)}"
 
     def has(self, row: int) -> bool:
         return min(row, self.rows) < self._known

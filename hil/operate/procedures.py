@@ -206,11 +206,13 @@ class Lease:
         self.why = self.why or why
 
 
-def follow(stage: Operated, path: PathStream, start_m: Array) -> Steps:
+def follow(stage: Operated, path: PathStream) -> Steps:
     """To the first point of a path, then along it, and until the stage is in position at its end."""
     stage.require_holding("a path")
-    if float(np.abs(stage.setpoints.state()[0] - start_m).max()) > _NEAR_M or not stage.setpoints.has_arrived:
-        yield from move(stage, start_m, stage.settings.limits)
+    if (why := stage.reach.target_refusal(path.end_m)) is not None:
+        raise RefusedError(f"the path's end: {why}")
+    if float(np.abs(stage.setpoints.state()[0] - path.start_m).max()) > _NEAR_M or not stage.setpoints.has_arrived:
+        yield from move(stage, path.start_m, stage.settings.limits)
     stage.path = path
     for _ in stage.ticks(_STARTS_S):
         if path.objection is not None:
@@ -220,7 +222,7 @@ def follow(stage: Operated, path: PathStream, start_m: Array) -> Steps:
         yield
     else:
         raise AbortedError("the rows of the path did not come")
-    stage.setpoints.follow(path, start_m)
+    stage.setpoints.follow(path, path.end_m)
     yield
     while not stage.setpoints.has_arrived:
         if stage.setpoints.runs_short and not stage.setpoints.is_stopping:

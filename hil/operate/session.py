@@ -173,8 +173,8 @@ class Session:
             self._lease = Lease(self.now_us + round(self.settings.lease_s * 1e6))
             return procedures.jog(stage, direction, self._limits(command), self._lease)
         if verb is Verb.PATH:
-            path = PathStream(int(command["path"]), int(command["rows"]), command["start_m"].copy(), stage.reach)
-            return procedures.follow(stage, path, command["start_m"].copy())
+            ends = command["start_m"].copy(), command["target_m"].copy()
+            return procedures.follow(stage, PathStream(int(command["path"]), int(command["rows"]), *ends, stage.reach))
         if verb is Verb.LAW:
             return self._change_law(command)
         if verb in (Verb.STOP, Verb.ABORT):

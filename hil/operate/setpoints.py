@@ -126,7 +126,7 @@ class Setpoints:
         self._do(lambda: self._brake(limits))
 
     def follow(self, path: Source, end_m: Array) -> None:
-        """Set out on a path that begins, at rest, where the set-point stands."""
+        """Set out on a path that begins, at rest, where the set-point stands, and ends at ``end_m`` (3,)."""
         self._do(lambda: self._set_out(path, end_m, self.free_row))
 
     def stop_on_path(self) -> None:

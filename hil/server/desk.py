@@ -251,7 +251,8 @@ class Desk:
         path = await self._planned(message)
         self._require_still_wanted(client, stops)
         command_id = self.link.next_id()
-        self.link.command(Verb.PATH, command_id, path=command_id, rows=path.rows, start_m=path.start_m)
+        ends = {"start_m": path.start_m, "target_m": path.end_m}
+        self.link.command(Verb.PATH, command_id, path=command_id, rows=path.rows, **ends)
         client.tags[command_id] = tag
         self._asked_for = Feeding(self.link, command_id, path)
         self._tell("path", command_id, State.ACCEPTED, f"{path.name}: {path.duration_s:.3g} s")

@@ -78,6 +78,11 @@ class StagePath:
         return self.sample(0, 1)[0, 0:3]
 
     @property
+    def end_m(self) -> Array:
+        """(3,) of the stage, where it comes to rest."""
+        return self.sample(self.rows - 1, 1)[0, 0:3]
+
+    @property
     def duration_s(self) -> float:
         """At its own speed."""
         return self.rows * self.period_us * 1e-6

@@ -77,7 +77,7 @@ def test_what_holds_is_changed_and_nothing_else():
         yield from rig.wait_s(0.004)
         yield from refused("lqg", "MOVE (command 9) is running: wait for it, or abort it first")
         yield from rig.wait_s(0.05)
-        number = rig.give(Verb.PATH, path=7, rows=len(path), start_m=start)
+        number = rig.give(Verb.PATH, path=7, rows=len(path), start_m=start, target_m=path[-1, 0:3])
         rig.every_tick.append(lambda: rig.session.wants_rows and feed())
         yield from rig.wait_s(0.08)
         yield from refused("lqg", "is running: wait for it")

@@ -6,6 +6,21 @@ from operated_rig import MIDDLE_M, PERIOD_S, Feeder, OperatedRig, Script, raster
 
 from hil.operate.commands import Activity, State, Verb
 from hil.operate.settings import Settings
+from pkxyz_ctrl.trajectory import Move, Trajectory
+
+NAN = float("nan")
+
+
+def rows_away() -> tuple[np.ndarray, np.ndarray]:
+    """A path that ends where it did not begin, as rows, and its end."""
+    way = Move(
+        kind="move", to_m=(2e-6, -1e-6, 0.5e-6), velocity_max_m_per_s=20e-6, acceleration_max_m_per_s2=0.5,
+        jerk_max_m_per_s3=300.0,
+    )  # fmt: skip
+    trajectory = Trajectory([way])
+    rows = trajectory.sample(0, trajectory.duration_us // 200 + 2, 200)
+    rows[:, 0:3] += MIDDLE_M
+    return rows, rows[-1, 0:3].copy()
 
 
 def test_a_path_is_followed_paused_resumed_and_not_left():
@@ -16,7 +31,7 @@ def test_a_path_is_followed_paused_resumed_and_not_left():
 
     def script() -> Script:
         yield from rig.switched_on()
-        path = rig.give(Verb.PATH, path=7, rows=len(rows), start_m=start)
+        path = rig.give(Verb.PATH, path=7, rows=len(rows), start_m=start, target_m=rows[-1, 0:3])
         while rig.session.state["progress"][0] < 0.4:
             yield
         assert rig.session.state["activity"] == Activity.SCANNING
@@ -54,7 +69,7 @@ def test_a_path_whose_rows_stop_coming_is_paused_in_time_and_goes_on_when_they_c
 
     def script() -> Script:
         yield from rig.switched_on()
-        path = rig.give(Verb.PATH, path=1, rows=len(rows), start_m=start)
+        path = rig.give(Verb.PATH, path=1, rows=len(rows), start_m=start, target_m=rows[-1, 0:3])
         rig.session.stage.path = None
         while rig.session.stage.path is None or rig.session.stage.path.wants < 1000:
             yield
@@ -84,7 +99,7 @@ def test_rows_that_cannot_be_followed_are_not():
 
     def script() -> Script:
         yield from rig.switched_on()
-        path = rig.give(Verb.PATH, path=1, rows=len(rows), start_m=start)
+        path = rig.give(Verb.PATH, path=1, rows=len(rows), start_m=start, target_m=rows[-1, 0:3])
         assert (yield from rig.until_final(path)) is State.ABORTED
         assert "jumps" in rig.words_of(path)
         yield from rig.wait_s(0.02)
@@ -110,7 +125,7 @@ def test_a_server_that_falls_silent_stops_the_path_within_100_ms(on_silence):
 
     def script() -> Script:
         yield from rig.switched_on()
-        path = rig.give(Verb.PATH, path=1, rows=len(rows), start_m=start)
+        path = rig.give(Verb.PATH, path=1, rows=len(rows), start_m=start, target_m=rows[-1, 0:3])
         while rig.session.state["progress"][0] < 0.3:
             yield
         alive[0] = False
@@ -139,7 +154,7 @@ def test_a_pause_that_something_else_takes_the_place_of_comes_to_an_end(after):
 
     def script() -> Script:
         yield from rig.switched_on()
-        path = rig.give(Verb.PATH, path=1, rows=len(rows), start_m=start)
+        path = rig.give(Verb.PATH, path=1, rows=len(rows), start_m=start, target_m=rows[-1, 0:3])
         while rig.session.state["progress"][0] < 0.3:
             yield
         pause = rig.give(Verb.PAUSE)
@@ -162,7 +177,7 @@ def test_a_pause_comes_to_an_end_when_the_server_falls_silent():
 
     def script() -> Script:
         yield from rig.switched_on()
-        rig.give(Verb.PATH, path=1, rows=len(rows), start_m=start)
+        rig.give(Verb.PATH, path=1, rows=len(rows), start_m=start, target_m=rows[-1, 0:3])
         while rig.session.state["progress"][0] < 0.3:
             yield
         rig.session.server_says(1)  # for the last time
@@ -171,5 +186,76 @@ def test_a_pause_comes_to_an_end_when_the_server_falls_silent():
         yield from rig.wait_s(0.1)
         assert rig.state_of(pause) is State.ABORTED
         assert rig.words_of(pause) == "the server has fallen silent"
+
+    rig.play(script())
+
+
+def test_axes_that_a_move_leaves_out_stay_where_the_path_ended():
+    rows, end = rows_away()
+    rig = OperatedRig()
+    Feeder(rig, 1, rows)
+
+    def script() -> Script:
+        yield from rig.switched_on()
+        path = rig.give(Verb.PATH, path=1, rows=len(rows), start_m=rows[0, 0:3], target_m=end)
+        while rig.session.state["progress"][0] < 0.3:
+            yield
+        assert np.array_equal(rig.session.state["target_m"][0], end)
+        assert (yield from rig.do(Verb.PAUSE)) is State.DONE
+        assert np.array_equal(rig.session.state["target_m"][0], end)
+        yield from rig.do(Verb.RESUME)
+        assert (yield from rig.until_final(path)) is State.DONE
+        assert np.array_equal(rig.session.state["target_m"][0], end)
+        assert (yield from rig.do(Verb.MOVE, target_m=(1e-6, NAN, NAN))) is State.DONE
+        assert np.array_equal(rig.session.state["target_m"][0], [1e-6, end[1], end[2]])
+        assert (yield from rig.do(Verb.MOVE, relative=1, target_m=(NAN, 1e-6, NAN))) is State.DONE
+
+    reference = tracked(rig.play(script()))["reference_m"]
+    assert np.allclose(reference[-1], [1e-6, end[1] + 1e-6, end[2]], rtol=0.0, atol=1e-15)
+
+
+@pytest.mark.parametrize("by", [Verb.ABORT, Verb.STOP])
+def test_axes_that_a_move_leaves_out_stay_where_a_path_was_broken_off(by):
+    rows, end = rows_away()
+    rig = OperatedRig()
+    Feeder(rig, 1, rows)
+    stands: list[np.ndarray] = []
+
+    def script() -> Script:
+        yield from rig.switched_on()
+        rig.give(Verb.PATH, path=1, rows=len(rows), start_m=rows[0, 0:3], target_m=end)
+        while rig.session.state["progress"][0] < 0.3:
+            yield
+        assert (yield from rig.do(by)) is State.DONE
+        yield from rig.wait_s(0.002)
+        stands.append(rig.session.state["target_m"][0].copy())
+        assert np.allclose(rig.rows[-1]["reference_m"], stands[0], rtol=0.0, atol=1e-15)
+        assert (yield from rig.do(Verb.MOVE, target_m=(1e-6, NAN, NAN))) is State.DONE
+
+    reference = tracked(rig.play(script()))["reference_m"]
+    assert rows[0, 0] < stands[0][0] < end[0]
+    assert np.allclose(reference[-1], [1e-6, *stands[0][1:]], rtol=0.0, atol=1e-15)
+
+
+@pytest.mark.parametrize(
+    ("said", "state", "words"),
+    [
+        ((NAN, NAN, NAN), State.REFUSED, "the path's end: a target has to be finite"),
+        ((0.0, 0.0, 60e-6), State.REFUSED, "the path's end: (0, 0, 60) um can't be held"),
+        (MIDDLE_M, State.ABORTED, "the path does not end where it was said to"),
+    ],
+)
+def test_a_path_has_to_end_where_it_was_said_to(said, state, words):
+    rows, _ = rows_away()
+    rig = OperatedRig()
+    Feeder(rig, 1, rows)
+
+    def script() -> Script:
+        yield from rig.switched_on()
+        path = rig.give(Verb.PATH, path=1, rows=len(rows), start_m=rows[0, 0:3], target_m=said)
+        assert (yield from rig.until_final(path)) is state
+        assert words in rig.words_of(path)
+        yield from rig.wait_s(0.002)
+        assert rig.session.state["activity"] == Activity.HOLDING
 
     rig.play(script())

@@ -168,7 +168,7 @@ def rehearse(reach: Reach, settings: Settings) -> None:
     for position in (near_m, np.full(3, 1.0), np.full(3, 1e-3)):
         reach.target_refusal(position)
     reach.farthest(near_m, 0, 1.0)
-    path = PathStream(1, 2, start, reach)
+    path = PathStream(1, 2, start, start, reach)
     path.take(1, 0, np.zeros((2, 9)), np.zeros(2, np.int32))
     steps: tuple[Callable[[], object], ...] = (
         lambda: setpoints.go(near_m, settings.limits, reach.motion_refusal), setpoints.stop_on_path, setpoints.go_on,

@@ -85,7 +85,7 @@ class Operator:
         for first in range(0, len(rows), PATH_ROWS):
             block = rows[first : first + PATH_ROWS]
             self.link.rows(number, first, block, np.zeros(len(block), np.int64))
-        command = self.give(Verb.PATH, path=number, rows=len(rows), start_m=start)
+        command = self.give(Verb.PATH, path=number, rows=len(rows), start_m=start, target_m=rows[-1, 0:3])
         self.until(Activity.SCANNING)
         self._until(lambda: float(self.state["path_row"]) > _UNDER_WAY_ROWS)  # so the loop has taken it, too
         return command
