@@ -144,11 +144,7 @@ def disable(stage: Operated) -> Steps:
 def move(stage: Operated, target_m: Array, limits: Limits) -> Steps:
     """To a point (3,), and until the stage is in position there."""
     stage.require_holding("a move")
-    _set_out(stage, target_m, limits)
-    while not stage.setpoints.has_arrived:
-        _require_set_out(stage)
-        yield
-    _require_set_out(stage)
+    yield from _lead(stage, target_m, limits)
     for n in stage.ticks(stage.settings.settle_s):
         if stage.is_in_position:
             return f"in position at {stage.where(target_m)}, {n * stage.period_s * 1e3:.1f} ms after the set-point"
@@ -279,9 +275,9 @@ def halt(stage: Operated, *, on_path: bool) -> Steps:
 
 
 def park(stage: Operated) -> Steps:
-    """To the rest pose, then 0 V."""
-    if stage.is_driven:
-        yield from move(stage, _REST, stage.settings.limits)
+    """To the rest pose, in position there or not, then 0 V."""
+    if stage.mode == Mode.TRACKING:
+        yield from _lead(stage, _REST, stage.settings.limits)
     yield from disable(stage)
     return "parked: at rest, the combs are at 0 V"
 
@@ -342,6 +338,15 @@ def _listened(stage: Operated, heard: law_change.Listening) -> Generator[None, N
         heard.listen(stage.controller.passed())
     if stage.mode not in (Mode.IDLE, Mode.TRACKING):
         raise AbortedError("the stage no longer held")
+
+
+def _lead(stage: Operated, target_m: Array, limits: Limits) -> Generator[None, None, None]:
+    """The set-point to a point (3,)."""
+    _set_out(stage, target_m, limits)
+    while not stage.setpoints.has_arrived:
+        _require_set_out(stage)
+        yield
+    _require_set_out(stage)
 
 
 def _require_set_out(stage: Operated) -> None:

@@ -325,3 +325,46 @@ def test_random_commands_never_lose_the_stage():
     assert rows["voltage_v"].max() <= 200.0
     finals = {n for n, state, _ in rig.answers if state in (State.DONE, State.REFUSED, State.ABORTED)}
     assert finals >= set(range(1, rig._id + 1)), "every command came to an end"
+
+
+@pytest.mark.parametrize("verb", [Verb.PARK, Verb.AUTO_ZERO])
+def test_a_stage_that_cannot_be_in_position_can_be_parked(verb):
+    """Under voltage it would stay only because something disturbs it, or the window is too small for its noise."""
+    rig = OperatedRig()
+
+    def script() -> Script:
+        yield from rig.switched_on()
+        assert (yield from rig.do(Verb.SETTLE, window_m=0.1e-9, dwell_s=0.1)) is State.DONE
+        command = rig.give(verb)
+        state = yield from rig.until_final(command)
+        if verb is Verb.PARK:
+            assert state is State.DONE, rig.words_of(command)
+            yield from rig.wait_s(0.002)
+            assert rig.session.state["activity"] == Activity.OFF
+            assert not rig.rows[-1]["voltage_v"].any()
+        else:
+            assert state is State.ABORTED
+            assert "the set-point is at (0, 0, 18) um, but the stage has not been within 0.1 nm" in rig.words_of(
+                command
+            )
+            assert rig.session.state["activity"] == Activity.HOLDING
+
+    rows = rig.play(script())
+    assert (rows["mode"] == Mode.HOMING).sum() > (400 if verb is Verb.AUTO_ZERO else 200)
+    down = np.flatnonzero(rows["mode"] == Mode.LANDING)[0]
+    assert not rows["reference_m"][down - 1].any(), "led to rest, and not dropped"
+
+
+def test_a_stage_that_has_just_closed_its_loop_can_be_parked():
+    rig = OperatedRig()
+
+    def script() -> Script:
+        assert (yield from rig.do(Verb.HOME)) is State.DONE
+        enable = rig.give(Verb.ENABLE)
+        while rig.session.stage.mode != Mode.ENABLED:
+            yield
+        assert (yield from rig.do(Verb.PARK)) is State.DONE, rig.answers
+        assert rig.state_of(enable) is State.ABORTED
+        assert rig.session.stage.mode == Mode.IDLE
+
+    rig.play(script())
