@@ -133,9 +133,7 @@ class Desk:
             path = await self._planned(message)
             client.tell({"preview": {"tag": tag, **shown(path)}})
         elif what == "body":
-            newest = self.link.newest()
-            target = np.zeros(3) if newest is None else newest["session"]["target_m"].copy()
-            client.tell({"body": await self._plan(self._planner.body, target)})
+            client.tell({"body": await self._plan(self._planner.body, self.link.stands_m)})
         elif what == "save":
             seconds = number(message, "seconds", 60.0)
             client.tell(answer_of(tag, "save", "done", await self._kept(min(max(seconds, 0.1), 60.0), "")))
@@ -239,13 +237,13 @@ class Desk:
         self._tell(Verb(verb).name.lower(), command_id, State.ACCEPTED, "")
 
     async def _planned(self, message: dict[str, Any]) -> StagePath:
-        pixels = pixels_of(message)
+        pixels, stands_m = pixels_of(message), self.link.stands_m
         if "scenario" in message:
             return await self._plan(self._planner.of_scenario, str(message["scenario"]), pixels)
         if "table" in message:
             limits = {name.replace("_m_per_s", "_max_m_per_s"): message.get(name) for name in _LIMITS}
-            return await self._plan(self._planner.of_table, str(message["table"]), limits)
-        return await self._plan(self._planner.of_segments, message.get("segments"), pixels)
+            return await self._plan(self._planner.of_table, str(message["table"]), limits, stands_m)
+        return await self._plan(self._planner.of_segments, message.get("segments"), pixels, stands_m)
 
     async def _send_path(self, client: Client, message: dict[str, Any], tag: Any, stops: int) -> None:
         path = await self._planned(message)

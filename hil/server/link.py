@@ -11,6 +11,7 @@ from numpy.typing import NDArray
 from hil.operate.commands import ANSWER, COMMAND, PATH_BLOCK, PATH_ROWS, State, Verb, new_command
 from hil.operate.memory import StageMemory
 from pkxyz_ctrl.client import place
+from pkxyz_ctrl.safety.modes import LOOP_CLOSED
 
 Array = NDArray[np.float64]
 
@@ -137,6 +138,14 @@ class Link:
             return
         while (data := self._answers.read()) is not None:
             take(Answer(np.frombuffer(data, ANSWER)[0]))
+
+    @property
+    def stands_m(self) -> Array:
+        """(3,) in its own coordinates, where the stage stands or will; at rest, as long as the loop is open."""
+        newest = self.newest()
+        if newest is None or not LOOP_CLOSED[newest["row"]["mode"]]:
+            return np.zeros(3)
+        return np.array(newest["session"]["target_m"])
 
     def newest(self) -> np.void | None:
         """The newest tick, a record of ``TICK``; None before the first."""

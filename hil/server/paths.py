@@ -1,6 +1,7 @@
 """Paths for the loop: planned and checked away from it, and streamed to it while it follows them."""
 
 import math
+import re
 import tempfile
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -21,7 +22,7 @@ from pkxyz_ctrl.config.controller import ControllerConfig
 from pkxyz_ctrl.config.files import ConfigError, FrozenModel, load, parse
 from pkxyz_ctrl.config.stage import StageConfig
 from pkxyz_ctrl.stage import Stage
-from pkxyz_ctrl.trajectory import Segment, Trajectory
+from pkxyz_ctrl.trajectory import Move, Segment, Trajectory, TrajectoryError
 from pkxyz_ctrl.trajectory.check import DriveLimits, check_against
 from pkxyz_ctrl.trajectory.table import Table, in_folder
 
@@ -39,36 +40,26 @@ class _Segments(FrozenModel):
 
 
 class _OfSample(Trajectory):
-    """A trajectory in the sample's coordinates, sampled in the stage's. Before ``begin_us``, to which the stage goes by
-    itself, it stands.
-    """
+    """A trajectory in the sample's coordinates, sampled in the stage's."""
 
-    def __init__(self, segments: Sequence[Segment], turn: Turn, pixels: int = 0) -> None:
-        super().__init__(segments, pixels)
+    def __init__(self, segments: Sequence[Segment], turn: Turn, pixels: int, start_m: Array) -> None:
+        super().__init__(segments, pixels, start_m)
         self.turn = turn
-        begins = [s.t_start_us for s in self.segments if s.kind not in _LEADING]
-        self.begin_us = begins[0] if begins else 0
 
     def sample(self, first_tick: int, count: int, period_us: int) -> Array:
+        rows = super().sample(first_tick, count, period_us)
         if self.turn.is_plain:
-            return super().sample(first_tick, count, period_us)
-        begin = -(-self.begin_us // period_us)
-        before = min(max(begin - first_tick, 0), count)
-        rows = np.concatenate([
-            np.repeat(super().sample(begin, 1, period_us), before, axis=0),
-            super().sample(first_tick + before, count - before, period_us),
-        ])  # fmt: skip
+            return rows
         turned = [self.turn.to_stage(rows[:, 0:3]), *(self.turn.way_to_stage(rows[:, n : n + 3]) for n in (3, 6))]
         return np.concatenate(turned, axis=1)
 
 
 @dataclass(frozen=True)
 class StagePath:
-    """A path that the stage can follow: a trajectory from the first segment that is more than going there."""
+    """A path that the stage can follow."""
 
     trajectory: _OfSample
     period_us: int
-    first_tick: int
     rows: int
     name: str
 
@@ -89,16 +80,16 @@ class StagePath:
 
     def sample(self, first: int, count: int) -> Array:
         """Rows (count, 9)."""
-        return self.trajectory.sample(self.first_tick + first, count, self.period_us)
+        return self.trajectory.sample(first, count, self.period_us)
 
     def outputs(self, first: int, count: int) -> NDArray[np.int64]:
         """Trigger bits (count,) of rows."""
-        return self.trajectory.outputs(self.first_tick + first, count, self.period_us)
+        return self.trajectory.outputs(first, count, self.period_us)
 
     @property
     def lines(self) -> list[tuple[int, int, int]]:
         """Of each line of a raster its first and last row, and the number of its frame."""
-        rows = self.trajectory.line_rows(self.period_us) - (self.first_tick, self.first_tick, 0)
+        rows = self.trajectory.line_rows(self.period_us)
         return [(int(first), int(last), int(frame)) for first, last, frame in rows]
 
     @property
@@ -168,41 +159,63 @@ class Planner:
 
     def of_scenario(self, name: str, pixels: int = 0) -> StagePath:
         """The reference of a shipped scenario, with so many pixels on each line: names only, as a client can't be let
-        into our files.
+        into our files. If no move leads to it, it begins at the origin.
         """
         if "/" in name or "\\" in name or "." in name:
             raise ConfigError(f"{name!r}: the name of a shipped scenario is wanted; a file of yours is sent as a table")
         scenario = load_scenario(name)
         return self._path(in_folder(scenario.config.reference, scenario.source.parent), name, pixels)
 
-    def of_segments(self, segments: Any, pixels: int = 0, name: str = "scan") -> StagePath:
-        """Segments as in the ``[[reference]]`` of a scenario file."""
+    def of_segments(self, segments: Any, pixels: int = 0, stands_m: Array | None = None) -> StagePath:
+        """Segments as in the ``[[reference]]`` of a scenario file. If no move leads to it, the path begins at
+        ``stands_m`` (3,) of the stage, at the sample's origin if not given.
+        """
         parsed = parse({"reference": segments}, _Segments, "the path")
         if any(isinstance(segment, Table) for segment in parsed.reference):
             raise ConfigError("the path: a table is sent by itself, not by the name of a file")
-        return self._path(parsed.reference, name, pixels)
+        return self._path(parsed.reference, "scan", pixels, stands_m)
 
-    def of_table(self, text: str, limits: dict[str, float]) -> StagePath:
-        """A table of positions at instants, as the text of a CSV file."""
+    def of_table(self, text: str, limits: dict[str, float], stands_m: Array | None = None) -> StagePath:
+        """A table of positions at instants, as the text of a CSV file. The path begins as one of segments does."""
         with tempfile.TemporaryDirectory(prefix="pkxyz-") as folder:
             file = Path(folder) / "table.csv"
             file.write_text(text, encoding="utf-8")
             table = TypeAdapter(Table).validate_python({"kind": "csv", "file": str(file)} | limits)
             try:
-                return self._path([table], "table")
+                return self._path([table], "table", stands_m=stands_m)
             except ConfigError as error:
                 raise ConfigError(str(error).replace(str(file), "the table")) from None
 
-    def _path(self, segments: Sequence[Segment], name: str, pixels: int = 0) -> StagePath:
-        trajectory = _OfSample(segments, self.turn, pixels)
-        check_against(self.stage, trajectory, self._drive)
+    def _path(
+        self, segments: Sequence[Segment], name: str, pixels: int = 0, stands_m: Array | None = None
+    ) -> StagePath:
+        turn = self.turn
+        led, start_m = _led(segments, np.zeros(3) if stands_m is None else turn.to_sample(stands_m))
+        whose = ""
+        try:
+            trajectory = _OfSample(segments[led:], turn, pixels, start_m)
+            whose = "" if turn.is_plain else "; places are in the stage's coordinates, not in the sample's"
+            check_against(self.stage, trajectory, self._drive)
+        except TrajectoryError as error:
+            raise TrajectoryError(_as_sent(str(error), led) + whose) from None
         if any(segment.jumps_us for segment in trajectory.segments):
             raise ConfigError(
                 f"{name}: jumps on purpose, which a stage in operation does not; use `pkxyz run` for that"
             )
-        first_tick = math.ceil(trajectory.begin_us / self.period_us)
-        rows = math.ceil(trajectory.duration_us / self.period_us) - first_tick + 1
-        return StagePath(trajectory, self.period_us, first_tick, rows, name)
+        rows = math.ceil(trajectory.duration_us / self.period_us) + 1
+        return StagePath(trajectory, self.period_us, rows, name)
+
+
+def _led(segments: Sequence[Segment], start_m: Array) -> tuple[int, Array]:
+    """How many segments only lead to a path, as the stage goes there by itself, and where (3,) they lead."""
+    led = next((n for n, segment in enumerate(segments) if segment.kind not in _LEADING), 0)
+    moves = [segment for segment in segments[:led] if isinstance(segment, Move)]
+    return led, np.array(moves[-1].to_m) if moves else start_m
+
+
+def _as_sent(words: str, led: int) -> str:
+    """A refusal, with the number of the segment as it was sent."""
+    return re.sub(r"^reference\.(\d+)", lambda found: f"reference.{int(found[1]) + led}", words)
 
 
 class Feeding:

@@ -3,7 +3,7 @@
     >>> trajectory = Trajectory([Hold(kind="hold", duration_s=0.01), Move(kind="move", to_m=(0.0, 0.0, 1e-6), ...)])
     >>> trajectory.sample(first_tick=0, count=1000, period_us=200)
 
-Positions are relative to the rest pose, where every trajectory starts.
+Positions are relative to the rest pose, where a trajectory starts unless it is told otherwise.
 """
 
 import math
@@ -72,15 +72,22 @@ class TimedSegment:
 
 
 class Trajectory:
-    """Segments one after another from the rest pose; immutable. Each segment ends on a whole microsecond."""
+    """Segments one after another, from rest to rest; immutable. Each segment ends on a whole microsecond."""
 
-    def __init__(self, segments: Sequence[AnySegment], pixels: int | None = None) -> None:
-        """``pixels`` of each line, for triggers; None: it has none. Raises ``TrajectoryError``, naming the segment,
-        where one can't be planned.
+    def __init__(
+        self,
+        segments: Sequence[AnySegment],
+        pixels: int | None = None,
+        start_m: Array | tuple[float, float, float] = (0.0, 0.0, 0.0),
+    ) -> None:
+        """``pixels`` of each line, for triggers; None: it has none. ``start_m``: (3,), where it begins. Raises
+        ``TrajectoryError``, naming the segment, where one can't be planned.
         """
         if not segments:
             raise TrajectoryError("reference: has no segments; give at least one [[reference]]")
-        position = np.zeros(3)
+        position = np.array(start_m, np.float64)
+        if position.shape != (3,) or not np.isfinite(position).all():
+            raise TrajectoryError(f"reference: begins at {start_m}; three finite numbers are wanted, x, y and z in m")
         start_us = pieces = 0
         motions: list[Motion] = []
         starts_us: list[float] = []

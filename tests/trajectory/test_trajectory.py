@@ -192,6 +192,28 @@ def test_move_and_hold_by_hand():
         Trajectory([])
 
 
+def test_segments_begin_where_they_are_told_to():
+    limits = {"velocity_max_m_per_s": 0.5e-3, "acceleration_max_m_per_s2": 0.5, "jerk_max_m_per_s3": 300.0}
+    start_m = (1e-6, -2e-6, 18e-6)
+    wait = Hold(kind="hold", duration_s=0.01)
+    raster = Raster(kind="raster", line_length_m=2e-6, lines=3, line_pitch_m=0.1e-6, line_rate_hz=60.0, **limits)
+    away = Trajectory([wait, raster, wait], start_m=np.array(start_m))
+    from_rest = Trajectory([wait, raster, wait])
+    rows, same = (each.sample(-1, away.duration_us // 200 + 3, 200) for each in (away, from_rest))
+    assert away.duration_us == from_rest.duration_us
+    same[:, 0:3] += start_m
+    for n, rounding in ((0, 1e-15), (3, 1e-12), (6, 1e-8)):
+        assert np.allclose(rows[:, n : n + 3], same[:, n : n + 3], rtol=0.0, atol=rounding)
+    assert np.array_equal(rows[[0, 1, -1], 0:3], [start_m] * 3)
+    assert np.array_equal(away.end_m, start_m)
+    move = Move(kind="move", to_m=start_m, **limits)
+    with pytest.raises(TrajectoryError, match=r"reference\.0 \(move\): .*nowhere"):
+        Trajectory([move], start_m=start_m)
+    for wrong in ((0.0, np.nan, 0.0), (0.0, np.inf, 0.0), (0.0, 0.0), ((0.0, 0.0, 0.0),)):
+        with pytest.raises(TrajectoryError, match=r"begins at .* three finite numbers"):
+            Trajectory([move], start_m=wrong)
+
+
 def test_the_default_scan_can_be_followed_and_worse_ones_say_where_and_why_not():
     class Reference(FrozenModel):
         reference: tuple[Segment, ...]
