@@ -11,7 +11,6 @@ from typing import NamedTuple
 
 import numpy as np
 from compared import Law
-from debian import fetched
 from disassembly import fused_instructions, stack_bound
 from exchanges import Exchange, hashes
 from numpy.typing import NDArray
@@ -23,6 +22,9 @@ from pkxyz_ctrl.export.words import canonical
 from pkxyz_ctrl.loop import cycle as cycling
 from pkxyz_ctrl.loop.exchange import EXCHANGE_MEMORY
 from pkxyz_ctrl.safety.modes import Mode
+
+sys.path.append(str(Path(__file__).parents[1] / "fetched"))
+from debian import fetched
 
 Records = NDArray[np.void]
 
