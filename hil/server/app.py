@@ -17,6 +17,7 @@ from starlette.types import ASGIApp, Receive, Scope, Send
 from starlette.websockets import WebSocket, WebSocketDisconnect
 
 from hil.server.client import Client
+from hil.server.designing import give_up
 from hil.server.desk import Desk
 from hil.server.messages import is_urgent
 from pkxyz_ctrl.client.protocol import SUBPROTOCOL, TEXT_MAX_BYTES, TOKEN_PREFIX
@@ -121,6 +122,7 @@ def app_of(desk: Desk, token: str, hosts: frozenset[str]) -> Starlette:
         finally:
             for task in tasks:
                 task.cancel()
+            give_up()  # the combs are at 0 V once the server has ended
 
     return Starlette(
         routes=[WebSocketRoute("/stage", talk), Mount("/", StaticFiles(directory=PAGE, html=True))],

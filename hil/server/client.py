@@ -7,6 +7,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from hil.server.messages import FIELDS, AskedWrongError
 from pkxyz_ctrl.client.protocol import Block, Precision, packed
 
 SAID_MOST, _BLOCKS_MOST = 400, 4
@@ -45,6 +46,16 @@ class Client:
         self.lost = 0
         self._blocks = 0
         self.is_hopeless = False
+
+    def subscribe(self, message: dict[str, Any]) -> None:
+        """What it wants to see of telemetry. Raises ``AskedWrongError``."""
+        fields, precision = message.get("fields", []), message.get("precision", "f4")
+        unknown = [f for f in fields if f not in FIELDS] if isinstance(fields, list) else [fields]
+        if unknown or len(fields) > len(FIELDS):
+            raise AskedWrongError(f"no telemetry is called {unknown[:1]}; there are: {', '.join(sorted(FIELDS))}")
+        if precision not in ("f4", "f8"):
+            raise AskedWrongError("precision is f4 or f8")
+        self.fields, self.precision = tuple(dict.fromkeys(fields)), precision
 
     def tell(self, message: dict[str, Any]) -> None:
         """Queue a message; a client that takes none of hundreds is given up."""

@@ -13,7 +13,7 @@ import numpy as np
 
 from hil.operate.commands import FINAL, State, Verb
 from hil.server.client import Client, Moment
-from hil.server.designing import offer_of
+from hil.server.designing import Choice, offer_of
 from hil.server.link import Answer, BusyError, Link
 from hil.server.messages import FIELDS, AskedWrongError, number, of_sample, pixels_of, shown, tag_of, trigger_of
 from hil.server.messages import answer as answer_of
@@ -28,7 +28,7 @@ from pkxyz_ctrl.config.files import ConfigError
 
 _AXES = ("x", "y", "z")
 _LIMITS = ("velocity_m_per_s", "acceleration_m_per_s2", "jerk_m_per_s3")
-_LOOKS = frozenset({"settings", "values", "parameters", "recordings", "open_recording"})
+_LOOKS = frozenset({"settings", "values", "parameters", "recordings", "open_recording", "laws"})
 _FREE = _LOOKS | {"stop", "release", "subscribe", "take_control", "give_control", "preview", "body", "save"}
 """What needs no control: nothing of it moves anything, or it stops what moves."""
 _STOPPED = "the stage was stopped after this was asked, and before it began: ask again"
@@ -56,6 +56,7 @@ class Desk:
         self.holder: Client | None = None
         self.last_fault = ""
         self._planner, self._plan = planner, plan
+        self._choice = Choice(planner.files["stage"], planner.files["bus"], plan)
         self._feeding: Feeding | None = None
         self._asked_for: Feeding | None = None  # fed once the loop has begun it; another may be running
         self._stopping = Stopping(link, self._tell)
@@ -122,7 +123,7 @@ class Desk:
             client.tags[stop_id] = tag
             self._stopping.ask(stop_id)
         elif what == "subscribe":
-            self._subscribe(client, message)
+            client.subscribe(message)
         elif what == "take_control":
             self._take_control(client, tag)
         elif what == "give_control":
@@ -131,7 +132,7 @@ class Desk:
             client.tell(answer_of(tag, "give_control", "done", ""))
         elif what == "preview":
             path = await self._planned(message)
-            client.tell({"preview": {"tag": tag, **shown(path)}})
+            client.tell({"preview": {"tag": tag, **await self._plan(shown, path)}})
         elif what == "body":
             client.tell({"body": await self._plan(self._planner.body, self.link.stands_m)})
         elif what == "save":
@@ -159,6 +160,8 @@ class Desk:
             client.tell({"settings": self._setting.told()})
         elif what == "parameters":
             client.tell({"parameters": self._planner.parameters})
+        elif what == "laws":
+            self._choice.tell(client.tell)
         elif what == "recordings":
             names = await self._plan(listed, self._saves)
             client.tell({"recordings": {"folder": str(self._saves), "names": names}})
@@ -372,15 +375,6 @@ class Desk:
             client.tell_status(text)
 
     # -- telemetry -----------------------------------------------------------------------------------------------------
-
-    def _subscribe(self, client: Client, message: dict[str, Any]) -> None:
-        fields = message.get("fields", [])
-        unknown = [f for f in fields if f not in FIELDS] if isinstance(fields, list) else [fields]
-        if unknown or len(fields) > len(FIELDS):
-            raise AskedWrongError(f"no telemetry is called {unknown[:1]}; there are: {', '.join(sorted(FIELDS))}")
-        if message.get("precision", "f4") not in ("f4", "f8"):
-            raise AskedWrongError("precision is f4 or f8")
-        client.fields, client.precision = tuple(dict.fromkeys(fields)), message.get("precision", "f4")
 
     def show_telemetry(self, most: int) -> None:
         """New rows to whoever asked for them."""

@@ -17,6 +17,8 @@ FIELDS = frozenset({*(name for name in ROW.names or () if ROW[name].base.kind in
 """Of telemetry."""
 _URGENT_MOST = 300
 _PIXELS_MOST = 1_000_000
+_STRETCHES, _AT_ONCE = 1500, 100
+"""Of a path that is drawn: into how many stretches it is cut, and how many of them are looked at together."""
 _PLACES = frozenset({"reference_m", "measurement_m", "estimate_m", "position_m"})
 _WAYS = frozenset({"estimate_m_per_s", "innovation_m"})
 
@@ -52,12 +54,27 @@ def tag_of(value: Any) -> str | int | None:
 
 def shown(path: StagePath) -> dict[str, Any]:
     """A path before it is followed, in the sample's coordinates."""
-    points = path.shown()
+    points = _drawn(path)
     return {
         "name": path.name, "duration_s": path.duration_s, "start_m": points[0].tolist(),
         "points_m": np.round(points, 12).tolist(), "low_m": points.min(0).tolist(), "high_m": points.max(0).tolist(),
         "lines": path.lines, "backward": path.backward,
     }  # fmt: skip
+
+
+def _drawn(path: StagePath) -> Array:
+    """Positions (n, 3) to draw it by: of each stretch its first row, and those that are farthest along an axis, so that
+    every line reaches as far as it does.
+    """
+    length = -(-path.rows // _STRETCHES)
+    drawn = []
+    for first in range(0, path.rows, length * _AT_ONCE):
+        count = min(length * _AT_ONCE, path.rows - first)
+        points = path.trajectory.turn.to_sample(path.sample(first, count)[:, 0:3])
+        for begin in range(0, count, length):
+            stretch = points[begin : begin + length]
+            drawn.append(stretch[np.unique([0, *stretch.argmin(0), *stretch.argmax(0)])])
+    return np.concatenate([*drawn, points[-1:]])
 
 
 def number(message: dict[str, Any], name: str, absent: float | None) -> float:
