@@ -13,7 +13,7 @@ def fetched(packages: Sequence[str], root: Path, *, with_dependencies: bool = Fa
     """
     if not (shutil.which("apt-get") and shutil.which("dpkg-deb")):
         return "packages are fetched with apt-get and unpacked with dpkg-deb, which are not here"
-    mark = root.parent / f".unpacked-{'-'.join(packages)}"
+    mark = root / f".unpacked-{'-'.join(packages)}"
     if mark.is_file():
         return ""
     root.mkdir(parents=True, exist_ok=True)

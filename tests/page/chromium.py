@@ -6,6 +6,7 @@ import json
 import os
 import shutil
 import subprocess
+import sys
 import threading
 import time
 import urllib.request
@@ -14,6 +15,9 @@ from types import TracebackType
 from typing import Any, Self
 
 from websockets.sync.client import connect
+
+sys.path.append(str(Path(__file__).parents[1] / "fetched"))
+import debian
 
 PACKAGE = "chromium-headless-shell"
 PLACE = Path(os.environ.get("XDG_CACHE_HOME", Path.home() / ".cache")) / "pkxyz" / "chromium"
@@ -28,21 +32,9 @@ def fetched() -> Path:
     if system is not None:
         return Path(system)
     unpacked = PLACE / "root/usr/lib/chromium" / PACKAGE
-    if unpacked.is_file():
-        return unpacked
-    if shutil.which("apt-get") is None or shutil.which("dpkg") is None:
-        raise OSError("no Chromium, and no apt to fetch one with")
-    archives = PLACE / "archives"
-    (archives / "partial").mkdir(parents=True, exist_ok=True)
-    subprocess.run(
-        ["apt-get", "-q", "-y", "--no-install-recommends", "--download-only", "-o", f"Dir::Cache::archives={archives}",
-         "install", PACKAGE],
-        check=True, capture_output=True, timeout=600,
-    )  # fmt: skip
-    for package in sorted(archives.glob("*.deb")):
-        subprocess.run(["dpkg", "-x", str(package), str(PLACE / "root")], check=True)
-    shutil.rmtree(archives)
-    return fetched()
+    if not unpacked.is_file() and (why_not := debian.fetched([PACKAGE], PLACE / "root", with_dependencies=True)):
+        raise OSError(f"no Chromium: {why_not}")
+    return unpacked
 
 
 def _libraries(root: Path, binary: Path) -> list[Path]:

@@ -14,7 +14,6 @@ Exit code 0 if all tests pass, or if the packages cannot be had, which is then s
 import dataclasses
 import os
 import shlex
-import shutil
 import signal
 import subprocess
 import sys
@@ -29,9 +28,12 @@ from hil.lanes.lane import Lane
 from hil.native.program import compiled
 from hil.runs.scenario import load_scenario
 
+sys.path.append(str(Path(__file__).parents[1] / "fetched"))
+from debian import fetched
+
 ROOT = Path(__file__).parent.parent.parent
 SCRATCH = ROOT / ".uml"
-PACKAGES = {"user-mode-linux": "usr/bin/linux.uml", "busybox-static": "bin/busybox", "can-utils": "usr/bin/candump"}
+PACKAGES = ("user-mode-linux", "busybox-static", "can-utils")
 TESTS = ("tests/socketcan/on_vcan.py", "tests/socketcan/on_vcan_native.py")
 MODULES = ("drivers/net/can/dev/can-dev", "drivers/net/can/vcan", "net/can/can", "net/can/can-raw", "net/can/can-bcm")
 BOOTS = 2
@@ -64,7 +66,7 @@ $b poweroff -f
 
 def main(chosen: list[str]) -> int:
     """Fetch, boot, wait; returns the exit code. ``chosen``: arguments for pytest."""
-    missing = _fetch()
+    missing = fetched(PACKAGES, SCRATCH / "root")
     if missing:
         print(f"\n*** SKIPPED: test-socketcan, nothing was tested over a real CAN socket: {missing}\n", file=sys.stderr)
         return 0
@@ -126,30 +128,6 @@ def _clock_ticks(pid: int) -> int:
     return int(after_name[11]) + int(after_name[12])
 
 
-def _fetch() -> str:
-    """Have the packages unpacked in the scratch folder; empty if they are there, else why not."""
-    if not (shutil.which("apt-get") and shutil.which("dpkg-deb")):
-        return "packages are fetched with apt-get and unpacked with dpkg-deb, which are not here"
-    SCRATCH.mkdir(exist_ok=True)
-    for package, file in PACKAGES.items():
-        if (SCRATCH / "root" / file).is_file():
-            continue
-        with tempfile.TemporaryDirectory(dir=SCRATCH) as folder:
-            done = _apt("download", package, cwd=folder)
-            if done.returncode != 0:
-                _apt("update", cwd=folder)
-                done = _apt("download", package, cwd=folder)
-            if done.returncode != 0:
-                return f"no package {package}: {' '.join(done.stderr.split())[-200:]}"
-            (archive,) = Path(folder).glob("*.deb")
-            subprocess.run(["dpkg-deb", "-x", archive, SCRATCH / "root"], check=True)
-    return ""
-
-
-def _apt(*words: str, cwd: str) -> subprocess.CompletedProcess[str]:
-    return subprocess.run(["apt-get", "-q", *words], cwd=cwd, check=False, capture_output=True, text=True)
-
-
 def _boot(short: Path, chosen: list[str]) -> subprocess.Popen[bytes]:
     """Start the guest; ``short`` is a folder for its memory and its sockets."""
     scratch = SCRATCH / "guest"
@@ -159,7 +137,7 @@ def _boot(short: Path, chosen: list[str]) -> subprocess.Popen[bytes]:
     (kernel,) = (SCRATCH / "root/usr/lib/uml/modules").glob("*/kernel")
     init = scratch / "init"
     values = {
-        "busybox": SCRATCH / "root" / PACKAGES["busybox-static"],
+        "busybox": SCRATCH / "root/bin/busybox",
         "modules": " ".join(shlex.quote(f"{kernel / module}.ko") for module in MODULES),
         "scratch": scratch,
         "cache": os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache",
@@ -174,7 +152,7 @@ def _boot(short: Path, chosen: list[str]) -> subprocess.Popen[bytes]:
     init.write_text(INIT.format(**quoted), encoding="utf-8")
     init.chmod(0o755)
     words = [
-        SCRATCH / "root" / PACKAGES["user-mode-linux"], f"mem={MEMORY}", "root=/dev/root", "rootfstype=hostfs",
+        SCRATCH / "root/usr/bin/linux.uml", f"mem={MEMORY}", "root=/dev/root", "rootfstype=hostfs",
         "rootflags=/", "ro", f"init={init}", "con=null", "con0=null,fd:2", "con1=null", "ssl=null", "quiet",
         "umid=vcan", f"uml_dir={short}/",
     ]  # fmt: skip
