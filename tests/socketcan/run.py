@@ -1,5 +1,5 @@
-"""Boots user-mode-linux with CAN in its kernel and runs ``on_vcan.py`` and ``on_vcan_native.py`` there, or other files:
-``make test-socketcan``.
+"""Boots user-mode-linux with CAN in its kernel and runs ``on_vcan.py``, ``on_vcan_native.py`` and ``on_vcan_serve.py``
+there, or other files: ``make test-socketcan``.
 
 The host's files are the guest's root, read-only, so it runs this very checkout and its environment, and it has the
 host's cache with the kernels that were compiled there. It has one processor, and its clock is not the world's: what is
@@ -34,7 +34,7 @@ from debian import fetched
 ROOT = Path(__file__).parent.parent.parent
 SCRATCH = ROOT / ".uml"
 PACKAGES = ("user-mode-linux", "busybox-static", "can-utils")
-TESTS = ("tests/socketcan/on_vcan.py", "tests/socketcan/on_vcan_native.py")
+TESTS = tuple(f"tests/socketcan/on_vcan{of}.py" for of in ("", "_native", "_serve"))
 MODULES = ("drivers/net/can/dev/can-dev", "drivers/net/can/vcan", "net/can/can", "net/can/can-raw", "net/can/can-bcm")
 BOOTS = 2
 LONGEST_S = 1200  # a guest that has come to a standstill is found long before
