@@ -11,6 +11,10 @@ from pkxyz_ctrl.config.triggers import BITS
 from pkxyz_ctrl.safety.modes import LOOP_CLOSED, MODE_FACTS, Mode
 
 _LOAD_OVER_US = 500_000
+_RESTLESS = frozenset({
+    "t_s", "tick", "position_m", "error_m", "uncertainty_m", "voltage_v", "headroom_v", "frames", "bus_load",
+})  # fmt: skip
+"""What changes by itself while nothing happens."""
 
 
 class BusLoad:
@@ -28,6 +32,23 @@ class BusLoad:
             self._share = (wire_ns - self._from_wire_ns) * 1e-3 / passed_us if passed_us > 0 else 0.0
             self._from_us, self._from_wire_ns = t_us, wire_ns
         return self._share
+
+
+class Pace:
+    """Of two words on a stage at which nothing happens one is left out: numbers that can be read change five times a
+    second, and every message costs.
+    """
+
+    def __init__(self) -> None:
+        self._last: dict[str, Any] = {}
+        self._is_left_out = False
+
+    def is_due(self, status: dict[str, Any]) -> bool:
+        """Whether it is told; a change of anything but what changes by itself always is."""
+        lasting = {name: value for name, value in status.items() if name not in _RESTLESS}
+        self._is_left_out = lasting == self._last and not self._is_left_out
+        self._last = lasting
+        return not self._is_left_out
 
 
 def status_of(tick: np.void, description: dict[str, Any], bus_load: float) -> dict[str, Any]:

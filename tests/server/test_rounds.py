@@ -58,6 +58,34 @@ def test_the_loop_is_looked_at_often_while_it_has_something_to_say_or_would_stop
     rig.play(script())
 
 
+def test_where_it_is_is_told_half_as_often_while_nothing_happens_and_at_once_when_something_does(tmp_path, monkeypatch):
+    rig = DeskRig(tmp_path, monkeypatch)
+    client = rig.desk.enter()
+
+    def told() -> list[str]:
+        rig.desk.tell_status(in_turn=True)
+        return [status["activity"] for status in rig.heard(client).get("status", [])]
+
+    def script() -> Script:
+        yield from switched_on(rig, client)
+        yield from rig.wait_s(0.1)
+        told()
+        seen = []
+        for _ in range(6):
+            yield from rig.wait_s(0.01)
+            seen += [told()]
+        assert sorted(seen) == [[], [], [], ["holding"], ["holding"], ["holding"]]
+        rig.ask(client, do="move", x_m=2e-6, velocity_m_per_s=50e-6)
+        for _ in range(3):
+            yield from rig.wait_s(0.008)
+            assert told() == ["moving"], "every time while it moves"
+        for _ in range(2):
+            rig.desk.tell_status()
+            assert rig.heard(client)["status"], "where something has ended, it is told whatever was told before"
+
+    rig.play(script())
+
+
 def test_a_client_that_asks_for_much_is_not_refused_what_the_loop_has_taken_since_the_last_look(tmp_path, monkeypatch):
     rig = DeskRig(tmp_path, monkeypatch)
     client = rig.desk.enter()
