@@ -121,6 +121,9 @@ def plant(
     as_json: Annotated[bool, typer.Option("--json", help="Print each change as a line of JSON.")] = False,
 ) -> None:
     """Serve amplifier node and plant on a bus until Ctrl-C or SIGTERM."""
+    from pkxyz_ctrl.compiled.quick_load import load_quickly
+
+    load_quickly()
     load_can_quickly()
     from hil.lanes.ending import Ended, Ending
     from hil.lanes.wall import require_real_bus

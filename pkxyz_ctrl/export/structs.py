@@ -98,8 +98,22 @@ def loop_header(period_us: int = 0, held: Stored | None = None) -> str:
 
 @cache
 def layout() -> int:
-    """Digest of all that the native loop shares, (64 bits): whoever reads it must mean the same."""
-    return int.from_bytes(hashlib.sha256((_body() + _shared_body()).encode()).digest()[:8], "little")
+    """Digest of all that the native loop shares, (64 bits): whoever reads it must mean the same. Of the dtypes and
+    numbers themselves, not of the words about them: a loop that begins waits for it.
+    """
+    kinds = [kind for _, kind in (*_NUMBERS, *_NUMBERS_SHARED)]
+    numbers = [(kind.__name__, [(member.name, int(member)) for member in kind]) for kind in kinds]
+    shared = repr((numbers, BLOCK_ROWS, _laid_out(SHARED), _laid_out(PATH)))
+    return int.from_bytes(hashlib.sha256(shared.encode()).digest()[:8], "little")
+
+
+def _laid_out(dtype: Dtype) -> object:
+    """Where everything of a record stands, and as what: of records in it, too."""
+    if dtype.fields is None:
+        return dtype.str
+    fields = dtype.fields.items()
+    parts = [(name, offset, kind.shape, _laid_out(kind.base)) for name, (kind, offset, *_) in fields]
+    return dtype.itemsize, parts
 
 
 @cache

@@ -85,6 +85,10 @@ class Controller:
         self._out = part(self.exchange, "driver", "out").view(np.uint8).data
         self.period_us = bus.period_us
         self._reference = standing_still()  # the latest that was handed in
+        self._load_kernels()
+
+    def _load_kernels(self) -> None:
+        """All that it calls: now, not in the first tick."""
         config, memory = self.record, self.exchange
         self._begin = direct(exchange.begin, config, memory, 0)
         self._on_frame = direct(exchange.on_frame, config, memory, *[0] * 5)
@@ -94,7 +98,7 @@ class Controller:
         self._ask_to_clear = direct(exchange.ask_to_clear, memory)
         self._change_law = direct(law_change.take_over, self.law, self.memory, np.zeros(1, law_change.CHANGE))
         self._period = self._period_of()
-        self._period(config, memory.copy(), self._reference, 0)  # loaded now, not in the first tick
+        self._period(config, memory.copy(), self._reference, 0)
 
     def _period_of(self) -> Callable[..., Any]:
         """The compiled period, or the one that plans between its two parts."""

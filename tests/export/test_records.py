@@ -2,14 +2,16 @@
 
 import shutil
 import subprocess
+from pathlib import Path
 
 import numpy as np
 import pytest
 
 from pkxyz_ctrl.core import estimator, feedback
 from pkxyz_ctrl.core import tick as ticking
+from pkxyz_ctrl.export import structs
 from pkxyz_ctrl.export.stored import Stored
-from pkxyz_ctrl.export.structs import header, struct_name, unit_of
+from pkxyz_ctrl.export.structs import header, layout, loop_header, struct_name, unit_of
 from pkxyz_ctrl.export.words import CANONICAL_NAN, FNV_OFFSET, canonical, digest, words_of
 from pkxyz_ctrl.loop import cycle
 from pkxyz_ctrl.loop.exchange import EXCHANGE, EXCHANGE_MEMORY
@@ -112,3 +114,48 @@ def test_digest_is_fnv_1a_over_words():
     assert digest(FNV_OFFSET, np.array([], np.uint64)) == 0xCBF29CE484222325
     assert digest(FNV_OFFSET, np.array([0], np.uint64)) == 0xCBF29CE484222325 * 0x100000001B3 % 2**64
     assert digest(FNV_OFFSET, np.array([1, 2], np.uint64)) != digest(FNV_OFFSET, np.array([2, 1], np.uint64))
+
+
+SHARED_LIKE = [("first", "i8"), ("inner", [("rows", "f8", (3,)), ("count", "i4")], (2,))]
+
+
+def digest_of(monkeypatch, fields):
+    monkeypatch.setattr(structs, "SHARED", np.dtype(fields, align=True))
+    layout.cache_clear()
+    try:
+        return layout()
+    finally:
+        layout.cache_clear()
+
+
+@pytest.mark.parametrize(
+    "fields",
+    [
+        [("other", "i8"), SHARED_LIKE[1]],
+        [("first", "u8"), SHARED_LIKE[1]],
+        [SHARED_LIKE[1], ("first", "i8")],
+        [*SHARED_LIKE, ("behind", "i1")],
+        [("first", "i8"), ("inner", SHARED_LIKE[1][1], (3,))],
+        [("first", "i8"), ("inner", [("rows", "f8", (3,)), ("number", "i4")], (2,))],
+        [("first", "i8"), ("inner", [("rows", "f8", (1, 3)), ("count", "i4")], (2,))],
+    ],
+    ids=["name", "format", "order", "size", "length", "name within", "shape within"],
+)
+def test_two_who_share_records_that_stand_otherwise_know_it_by_their_digest(monkeypatch, fields):
+    alike = digest_of(monkeypatch, list(SHARED_LIKE))
+    assert digest_of(monkeypatch, list(SHARED_LIKE)) == alike
+    assert digest_of(monkeypatch, fields) != alike
+
+
+def test_what_the_numbers_mean_is_in_the_digest_too(monkeypatch):
+    before = layout()
+    monkeypatch.setattr(structs, "_NUMBERS_SHARED", structs._NUMBERS_SHARED[1:])
+    assert digest_of(monkeypatch, structs.SHARED) != before
+
+
+def test_the_header_has_the_digest_and_who_maps_the_file_reads_no_source_for_it(monkeypatch):
+    """It took half a second of each start."""
+    said = loop_header()
+    layout.cache_clear()
+    monkeypatch.setattr(Path, "read_text", lambda path, **words: pytest.fail(f"reads {path}"))
+    assert f"#define PKXYZ_LAYOUT {layout():#x}\n" in said

@@ -13,6 +13,7 @@ from hypothesis import strategies as st
 
 from hil.native.mapped import Mapped
 from hil.native.program import FLAGS, compiler
+from hil.native.teller import Teller
 from hil.operate.running.ordered import Ordered
 from hil.operate.running.sheets import Sheets
 from hil.operate.setpoints import rows_of
@@ -20,6 +21,7 @@ from hil.runs.scenario import load_scenario
 from pkxyz_ctrl.export.folder import LOOP_SOURCES
 from pkxyz_ctrl.export.shared import LoopEnd
 from pkxyz_ctrl.export.structs import loop_header
+from pkxyz_ctrl.loop import controller
 from pkxyz_ctrl.loop.reference import REFERENCE
 from pkxyz_ctrl.safety.modes import Event, Mode
 from pkxyz_ctrl.trajectory.segments import Limits
@@ -267,3 +269,9 @@ def test_in_simulation_time_stands_still_until_the_session_has_looked_and_not_fo
     assert library.alone_awaited(5) == 0  # it is back, so ...
     side.tick()
     assert library.alone_awaited(5) == 5
+
+
+def test_who_only_tells_what_a_loop_did_loads_no_kernel_to_run_one(setup, monkeypatch):
+    """A fifth of a second of each start."""
+    monkeypatch.setattr(controller, "direct", lambda kernel, *examples: pytest.fail(f"loads {kernel.__name__}"))
+    assert Teller(setup).mode == Mode.BOOT

@@ -27,6 +27,9 @@ def operate(
     native: NativeLoop = None,
 ) -> None:
     """Run the loop of a stage that `pkxyz serve` operates, until Ctrl-C or SIGTERM; at its end the combs are at 0 V."""
+    from pkxyz_ctrl.compiled.quick_load import load_quickly
+
+    load_quickly()
     load_can_quickly()
     from hil.lanes.setup import bare_setup
     from hil.operate.running.at_rate import operate as run_loop
