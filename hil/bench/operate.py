@@ -19,7 +19,7 @@ from hil.bench.rigs.running import running
 from hil.lanes.setup import bare_setup
 from hil.operate.memory import StageMemory
 from hil.operate.setpoints import rows_of
-from hil.server.serving import bus_of_its_own
+from hil.server.beside import bus_of_its_own
 from pkxyz_ctrl.client import place
 from pkxyz_ctrl.client.stage import AsyncStage, connect_async
 from pkxyz_ctrl.config.bus import BusConfig

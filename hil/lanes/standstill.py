@@ -7,11 +7,15 @@ whenever it comes, and what is due later than that period waits for the next (``
 would see on a computer that is never late. Whoever is silent for longer is gone, and time goes on without.
 """
 
+from typing import TYPE_CHECKING
+
 from pkxyz_ctrl.can import cob_id
 from pkxyz_ctrl.can.frame import Frame
 from pkxyz_ctrl.config.bus import BusConfig
 from pkxyz_ctrl.io.clocks import WallClock
-from pkxyz_ctrl.loop.runtime import Port
+
+if TYPE_CHECKING:
+    from pkxyz_ctrl.loop.runtime import Port
 
 STANDSTILL_US = 100_000
 """For so long at once the time of an amplifier that is only simulated waits for the computer, where nobody says."""
@@ -31,7 +35,7 @@ class WaitingPort:
     An amplifier that did not answer the last time is not waited for.
     """
 
-    def __init__(self, port: Port, clock: WallClock, bus: BusConfig) -> None:
+    def __init__(self, port: "Port", clock: WallClock, bus: BusConfig) -> None:
         assert bus.can is not None
         driver = bus.can.driver
         self._port, self._clock = port, clock

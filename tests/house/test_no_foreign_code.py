@@ -17,7 +17,7 @@ ALLOWED = {
     ("hil/emulator/board.py", "subprocess"): "the emulator, with the firmware that was made of them",
     ("hil/native/program.py", "subprocess"): "the C compiler, for sources of this package",
     ("hil/native/loop_process.py", "subprocess"): "the program that it made of them",
-    ("hil/server/serving.py", "subprocess"): "this program: the loop and the plant, in processes of their own",
+    ("hil/server/beside.py", "subprocess"): "this program: the loop and the plant, in processes of their own",
     ("pkxyz_ctrl/export/kernels.py", "subprocess"): "this program, where numba leaves what it compiles unoptimised",
 }
 _CALLS = {"eval", "exec", "compile", "__import__", "import_module", "run_path", "run_module", "system", "popen"}

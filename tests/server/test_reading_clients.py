@@ -7,8 +7,8 @@ import socket
 import numpy as np
 import pytest
 
+from hil.server.beside import _bound
 from hil.server.client import SAID_MOST, Client, Moment
-from hil.server.serving import _bound
 from pkxyz_ctrl.client.protocol import Block, packed
 
 pytestmark = pytest.mark.at_rate

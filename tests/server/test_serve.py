@@ -40,7 +40,8 @@ def address() -> tuple[str, str]:
 def shake(token: str, **keywords: object) -> None:
     netloc, _ = address()
     offered = [Subprotocol(SUBPROTOCOL), Subprotocol(TOKEN_PREFIX + token)]
-    plain_connect(f"ws://{netloc}/stage", subprotocols=offered, proxy=None, **keywords).close()
+    with plain_connect(f"ws://{netloc}/stage", subprotocols=offered, proxy=None, **keywords):
+        pass
 
 
 def test_the_first_program_anyone_writes(server):
@@ -194,6 +195,19 @@ def test_a_server_that_is_killed_in_a_scan_leaves_a_stage_that_holds(server):
         position = stage.status.target_m
         assert position[2] > 15e-6
         assert stage.move_to(x=0.0, y=0.0, z=18e-6).state == "done"
+
+
+def test_the_next_start_has_another_token_and_brings_in_no_library_to_compile_with(server):
+    with alive(control=False):  # all is compiled and designed
+        before = address()[1]
+    assert server.end() == 0
+    server.start()
+    shake(address()[1])
+    with pytest.raises(InvalidStatus, match=r"40[03]"):
+        shake(before)
+    with alive(control=False):
+        for kind in ("server", "loop", "plant"):
+            assert "/scipy/linalg/" not in Path(f"/proc/{place.read('stage', kind)['pid']}/maps").read_text(), kind
 
 
 def test_at_the_end_nothing_is_left(server):

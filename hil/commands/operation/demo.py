@@ -8,6 +8,7 @@ from typing import Annotated
 
 import typer
 
+from hil.commands.operation.serve import serve_beside
 from hil.screen.options import ControllerFile, ListenPort
 
 _NAME = "demo"
@@ -22,10 +23,8 @@ def demo(
     bus: Annotated[str | None, typer.Option(help="Name or file of a bus between processes.")] = None,
 ) -> None:
     """Operate a simulated stage that scans, until Ctrl-C: take control on the page and the scan gives way to you."""
-    from hil.screen.first_run import say_if_compiling
-    from hil.server.serving import Served, bus_of_its_own, serve
+    from hil.server.beside import Served, bus_of_its_own
 
-    say_if_compiling(quiet=False)
     served = Served(
         name=_NAME, stage="reconstructed", controller=controller, plant="nominal",
         bus=bus or bus_of_its_own(_NAME, "unix_2k"),
@@ -37,7 +36,7 @@ def demo(
         print(f"a stage that scans is at {url}", flush=True)
         threading.Thread(target=_scan, args=(scenario,), daemon=True).start()
 
-    raise typer.Exit(serve(served, tell))
+    raise typer.Exit(serve_beside(served, tell, quiet=False))
 
 
 def _scan(scenario: str) -> None:

@@ -1,9 +1,12 @@
 """``pkxyz serve``: a stage in operation, with a page and clients."""
 
+import contextlib
 import json
+import signal
 import sys
+from collections.abc import Callable, Iterator
 from pathlib import Path
-from typing import Annotated
+from typing import TYPE_CHECKING, Annotated
 
 import typer
 
@@ -19,6 +22,9 @@ from hil.screen.options import (
     StageCalled,
     StageFile,
 )
+
+if TYPE_CHECKING:
+    from hil.server.beside import Served
 
 
 def serve(
@@ -45,7 +51,7 @@ def serve(
 
     What it prints is the address of the page; what stands behind # in it lets people in, so keep it to yourself.
     """
-    from hil.server.serving import Served, bus_of_its_own, serve
+    from hil.server.beside import Served, bus_of_its_own
     from pkxyz_ctrl.config.bus import BusConfig
     from pkxyz_ctrl.config.files import load
 
@@ -56,7 +62,6 @@ def serve(
         from hil.conformance.proven import with_report
 
         with_report(config, report)  # said here, before anything is started
-    say_if_compiling(quiet=as_json)
     if host not in ("127.0.0.1", "localhost", "::1"):
         print(f"everybody who can reach {host} and has the address below can move the stage", file=sys.stderr)
 
@@ -67,7 +72,35 @@ def serve(
         name, stage, controller, plant, bus, on_silence, silence_s, saves, host, port, is_simulated, settings, report,
         native,
     )  # fmt: skip
-    raise typer.Exit(serve(served, tell))
+    raise typer.Exit(serve_beside(served, tell, quiet=as_json))
 
 
+def serve_beside(served: "Served", tell: Callable[[str], object], *, quiet: bool) -> int:
+    """Start what takes longest, load the server meanwhile, and serve until SIGINT or SIGTERM; ``tell`` is told where.
+    Returns an exit code. Raises ``ConfigError``.
+    """
+    from hil.server.beside import started
+
+    try:
+        with started(served) as beside:
+            with _loaded_whole():
+                say_if_compiling(quiet=quiet)
+                from hil.server.serving import serve
+
+            return serve(served, beside, tell)
+    except KeyboardInterrupt:
+        return 0
+
+
+@contextlib.contextmanager
+def _loaded_whole() -> Iterator[None]:
+    """Ctrl-C and SIGTERM act afterwards: an import that is interrupted may end in anything."""
+    signal.pthread_sigmask(signal.SIG_BLOCK, _ENDING)
+    try:
+        yield
+    finally:
+        signal.pthread_sigmask(signal.SIG_UNBLOCK, _ENDING)
+
+
+_ENDING = (signal.SIGINT, signal.SIGTERM)
 _SIMULATED_BUS = "unix_2k"
