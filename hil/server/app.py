@@ -157,7 +157,7 @@ async def go_rounds(desk: Desk) -> None:
     look, show, tell = (
         Round("look for answers", desk.look),
         Round("show telemetry", lambda: desk.show_telemetry(_ROWS_MOST)),
-        Round("tell where the stage is", lambda: desk.tell_status(in_turn=True)),
+        Round("tell where the stage is", lambda: desk.tell_status(is_in_turn=True)),
     )
     passed = 0
     while True:

@@ -21,7 +21,7 @@ from hil.server.opening import listed, opened, values_of
 from hil.server.paths import Feeding, Planner, StagePath
 from hil.server.saving import AFTER_S, BEFORE_S, NotSavedError, save
 from hil.server.setting import ASKED, Setting
-from hil.server.status import BusLoad, Pace, status_of
+from hil.server.status import BusLoad, Due, status_of
 from hil.server.stopping import Stopping
 from hil.server.stored_settings import SettingsStore
 from pkxyz_ctrl.config.files import ConfigError
@@ -63,7 +63,7 @@ class Desk:
         self._jog_id = 0
         self._jog_direction = [0.0, 0.0, 0.0]
         self._numbers = 0
-        self._bus_load, self._pace = BusLoad(), Pace()
+        self._bus_load, self._due = BusLoad(), Due()
         self._heeds_silence = False
         self._setting = Setting(link, planner, store or SettingsStore(), self._settings_changed)
 
@@ -353,8 +353,8 @@ class Desk:
                 client.tags.pop(command_id, None)
             client.tell(answer_of(tag, verb, state.name.lower(), words, command_id))
 
-    def tell_status(self, *, in_turn: bool = False) -> None:
-        """Where the stage is, to everybody; ``in_turn``: more seldom while nothing happens."""
+    def tell_status(self, *, is_in_turn: bool = False) -> None:
+        """Where the stage is, to everybody; ``is_in_turn``: more seldom while nothing happens."""
         newest = self.link.newest()
         if newest is None:
             status: dict[str, Any] = {"activity": "starting", "words": "the loop is starting", "alive": False}
@@ -370,7 +370,7 @@ class Desk:
             "held": self.holder is not None,
             "clients": len(self.clients),
         }
-        if not self._pace.is_due(status) and in_turn:
+        if not self._due.is_due(status) and is_in_turn:
             return
         text = json.dumps({"status": status}, allow_nan=False)
         for client in self.clients:

@@ -34,7 +34,7 @@ class BusLoad:
         return self._share
 
 
-class Pace:
+class Due:
     """Of two words on a stage at which nothing happens one is left out: numbers that can be read change five times a
     second, and every message costs.
     """

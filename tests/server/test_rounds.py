@@ -63,7 +63,7 @@ def test_where_it_is_is_told_half_as_often_while_nothing_happens_and_at_once_whe
     client = rig.desk.enter()
 
     def told() -> list[str]:
-        rig.desk.tell_status(in_turn=True)
+        rig.desk.tell_status(is_in_turn=True)
         return [status["activity"] for status in rig.heard(client).get("status", [])]
 
     def script() -> Script:
