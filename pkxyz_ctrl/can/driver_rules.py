@@ -15,6 +15,7 @@ from pkxyz_ctrl.can import cob_id, process_pdo, sense_input
 from pkxyz_ctrl.can.cob_id import NmtCommand, NmtState
 from pkxyz_ctrl.can.frame import UNUSUAL
 from pkxyz_ctrl.can.start_plan import START, START_MEMORY
+from pkxyz_ctrl.compiled.division import into_period
 
 Records = NDArray[np.void]
 
@@ -254,8 +255,7 @@ def heartbeat_sent(config_array: Records, memory_array: Records, t_us: int) -> N
     config, memory = config_array[0], memory_array[0]
     if t_us >= memory["heartbeat_next_us"]:
         period_us = config["heartbeat_period_us"]
-        missed = (t_us - memory["heartbeat_next_us"]) // period_us
-        memory["heartbeat_next_us"] += (missed + 1) * period_us
+        memory["heartbeat_next_us"] = t_us + period_us - into_period(t_us - memory["heartbeat_next_us"], period_us)
         _keep_away(config, memory, t_us)
 
 
@@ -266,7 +266,7 @@ def _keep_away(config: np.void, memory: np.void, t_us: int) -> None:
     """
     if memory["state"] == RUNNING:
         period_us = config["node_period_us"]
-        after_us = (memory["heartbeat_next_us"] - memory["node_heartbeat_us"] + _APART_US) % period_us
+        after_us = into_period(memory["heartbeat_next_us"] - memory["node_heartbeat_us"] + _APART_US, period_us)
         is_near = after_us < 2 * _APART_US < period_us
         if is_near and memory["heartbeat_next_us"] - after_us > t_us:
             memory["heartbeat_next_us"] -= after_us

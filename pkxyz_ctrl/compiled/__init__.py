@@ -1,1 +1,1 @@
-"""Where compiled kernels are kept, and how they are called without detours."""
+"""Where compiled kernels are kept, how they are called without detours, and what none of them should compute."""

@@ -117,7 +117,7 @@ define internal i64 @pkxyz.srem(i64 %a, i64 %b) nounwind optsize {
   ret i64 %rest
 }
 """
-"""Of 64-bit integers, bit by bit, where the processor divides 32 bits only: a heartbeat takes one now and then."""
+"""Of 64-bit integers, bit by bit, where the processor divides 32 bits only: a heartbeat late by periods takes one."""
 
 SQUARE_ROOT: Final = """
 define internal double @pkxyz.sqrt(double %x) noinline nounwind {

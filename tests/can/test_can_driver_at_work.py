@@ -1,6 +1,7 @@
 """What the driver does at work beside voltages: outputs, the node's signature, a release; each condition alone."""
 
 from binascii import crc_hqx
+from random import Random
 
 import pytest
 from scripted_node import (
@@ -23,7 +24,7 @@ from scripted_node import (
 from pkxyz_ctrl.can import driver_rules, start_plan
 from pkxyz_ctrl.can.driver import FOREIGN_FRAME, SAFETY_OBJECTS, AmplifierDriver, word_of
 from pkxyz_ctrl.can.driver_config import DriverConfig
-from pkxyz_ctrl.can.driver_rules import DriverState
+from pkxyz_ctrl.can.driver_rules import NEVER_US, DriverState
 from pkxyz_ctrl.can.frame import Frame
 from pkxyz_ctrl.can.startup import table
 from pkxyz_ctrl.safety.monitors import NodeEvent
@@ -310,6 +311,28 @@ def test_ours_is_put_before_the_nodes_where_they_would_meet(due_us: int, sent_us
     driver.memory["heartbeat_next_us"], driver.memory["node_heartbeat_us"] = due_us, 0
     driver.heartbeat_sent(sent_us)
     assert driver.memory["heartbeat_next_us"][0] == next_us
+
+
+def divided(due_us: int, node_us: int, sent_us: int, ours_us: int, theirs_us: int) -> int:
+    """When ours is due after one that was sent, by whole periods in Python's own numbers."""
+    if sent_us < due_us:
+        return due_us
+    due_us += ((sent_us - due_us) // ours_us + 1) * ours_us
+    after_us = (due_us - node_us + 1000) % theirs_us
+    return due_us - after_us if after_us < 2000 < theirs_us and due_us - after_us > sent_us else due_us
+
+
+def test_ours_is_due_where_whole_periods_put_it_however_late_and_silent_remains_silent() -> None:
+    draw, driver = Random(3), started()
+    for _ in range(20_000):
+        ours_us, theirs_us = (1000 * draw.choice((1, 2, 3, 20, 65_535)) for _ in range(2))
+        sent_us = draw.randint(0, 1 << draw.randint(1, 45))
+        due_us = draw.choice((NEVER_US, sent_us - draw.randint(-3, draw.choice((5, 80, 10**9))) * ours_us // 2))
+        node_us = sent_us - draw.randint(-1, draw.choice((3, 10**6))) * theirs_us // 2 + draw.randint(-1, 1)
+        driver.record["heartbeat_period_us"], driver.record["node_period_us"] = ours_us, theirs_us
+        driver.memory["heartbeat_next_us"], driver.memory["node_heartbeat_us"] = due_us, node_us
+        driver.heartbeat_sent(sent_us)
+        assert driver.memory["heartbeat_next_us"][0] == divided(due_us, node_us, sent_us, ours_us, theirs_us)
 
 
 def test_how_long_ours_may_be_put_off_is_the_configurations() -> None:
