@@ -2,6 +2,7 @@
 
 import hashlib
 import json
+import math
 from importlib.metadata import version
 from pathlib import Path
 from string import Template
@@ -91,7 +92,7 @@ def require_exportable(law: Records, name: str, target: str) -> None:
     if period_us * BUSY_MOST < most_us:
         raise ExportError(
             f"a period of {period_us} us is too short for {target}, where the longest tick takes {most_us} us; give a "
-            f"bus of {most_us / BUSY_MOST:.0f} us or more, or another target"
+            f"bus of {math.ceil(most_us / BUSY_MOST)} us or more, or another target"
         )
     if law["tick"]["kind"][0] == PREDICTIVE:
         raise ExportError(

@@ -1,13 +1,18 @@
 """``pkxyz export`` asked for what it can't give: one line, exit code 2, nothing written and nothing overwritten."""
 
+import re
+
+import numpy as np
 import pytest
 from command_line import refused
 
 from hil.runs.scenario import load_scenario
 from pkxyz_ctrl.export.calls import CALL
-from pkxyz_ctrl.export.folder import Exported, write
+from pkxyz_ctrl.export.folder import Exported, require_exportable, write
 from pkxyz_ctrl.export.kernels import ExportError
+from pkxyz_ctrl.loop.cycle import LAW
 from pkxyz_ctrl.loop.exchange import EXCHANGE
+from pkxyz_ctrl.loop.reference import REFERENCE
 
 
 @pytest.mark.parametrize(
@@ -20,13 +25,25 @@ from pkxyz_ctrl.loop.exchange import EXCHANGE
         (("--ticks", "10"), "ticks"),
         (("--target", "cortex-m4"), "a period of 200 us is too short for cortex-m4, where the longest tick takes 3700"),
         (("--controller", "robust_20k", "--bus", "local_20k", "--target", "host"), "bus 'local_20k' has no [can]"),
-        (("--controller", "robust_20k", "--bus", "local_20k"), "give a bus of 101 us or more, or another target"),
+        (("--controller", "robust_20k", "--bus", "local_20k"), "give a bus of 93 us or more, or another target"),
     ],
 )
 def test_what_does_not_go_is_said_in_a_line(tmp_path, capsys, monkeypatch, words, says):
     out = tmp_path / "out"
     assert says in refused(capsys, monkeypatch, "export", *words, "--out", out)
     assert not out.exists()
+
+
+@pytest.mark.parametrize("target", ["cortex-m7", "cortex-m4"])
+def test_the_shortest_period_that_it_asks_for_goes(target):
+    law = np.zeros(1, LAW)
+    with pytest.raises(ExportError, match="is too short") as refused:
+        require_exportable(law, "of_a_test", target)
+    law["period_us"] = int(re.search(r"a bus of (\d+) us or more", str(refused.value))[1])
+    require_exportable(law, "of_a_test", target)
+    law["period_us"] -= 1
+    with pytest.raises(ExportError, match="is too short"):
+        require_exportable(law, "of_a_test", target)
 
 
 def test_nothing_of_the_users_is_overwritten(tmp_path, capsys, monkeypatch):
@@ -37,10 +54,6 @@ def test_nothing_of_the_users_is_overwritten(tmp_path, capsys, monkeypatch):
 
 
 def test_a_path_that_no_board_holds_is_refused_with_what_it_takes(tmp_path):
-    import numpy as np
-
-    from pkxyz_ctrl.loop.reference import REFERENCE
-
     config = np.zeros(1, EXCHANGE)
     config["law"][0] = load_scenario("raster").setup().law
     exported = Exported(config, np.zeros(20_000, REFERENCE), np.zeros(100, CALL), "raster", "youla", "")
