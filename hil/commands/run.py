@@ -221,11 +221,12 @@ def _quiet(row: object) -> None:
 
 def _show(summary: "Summary", folder: Path) -> None:
     rows, loop = summary.rows, summary.loop
-    late = loop.lateness_us or {"p50": 0, "p99_9": 0, "max": 0}
+    late, answer = (of or {"p50": 0, "p99_9": 0, "max": 0} for of in (loop.lateness_us, loop.answer_us))
     print(
         f"{summary.scenario} on {summary.bus}: {rows.ticks} ticks, {loop.missed_ticks} missed, woken "
         f"{late['p50']} us late in the middle, {late['p99_9']} us at p99.9, {late['max']} us at most"
     )
+    print(f"sense frames answered in {answer['p50']} us, {answer['p99_9']} us at p99.9, {answer['max']} us at most")
     if loop.stood_still_s:
         print(f"time stood still for {loop.stood_still_s:.3g} s, as a simulated stage waits for the computer")
     said = (*error_lines(rows, loop.errors_are_of), *lacking_lines(loop.protections_lacking), *loss_lines(loop))

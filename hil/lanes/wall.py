@@ -14,11 +14,12 @@ from hil.lanes.setup import Setup
 from hil.lanes.standstill import WaitingPort
 from hil.lanes.streamed_reference import StreamedReference
 from pkxyz_ctrl.can import cob_id
+from pkxyz_ctrl.can.driver_config import DriverConfig
 from pkxyz_ctrl.can.frame import Frame
 from pkxyz_ctrl.config.bus import BusConfig, CanConfig
 from pkxyz_ctrl.config.files import ConfigError
 from pkxyz_ctrl.io.can_port import CanPort, open_bus
-from pkxyz_ctrl.io.clocks import TickClock, WallClock
+from pkxyz_ctrl.io.clocks import HISTOGRAM_US, TickClock, WallClock, count_us
 from pkxyz_ctrl.io.realtime import go_real_time, leave_real_time, settle_memory
 from pkxyz_ctrl.learning import Learner
 from pkxyz_ctrl.loop import cycle as cycling
@@ -85,21 +86,34 @@ class TakesTicks(TakesFrames, Protocol):
 
 
 class _LoggedPort:
-    """A port whose frames go to the recorder, too. ``heartbeat_us``: when ``node_id`` said last that it is there."""
+    """A port whose frames go to the recorder, too. ``heartbeat_us``: when the node said last that it is there.
 
-    def __init__(self, port: CanPort, clock: WallClock, recorder: TakesFrames, node_id: int) -> None:
+    ``answer_us`` counts answers by whole microseconds from a sense frame that was read to the drive frame that was
+    handed over, where that is the next to be sent; the last entry all beyond.
+    """
+
+    def __init__(self, port: CanPort, clock: WallClock, recorder: TakesFrames, driver: DriverConfig) -> None:
         self._port, self._clock, self._log = port, clock, recorder.frame
-        self._heartbeat_id = cob_id.HEARTBEAT_BASE + node_id
+        self._heartbeat_id = cob_id.HEARTBEAT_BASE + driver.node_id
+        self._sense_id = cob_id.sense(driver.node_id, driver.sense_pdo)
+        self._drive_id = cob_id.drive(driver.node_id, driver.drive_pdo)
+        self._sensed_ns = 0  # 0: nothing is to be answered
+        self.answer_us = [0] * HISTOGRAM_US
         self.heartbeat_us = 0
         self.unsent = port.unsent
 
     def send(self, frame: Frame) -> None:
+        sensed_ns, self._sensed_ns = self._sensed_ns, 0
         if self._port.send(frame):
+            if sensed_ns and frame.can_id == self._drive_id:
+                count_us(self.answer_us, (time.monotonic_ns() - sensed_ns) // 1000)
             self._log(frame, self._clock.now_us)
 
     def receive(self, deadline_us: int) -> Frame | None:
         frame = self._port.receive(deadline_us)
         if frame is not None:
+            if frame.can_id == self._sense_id:
+                self._sensed_ns = time.monotonic_ns()
             self._log(frame, self._port.last_us)
             if frame.can_id == self._heartbeat_id:
                 self.heartbeat_us = self._port.last_us
@@ -121,7 +135,7 @@ class WallRig:
         self._bus = open_bus(can_config, setup.bus.name)
         self.clock = WallClock()
         self.can_port = CanPort(self._bus, self.clock, can_config.sense_deadline_us // 2)
-        self.port = _LoggedPort(self.can_port, self.clock, recorder, can_config.driver.node_id)
+        self.port = _LoggedPort(self.can_port, self.clock, recorder, can_config.driver)
         waits = can_config.standstill_max_us > 0
         self._port_of_ticks = WaitingPort(self.port, self.clock, setup.bus) if waits else self.port
         self.controller = Controller(
@@ -152,6 +166,11 @@ class WallRig:
     def lateness_us(self) -> list[int]:
         """Wake-ups by whole microseconds of lateness, the last entry all beyond."""
         return self.ticks.lateness_us
+
+    @property
+    def answer_us(self) -> list[int]:
+        """Answers to a sense frame by whole microseconds, the last entry all beyond."""
+        return self.port.answer_us
 
     @property
     def stood_us(self) -> int:

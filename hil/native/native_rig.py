@@ -43,6 +43,11 @@ class NativeRig:
         return lateness
 
     @property
+    def answer_us(self) -> list[int]:
+        answers: list[int] = self._state["answers"].tolist()
+        return answers
+
+    @property
     def stood_us(self) -> int:
         return int(self._state["stood_us"])
 

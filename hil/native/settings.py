@@ -63,6 +63,8 @@ def fill(
     to["spin_us"], to["company_us"], to["silent_us"] = SPIN_US, round(company_s * 1e6), SILENT_US
     to["priority"] = FIFO_PRIORITY
     to["node_heartbeat_id"] = cob_id.HEARTBEAT_BASE + can.driver.node_id
+    to["sense_id"] = cob_id.sense(can.driver.node_id, can.driver.sense_pdo)
+    to["drive_id"] = cob_id.drive(can.driver.node_id, can.driver.drive_pdo)
     to["loop_closed"] = sum(1 << mode for mode, closed in enumerate(LOOP_CLOSED) if closed)
     to["interface"], to["fd"] = _INTERFACES[can.interface], can.driver.fd
     to["is_named"] = "/" not in can.channel

@@ -46,6 +46,8 @@ class RanAtRate:
     """signal that ended it, 0 if it ran to its end"""
     lateness_us: list[int]
     """wake-ups by whole microseconds of lateness"""
+    answer_us: list[int]
+    """answers to a sense frame by whole microseconds"""
 
 
 @dataclass
@@ -57,6 +59,7 @@ class _Watched:
     faults: tuple[str, ...] = ()
     protections_lacking: tuple[str, ...] = ()
     lateness_us: list[int] = dataclasses.field(default_factory=list)
+    answer_us: list[int] = dataclasses.field(default_factory=list)
     missed_ticks: int = 0
     refused_frames: int = 0
     dropped_frames: int | None = None
@@ -110,7 +113,7 @@ def _run_into(
     if begun.learning is not None:
         begun.learning.errors.look_at(recording)
     rows = _figures(recording, begun.metrics)
-    late, period_s = watched.lateness_us, scenario.bus.period_s
+    late, answers, period_s = watched.lateness_us, watched.answer_us, scenario.bus.period_s
     loop = LoopFigures(
         missed_ticks=watched.missed_ticks,
         faults=watched.faults,
@@ -123,9 +126,10 @@ def _run_into(
         lost_rows=recorder.lost_rows,
         stood_still_s=watched.stood_us * 1e-6,
         lateness_us={name: percentile_us(late, share) for name, share in _SHARES.items()},
+        answer_us={name: percentile_us(answers, share) for name, share in _SHARES.items()},
     )
     summary = begun.end(rows, loop, watched.learner, watched.adaptation, interrupted=bool(watched.ended_by))
-    return RanAtRate(summary, watched.ended_by, late)
+    return RanAtRate(summary, watched.ended_by, late, answers)
 
 
 def _loop_of(
@@ -159,6 +163,7 @@ def _run(rig: WallRig | NativeRig, watched: _Watched, say: Callable[[str], objec
             watched.faults = tuple(rig.controller.faults)
             watched.protections_lacking = rig.controller.driver.lost
             watched.lateness_us = rig.lateness_us
+            watched.answer_us = rig.answer_us
             watched.missed_ticks = rig.controller.missed_ticks
             watched.refused_frames = rig.refused_frames
             watched.dropped_frames = rig.dropped_frames

@@ -13,7 +13,15 @@ if TYPE_CHECKING:  # who draws a run loads none of it
     from hil.runs.period_errors import PeriodFigures
     from hil.runs.scenario import Scenario
 
-_AT_RATE = ("refused_frames", "dropped_frames", "blocked_frames", "lost_rows", "stood_still_s", "lateness_us")
+_AT_RATE = (
+    "refused_frames",
+    "dropped_frames",
+    "blocked_frames",
+    "lost_rows",
+    "stood_still_s",
+    "lateness_us",
+    "answer_us",
+)
 
 
 @dataclass(frozen=True)
@@ -44,6 +52,8 @@ class LoopFigures:
     """for how long time waited for the computer, as it does for a stage that is only simulated; wall lane"""
     lateness_us: Mapping[str, int] | None = None
     """of the wake-ups: p50, p99_9, max; wall lane"""
+    answer_us: Mapping[str, int] | None = None
+    """from a sense frame read to the drive frame handed over: p50, p99_9, max; wall lane"""
 
 
 @dataclass(frozen=True)

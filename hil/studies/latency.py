@@ -28,7 +28,7 @@ from pkxyz_ctrl.can.codec import ProcessCodec
 from pkxyz_ctrl.can.frame import Frame
 from pkxyz_ctrl.config.files import ConfigError
 from pkxyz_ctrl.config.refused import reason
-from pkxyz_ctrl.io.clocks import TickClock, WallClock, percentile_us
+from pkxyz_ctrl.io.clocks import HISTOGRAM_US, TickClock, WallClock, count_us, percentile_us
 from pkxyz_ctrl.io.realtime import FIFO_PRIORITY, go_real_time, leave_real_time, settle_memory
 from pkxyz_ctrl.loop import cycle as cycling
 from pkxyz_ctrl.loop.controller import Controller
@@ -36,7 +36,6 @@ from pkxyz_ctrl.loop.reference import reference_rows
 from pkxyz_ctrl.loop.runtime import run
 from pkxyz_ctrl.safety.modes import Mode
 
-_HISTOGRAM_US = 2000
 _SECONDS_MAX = 60.0
 _PERIODS_US = (100, 100_000)
 
@@ -105,7 +104,7 @@ class _Stopwatch:
     def __init__(self, clock: TickClock) -> None:
         self._clock = clock
         self.spend = clock.spend
-        self.cycle_us = [0] * _HISTOGRAM_US
+        self.cycle_us = [0] * HISTOGRAM_US
         self._awake_ns = 0
 
     @property
@@ -118,8 +117,7 @@ class _Stopwatch:
 
     def stop(self, tick: int) -> None:
         """The tick is done."""
-        taken_us = (time.monotonic_ns() - self._awake_ns) // 1000
-        self.cycle_us[taken_us if taken_us < _HISTOGRAM_US else -1] += 1
+        count_us(self.cycle_us, (time.monotonic_ns() - self._awake_ns) // 1000)
 
 
 def measure(period_us: int, seconds: float, cyclictest: str | None = None) -> Latency:
@@ -191,7 +189,7 @@ def start_cyclictest(path: str | None, period_us: int, seconds: float) -> "subpr
         return None
     real_time = ["-m", "-p", str(FIFO_PRIORITY)] if os.geteuid() == 0 else []
     loops = round(seconds * 1e6 / period_us)
-    words = [path, "-q", "-t1", *real_time, "-i", str(period_us), "-l", str(loops), "-h", str(_HISTOGRAM_US)]
+    words = [path, "-q", "-t1", *real_time, "-i", str(period_us), "-l", str(loops), "-h", str(HISTOGRAM_US)]
     try:
         return subprocess.Popen(words, stdout=subprocess.PIPE, stderr=subprocess.DEVNULL, text=True)
     except OSError as error:
@@ -200,9 +198,9 @@ def start_cyclictest(path: str | None, period_us: int, seconds: float) -> "subpr
 
 def read_cyclictest(text: str) -> list[int] | None:
     """The histogram that ``cyclictest -h`` prints, its overflows in the last entry; None if there is none."""
-    counts = [0] * _HISTOGRAM_US
+    counts = [0] * HISTOGRAM_US
     for late_us, count in re.findall(r"^(\d{6}) (\d+)$", text, flags=re.MULTILINE):
-        counts[min(int(late_us), _HISTOGRAM_US - 1)] += int(count)
+        count_us(counts, int(late_us), int(count))
     overflows = re.search(r"^# Histogram Overflows: (\d+)", text, flags=re.MULTILINE)
     counts[-1] += int(overflows[1]) if overflows else 0
     return counts if any(counts) else None

@@ -26,7 +26,7 @@ AHEAD_ROWS: Final = 32
 """... and so many of the next one behind them: what a law looks ahead."""
 SHEET_ROWS: Final = 1024
 SNAPSHOTS: Final = 64
-LATENESS_MOST_US: Final = 2000
+HISTOGRAM_US: Final = 2000
 EVENTS: Final = 64
 _WORDS: Final = 512
 _CHANNEL: Final = 128
@@ -106,6 +106,8 @@ SETTINGS = np.dtype(
         ("blocks", "i4"),  # of the path
         ("priority", "i4"),  # of SCHED_FIFO
         ("node_heartbeat_id", "i4"),
+        ("sense_id", "i4"),
+        ("drive_id", "i4"),
         ("loop_closed", "i4"),  # a bit a mode
         ("interface", "i4"),
         ("fd", "i4"),
@@ -141,7 +143,8 @@ STATE = np.dtype(
         ("signal", "i4"),  # that asked for the end
         ("status", "i4"),  # of a kernel that failed
         ("port", PORT, (1,)),
-        ("lateness", "i8", (LATENESS_MOST_US,)),  # wake-ups by whole us of lateness, the last entry all beyond
+        ("lateness", "i8", (HISTOGRAM_US,)),  # wake-ups by whole us of lateness, the last entry all beyond
+        ("answers", "i8", (HISTOGRAM_US,)),  # by whole us from a sense frame read to the drive frame handed over
         ("real_time", "u1", (_WORDS,)),  # what the system gave, in words
         ("refusal", "u1", (_WORDS,)),  # why the bus can't be had, in words
     ],

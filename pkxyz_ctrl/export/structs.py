@@ -24,7 +24,7 @@ from pkxyz_ctrl.export.entries import ENTRIES, MANY, OF_LOOP, Entry
 from pkxyz_ctrl.export.shared import (
     BLOCK_ROWS,
     EVENTS,
-    LATENESS_MOST_US,
+    HISTOGRAM_US,
     MAGIC,
     PATH,
     SHARED,
@@ -91,7 +91,7 @@ def loop_header(period_us: int = 0, held: Stored | None = None) -> str:
     held = held or Stored(EXCHANGE.itemsize, EXCHANGE_MEMORY.itemsize)
     law = _LAW.format(period_us=period_us, settings=held.settings, memory=held.memory)
     numbers = {"MAGIC": f"{MAGIC:#x}", "LAYOUT": f"{layout():#x}", "BLOCK_ROWS": BLOCK_ROWS, "EVENTS": EVENTS}
-    numbers["LATENESS_MOST_US"], numbers["SNAPSHOTS"] = LATENESS_MOST_US, SNAPSHOTS
+    numbers["HISTOGRAM_US"], numbers["SNAPSHOTS"] = HISTOGRAM_US, SNAPSHOTS
     defined = "".join(f"#define PKXYZ_{name} {value}\n" for name, value in numbers.items())
     return _HEAD + law + defined + _body() + _shared_body() + _TAIL
 

@@ -7,7 +7,8 @@ SPIN_US = 60
 """How long before an instant sleeping ends: more than a wake-up is late (20-30 us at p99.9 under SCHED_FIFO), and too
 little for the kernel's throttle of real-time processes (95 %) even at 5 kHz."""
 
-_HISTOGRAM_US = 2000
+HISTOGRAM_US = 2000
+"""Entries of a histogram by whole microseconds, the last all beyond."""
 
 
 class WallClock:
@@ -84,7 +85,7 @@ class TickClock:
         self._standstill_us = standstill_us
         self._late_frames = late_frames
         self._leave = leave
-        self.lateness_us = [0] * _HISTOGRAM_US
+        self.lateness_us = [0] * HISTOGRAM_US
         self._begun_us = 0
 
     @property
@@ -108,7 +109,7 @@ class TickClock:
             self._late_frames(t_us)  # what comes later than this came in a tick of its own
             clock.wait_until(t_us)
             late_us = clock.now_us - t_us
-            lateness[late_us if late_us < _HISTOGRAM_US else -1] += 1
+            count_us(lateness, late_us)
             if self._latest_start_us < late_us <= self._standstill_us:
                 clock.stand_at(t_us)
             elif late_us > self._latest_start_us:
@@ -123,11 +124,17 @@ class TickClock:
             self._clock.stand_at(self._begun_us + spent_at_most_us)
 
 
+def count_us(histogram: list[int], time_us: int, times: int = 1) -> None:
+    """``time_us`` came so many ``times`` more, in a histogram by whole microseconds."""
+    last_us = len(histogram) - 1
+    histogram[time_us if time_us < last_us else last_us] += times
+
+
 def percentile_us(histogram: list[int], share: float) -> int:
-    """The lateness in us that a share 0..1 of the wake-ups does not exceed; 0 if there were none."""
+    """The time in us that a share 0..1 of those counted does not exceed; 0 if there were none."""
     wanted, seen = share * sum(histogram), 0
-    for late_us, count in enumerate(histogram):
+    for time_us, count in enumerate(histogram):
         seen += count
         if seen >= wanted:
-            return late_us
+            return time_us
     return 0

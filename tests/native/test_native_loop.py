@@ -90,6 +90,8 @@ def test_a_run_leaves_what_python_s_loop_leaves_and_replays_in_every_bit(bench, 
         summary = json.loads(out)
         assert summary["faults"] == []
         assert summary["lost_rows"] == summary["refused_frames"] == summary["blocked_frames"] == 0
+        answer_us = summary["answer_us"]
+        assert 0 < answer_us["p50"] <= answer_us["p99_9"] <= answer_us["max"]
         folders[name] = bench / name, summary
     (native, native_summary), (python, python_summary) = folders.values()
     assert sorted(path.name for path in native.iterdir()) == sorted(path.name for path in python.iterdir())

@@ -72,7 +72,7 @@ def test_checks_that_fail(tmp_path, loop, more, failing):
 @pytest.mark.parametrize("as_json", [False, True])
 def test_the_exit_code_of_a_run_at_rate_is_its_verdict(tmp_path, monkeypatch, capsys, loop, ended_by, code, as_json):
     """The scenario has no checks; what it ran into is handed in."""
-    ran = RanAtRate(summary(tmp_path, loop, interrupted=bool(ended_by)), ended_by, [])
+    ran = RanAtRate(summary(tmp_path, loop, interrupted=bool(ended_by)), ended_by, [], [])
     monkeypatch.setattr("hil.runs.at_rate.run_into", lambda *_: ran)
     monkeypatch.setattr("hil.pictures.run.draw", lambda *_: None)
     with pytest.raises(typer.Exit) as ended:

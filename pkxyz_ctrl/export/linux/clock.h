@@ -16,6 +16,12 @@ void clock_wait_until(int64_t t_us);
 void clock_stand_at(int64_t t_us);
 int64_t clock_stood_us(void); /* in all */
 
+/* One more of time_us in a histogram by whole us, whose last entry has all beyond. */
+static inline void clock_count(int64_t *histogram, int64_t size, int64_t time_us)
+{
+    histogram[time_us < size ? time_us : size - 1]++;
+}
+
 /* Between two looks at something that may change at any moment. */
 static inline void clock_relax(void)
 {

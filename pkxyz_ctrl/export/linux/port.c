@@ -13,8 +13,8 @@ enum { BUS_OFF = 0x40 }; /* class of an error frame (linux/can/error.h); the nex
 static const bus *under;
 static pkxyz_shared_state *state;
 static pkxyz_shared_port *counts;
-static int64_t spin_us, last_us;
-static int32_t heartbeat_id;
+static int64_t spin_us, last_us, sensed_ns; /* sensed: 0 where nothing is to be answered */
+static int32_t heartbeat_id, sense_id, drive_id;
 
 int port_open(const pkxyz_shared_settings *settings, pkxyz_shared_state *said, char *why, int size)
 {
@@ -23,6 +23,8 @@ int port_open(const pkxyz_shared_settings *settings, pkxyz_shared_state *said, c
     under = settings->interface == PKXYZ_INTERFACE_UNIX ? &unix_bus : &can_bus;
     spin_us = settings->sense_deadline_us / 2;
     heartbeat_id = settings->node_heartbeat_id;
+    sense_id = settings->sense_id;
+    drive_id = settings->drive_id;
     if (under->open(settings, why, size) != 0)
         return -1;
     port_look();
@@ -34,6 +36,8 @@ void port_send(const pkxyz_driver_rules_outgoing *out)
     frame sent = {.can_id = out->can_id, .flags = out->flags, .length = out->length};
     memcpy(sent.data, &out->data, sizeof out->data);
     const int refusal = under->send(&sent);
+    const int64_t answered_ns = sensed_ns;
+    sensed_ns = 0;
     counts->refuses = refusal != 0;
     if (refusal != 0) {
         counts->refusal = refusal;
@@ -41,6 +45,8 @@ void port_send(const pkxyz_driver_rules_outgoing *out)
         return;
     }
     counts->sent++;
+    if (answered_ns != 0 && out->can_id == drive_id)
+        clock_count(state->answers, PKXYZ_HISTOGRAM_US, (clock_monotonic_ns() - answered_ns) / 1000);
     ring_frame(&sent, clock_now_us());
 }
 
@@ -72,6 +78,8 @@ int port_receive(int64_t deadline_us, frame *taken)
     const int64_t sent_us = (taken->sent_ns - clock_begun_ns()) / 1000;
     if (sent_us > last_us) /* it never runs backwards */
         last_us = sent_us;
+    if (taken->can_id == sense_id)
+        sensed_ns = clock_monotonic_ns();
     if (taken->can_id == heartbeat_id)
         state->heartbeat_us = last_us;
     ring_frame(taken, last_us);

@@ -35,11 +35,6 @@ static void take_late_frames(int64_t until_us)
         controller_take(&came, clock_now_us());
 }
 
-static void count(int64_t late_us)
-{
-    state->lateness[late_us < PKXYZ_LATENESS_MOST_US ? late_us : PKXYZ_LATENESS_MOST_US - 1]++;
-}
-
 int ticks_wait_until(int64_t t_us)
 {
     for (;;) {
@@ -57,7 +52,7 @@ int ticks_wait_until(int64_t t_us)
         take_late_frames(t_us); /* what comes later than this came in a tick of its own */
         clock_wait_until(t_us);
         const int64_t late_us = clock_now_us() - t_us;
-        count(late_us);
+        clock_count(state->lateness, PKXYZ_HISTOGRAM_US, late_us);
         if (late_us > settings->latest_start_us && late_us <= settings->standstill_us)
             clock_stand_at(t_us);
         else if (late_us > settings->latest_start_us)
