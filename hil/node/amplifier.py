@@ -91,7 +91,8 @@ class AmplifierNode:
         self._drive_errors = FrameErrors(self.emergency, error_hold_us)
         self._heartbeat = HeartbeatProducer(clock, self._send_heartbeat)
         self._consumers = [
-            HeartbeatConsumer(clock, self._controller_lost, self._controller_found) for _ in range(od[0x1016, 0])
+            HeartbeatConsumer(clock, self._controller_lost, lambda: self._release(ErrorCode.HEARTBEAT_LOST))
+            for _ in range(od[0x1016, 0])
         ]
         self._drive = DriveReceiver(od, self._drive_pdo, self._drive_errors, lambda: self.outputs)
         self._sense = SenseTransmitter(
@@ -115,6 +116,7 @@ class AmplifierNode:
         """Start as after power-up or reset: outputs at 0, all objects at their defaults, boot-up message to come."""
         self._holds.clear()
         self._restart(0x0000, 0xFFFF)
+        self._sense.power_on()
         self._set_outputs((0, 0, 0), self._clock.now_us)
         self.digital.put_out(0, self._clock.now_us)
 
@@ -176,7 +178,6 @@ class AmplifierNode:
     def _restart(self, first: int, last: int) -> None:
         """Reset the objects from ``first`` to ``last`` and boot."""
         self._enter(NmtState.INITIALISING)
-        self._admit()
         self.od.reset(first, last)
         self._sdo.reset()
         self._heartbeat.configure(0, beat_now=False)
@@ -188,7 +189,6 @@ class AmplifierNode:
         for code in sorted(self._holds):
             self.emergency.begin(code)
         self._drive.reset()
-        self._sense.configure()
         self._boot_alarm.set(self._clock.now_us + self._boot_us)
 
     def _boot(self, now_us: int) -> None:
@@ -338,9 +338,6 @@ class AmplifierNode:
         elif behaviour == 2:
             self._enter(NmtState.STOPPED)
 
-    def _controller_found(self) -> None:
-        self._release(ErrorCode.HEARTBEAT_LOST)
-
     # -- service data and frames -------------------------------------------------------------------------------------
 
     def _on_sdo(self, data: bytes, t_us: int) -> None:
@@ -384,7 +381,6 @@ class AmplifierNode:
                 self._heartbeat.configure(1000 * od[0x1017, 0], beat_now=True)
             case self._drive_pdo.communication | self._drive_pdo.mapping:
                 self._drive.configure()
-                self._drive.start()
             case self._sense_pdo.communication | self._sense_pdo.mapping:
                 self._sense.configure()
             case 0x6200 if self.state is NmtState.OPERATIONAL:

@@ -72,6 +72,7 @@ class DriveReceiver:
         """As after power-up."""
         self.start()
         self.configure()
+        self.crc = 0
         self._is_zero_due = False
 
     def demand_zero(self) -> None:

@@ -101,6 +101,7 @@ class EmergencyProducer:
         self._active.clear()
         self._waiting.clear()
         self._alarm.cancel()
+        self._open_us = 0
         self._od[0x1001, 0] = 0
         self.clear_history()
 

@@ -38,7 +38,7 @@ _GATE = (
 _START_PARTS = ("start_plan", "start_conditions", "driver_at_work", "sdo", "driver_start", "driver")
 _START = tuple(f"can/test_can_{part}.py" for part in _START_PARTS)
 _DRIVER = tuple(f"can/test_can_driver{part}.py" for part in ("_conditions", "_at_work", "_start", ""))
-_NODE_PARTS = ("pdo", "conditions", "release", "sync", "nmt", "heartbeat", "emergency")
+_NODE_PARTS = ("pdo", "conditions", "release", "restart", "sync", "nmt", "heartbeat", "emergency")
 _NODE = tuple(f"node/test_node_{part}.py" for part in _NODE_PARTS)
 TARGETS = {
     "pkxyz_ctrl.safety.gate": _GATE,

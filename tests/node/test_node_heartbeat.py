@@ -145,3 +145,17 @@ def test_rewriting_the_consumer_time_ends_the_watch() -> None:
     rig.give(CONTROLLER, b"\x05")
     rig.run(10_000)
     assert rig.node.outputs == (0, 0, 0)
+
+
+def test_the_alarms_of_its_work_are_those_that_a_quiet_cycle_puts_off() -> None:
+    """Drive PDO, its own heartbeat, the controller's: whoever does the cycle in the node's place moves all three."""
+    rig = watched()
+    assert rig.write(0x1017, 0, 1, 2) == 0
+    rig.energise()
+    rig.give(CONTROLLER, b"\x05")
+    before = [alarm.due_us or 0 for alarm in rig.node.work_alarms]
+    for _ in range(10):
+        rig.cycle((100, 200, 300))
+    rig.give(CONTROLLER, b"\x05")
+    after = [alarm.due_us or 0 for alarm in rig.node.work_alarms]
+    assert [b - a >= 1_000 for a, b in zip(before, after, strict=True)] == [True, True, True]

@@ -3,7 +3,7 @@
 from collections.abc import Callable
 
 import pytest
-from node_rig import EMCY, Rig, emergencies, operational
+from node_rig import EMCY, SYNC, Rig, emergencies, operational
 
 ZERO = (0, 0, 0)
 LATE, STEP, MISSING = 0xFF13, 0xFF14, 0x8250
@@ -224,3 +224,50 @@ def test_error_mode_and_value_of_each_comb() -> None:
     rig.nmt(128)
     assert rig.plant.driven[-1] == (rig.now_us, (0, 200, 55))
     assert [rig.read(0x6411, i) for i in (1, 2, 3)] == [0, 200, 55]
+
+
+def test_silence_is_counted_from_the_start() -> None:
+    rig = Rig()
+    for _ in range(3):  # five in a row is what is told
+        rig.start()
+        for _ in range(4):
+            rig.cycle()
+        rig.nmt(128)
+    assert emergencies(rig) == []
+
+
+def test_a_sync_that_is_none_is_a_cycle_without_a_drive_frame_too() -> None:
+    """Or a controller whose SYNC is spoilt would hold its last voltage for as long as 0x2012 says."""
+    rig = Rig()
+    assert rig.write(0x2012, 0, 65535, 2) == 0
+    rig.energise((5, 5, 5))
+    rig.cycle((5, 5, 5))
+    for left in (4, 3, 2, 1, 0):
+        rig.give(SYNC, b"\xf1")
+        assert rig.node.outputs == ((5, 5, 5) if left else ZERO)
+
+
+def test_what_was_sent_while_a_fault_held_the_combs_is_no_counter_to_follow() -> None:
+    """The controller goes on, unheard: its next frame with 0 V is the one that ends it."""
+    rig = Rig()
+    rig.energise((5, 5, 5))
+    rig.node.amplifier_fault(0x2310)
+    for _ in range(3):
+        rig.cycle((5, 5, 5))
+    rig.node.clear_amplifier_fault(0x2310)
+    rig.cycle(ZERO)
+    rig.cycle((6, 6, 6))
+    rig.sync()
+    rig.run(5_000)
+    assert (rig.node.outputs, emergencies(rig)) == ((6, 6, 6), [0x2310, 0])
+
+
+def test_of_a_step_too_far_only_the_combs_that_make_it_are_named() -> None:
+    rig = Rig()
+    assert rig.write(0x2011, 0, 9, 2) == 0
+    rig.energise((9, 9, 9))
+    rig.cycle((18, 0, 19))  # as far as it may, back as far, one further
+    rig.sync()
+    rig.run(2_000)
+    assert rig.node.outputs == ZERO
+    assert rig.of(EMCY)[0][3] == 0b100

@@ -33,6 +33,7 @@ def test_a_sync_that_is_none_is_not_one(data: bytes) -> None:
     rig.give(SYNC, data)
     rig.run(100)
     assert (rig.plant.driven, rig.of(SENSE), emergencies(rig)) == ([], [], [0x8240])
+    assert rig.of(EMCY)[0][3:] == (bytes((len(data),)) + data[:1]).ljust(5, b"\0")
     rig.sync()
     assert rig.node.outputs == (1, 2, 3)
 

@@ -151,6 +151,24 @@ def test_a_journal_counts_the_rows_that_the_system_has(tmp_path):
     assert len(reader.rows(700, 9_999)) == 3
 
 
+def test_each_row_is_the_systems_as_soon_as_it_was_handed_over(tmp_path):
+    """Nothing waits in the program, which may end at any moment; and no row is counted that it still has."""
+    path = tmp_path / "r.journal"
+    writer = JournalWriter(path, {})
+    head_bytes = path.stat().st_size
+    assert head_bytes > 0
+    for count in range(1, 4):
+        writer.append(random_rows(1))
+        assert path.stat().st_size == head_bytes + count * ROW.itemsize
+        assert JournalReader(path).ticks == writer.ticks == count
+
+
+def test_metadata_that_no_other_program_reads_is_refused_before_a_row_is_written(tmp_path):
+    """NaN is none of JSON's numbers."""
+    with pytest.raises(ValueError, match="JSON compliant"):
+        JournalWriter(tmp_path / "r.journal", {"speed_m_per_s": float("nan")})
+
+
 @pytest.fixture(scope="module")
 def whole_journal(tmp_path_factory):
     path = tmp_path_factory.mktemp("journal") / "r.parquet"
