@@ -305,6 +305,8 @@ def test_what_a_start_up_reads_is_answered_as_the_node_answers_it() -> None:
     assert bytes_of(rules.read(work.record[0], work.memory[0], 8, request(0x2011)), 8)[4:6] == (700).to_bytes(
         2, "little"
     )
+    odd = request(0x2011, 0x4F)  # bits that CiA 301 keeps for later
+    assert bytes_of(rules.read(work.record[0], work.memory[0], 8, odd), 8) == rig.node._sdo.serve(bytes_of(odd, 8))
     rig.node._sdo._multiplexer = bytes(3)
     work.put_at_rest()
     assert rig.node._sdo._multiplexer == b"\x11\x20\x00"

@@ -46,6 +46,7 @@ def of(rig: Rig) -> tuple[object, ...]:
         ((b"\x07",), SYNC, b"\x09", False),
         ((b"\xef",), SYNC, b"\xf0", True),
         ((b"\xf0",), SYNC, b"\x01", True),
+        ((b"\xf0",), SYNC, b"\x02", False),
         ((), NMT, b"\x80\x0a", True),
         ((), NMT, b"\x80\x0b", True),  # to another node
         ((), NMT, b"\x80", False),

@@ -1,5 +1,7 @@
 """The gate's every reason, and every condition of it by itself: each is met, and alone decides."""
 
+import dataclasses
+
 import pytest
 from gate_frames import CONFIG, drive, holding, nmt, sdo_write, sync
 
@@ -204,6 +206,45 @@ def test_words_of_a_refused_write_name_the_object_and_what_is_permitted() -> Non
 )
 def test_words_of_each_refusal_of_a_write(data: str, words: str) -> None:
     assert (reason(of(0x60A, bytes.fromhex(data)), Mode.BOOT) or "").endswith(f"blocked in BOOT: {words}")
+
+
+OFF = 0x8000_0000
+LISTED = [
+    (0x1005, 0x1005, 0, 0, 4, 0x80), (0x1016, 0x1016, 1, 1, 4, 0x7F0001), (0x1017, 0x1017, 0, 0, 2, 20),
+    (0x1019, 0x1019, 0, 0, 1, 240), (0x1029, 0x1029, 1, 1, 1, 2), (0x1400, 0x15FF, 1, 1, 4, OFF),
+    (0x1600, 0x17FF, 0, 0, 1, 5), (0x1600, 0x17FF, 1, 64, 4, 0), (0x1800, 0x19FF, 1, 1, 4, OFF),
+    (0x1800, 0x19FF, 2, 2, 1, 255), (0x1800, 0x19FF, 3, 3, 2, 1000), (0x1800, 0x19FF, 5, 5, 2, 1000),
+    (0x1A00, 0x1BFF, 0, 0, 1, 5), (0x1A00, 0x1BFF, 1, 64, 4, 0x64010110), (0x2010, 0x2010, 0, 0, 1, 5),
+    (0x2011, 0x2011, 0, 0, 2, 900), (0x2012, 0x2012, 0, 0, 2, 1000), (0x6443, 0x6443, 1, 3, 1, 1),
+    (0x6444, 0x6444, 1, 3, 4, 0),
+]  # fmt: skip
+"""First and last object and sub-index, size, and a value that each of them may hold."""
+ELSEWHERE = {(0x1A00, 1, OFF), (0x2011, 0, 1000), (0x2012, 0, 900)}
+"""Neighbours that are listed themselves, with what else they may hold."""
+
+
+@pytest.mark.parametrize(("first", "last", "sub_first", "sub_last", "size", "value"), LISTED)
+def test_what_may_be_written_begins_and_ends_with_its_objects(
+    first: int, last: int, sub_first: int, sub_last: int, size: int, value: int
+) -> None:
+    """CiA 301's: 512 PDOs each way, of 64 entries at most; everything else by itself."""
+    gate = TransmitGate(dataclasses.replace(CONFIG, count_slew_max=900))
+
+    def told(index: int, subindex: int) -> str | None:
+        gate.clear()
+        return reason(sdo_write(index, subindex, value, size), Mode.BOOT, gate)
+
+    subs = (sub_first, sub_last)
+    assert [told(index, sub) for index in (first, last) for sub in subs] == [None] * 4
+    beside = [(index, sub) for index in (first - 1, last + 1) for sub in subs]
+    beside += [(index, sub) for index in (first, last) for sub in (sub_first - 1, sub_last + 1) if sub >= 0]
+    assert all("SDO write" in (told(*key) or "") for key in beside if (*key, value) not in ELSEWHERE)
+
+
+def test_the_largest_step_and_the_time_out_have_a_limit_each() -> None:
+    gate = TransmitGate(dataclasses.replace(CONFIG, count_slew_max=900))
+    assert reason(sdo_write(0x2012, 0, 1000, 2), Mode.BOOT, gate) is None
+    assert "is not permitted" in (reason(sdo_write(0x2011, 0, 901, 2), Mode.BOOT, gate) or "")
 
 
 @pytest.mark.parametrize("count", [-32768, -32767])
