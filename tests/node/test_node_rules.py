@@ -315,9 +315,9 @@ def test_what_a_start_up_reads_is_answered_as_the_node_answers_it() -> None:
 @pytest.mark.parametrize(
     ("length", "word"),
     [(7, request(0x1000)), (8, request(0x1000, 0x23)), (8, request(0x1000, 0x60)), (8, request(0x1000, 0x80)),
-     (8, request(0x7777)), (8, request(0x011000))],
+     (8, request(0x7777)), (8, request(0x011000)), (8, request(0x1008))],
 )  # fmt: skip
-def test_a_request_that_is_no_read_is_the_nodes_own(length: int, word: int) -> None:
+def test_a_request_that_is_no_read_of_a_few_bytes_is_the_nodes_own(length: int, word: int) -> None:
     work = NodeAtWork(Rig().node)
     work.node.state = NmtState.PRE_OPERATIONAL
     assert work.take_at_rest() == 127
