@@ -13,11 +13,11 @@ import subprocess
 import sys
 import tempfile
 import time
-from concurrent.futures import ProcessPoolExecutor
+from concurrent.futures import ProcessPoolExecutor, ThreadPoolExecutor
 from pathlib import Path
 
 import numpy as np
-from closed_loop import closed_loop
+from closed_loop import PARTS, closed_loop
 from compared import Law, compared_here, exchanges_compared, first_difference, frames_compared, shared
 from disassembly import fused_instructions
 from exchanges import exchanges
@@ -46,35 +46,48 @@ from pkxyz_ctrl.safety.trips import Trip
 Records = NDArray[np.void]
 
 TICKS_LEAST = 1_000_000
+YIELDING = 5
 FROM_OUTSIDE = Trip.GATE_BLOCKED | Trip.OPERATOR | Trip.SOLVER
 """What no exported law raises by itself: its callers do, and the one law with a solver does not go."""
 
 
 def main(ticks: int) -> int:
-    """Everything, with at least so many ticks; prints what was found."""
+    """Everything, with at least so many ticks; prints what was found.
+
+    Beside this process two close the loop, of which most is waiting for the board, and one compiles, which yields to
+    them all. The emulated board, which this one only waits for, has a thread.
+    """
     begin_s = time.monotonic()
     SCRATCH.mkdir(exist_ok=True)
     failures: list[str] = []
     spawning = multiprocessing.get_context("spawn")
-    with ProcessPoolExecutor(1, spawning) as beside, tempfile.TemporaryDirectory(dir=SCRATCH) as folder:
+    with (
+        ProcessPoolExecutor(len(PARTS), spawning) as closing,
+        ProcessPoolExecutor(1, spawning, os.nice, (YIELDING,)) as compiling,
+        ThreadPoolExecutor(1) as waiting,
+        tempfile.TemporaryDirectory(dir=SCRATCH) as folder,
+    ):
         work = Path(folder)
-        host, board = exported("host", work), exported("cortex-m7", work)
-        again, others = beside.submit(anew), {name: beside.submit(lowered, name) for name in TARGETS}
+        again = compiling.submit(anew)
         board_tools()  # fetched once, before two processes look for them
-        closed = beside.submit(closed_loop)
+        host = exported("host", work)  # the kernels are there from now on
+        closed = [closing.submit(closed_loop, part) for part in PARTS]
+        others = {name: compiling.submit(lowered, name) for name in TARGETS}
+        board = exported("cortex-m7", work)
         failures += own_test(host)
         laws = played(ticks)
         failures += covered(laws)
         failures += too_large(laws)
+        conversations = list(exchanges())
+        on_board = waiting.submit(compared_on_board, laws, conversations, board)
         library = shared(host / "pkxyz.o", host)
         failures += compared_here(laws, library)
-        conversations = list(exchanges())
         failures += exchanges_compared(conversations, library)
         failures += frames_compared(library)
         failures += planted(laws[0], host)
         failures += clean(board, {name: other.result() for name, other in others.items()}, again.result())
-        failures += compared_on_board(laws, conversations, board)
-        failures += closed.result()
+        failures += on_board.result()
+        failures += [line for part in closed for line in part.result()]
     for line in failures:
         print(f"FAILED: {line}")
     print(f"{'failed' if failures else 'passed'}, {time.monotonic() - begin_s:.0f} s in all")
