@@ -6,6 +6,7 @@ import os
 import tomllib
 from collections.abc import Awaitable, Callable
 from concurrent.futures import ProcessPoolExecutor
+from concurrent.futures.process import BrokenProcessPool
 from typing import Any, Final
 
 import numpy as np
@@ -33,7 +34,7 @@ class Choice:
         self._found: asyncio.Task[dict[str, str]] | None = None
 
     def tell(self, told: Callable[[dict[str, Any]], object]) -> None:
-        """Call ``told`` as soon as it is known, with ``{"laws": why not, by law}``."""
+        """Call ``told`` as soon as it is known, with ``{"laws": why not, by law}``; of what is given up nothing."""
         if self._found is None:
             self._found = asyncio.create_task(self._look())
         self._found.add_done_callback(lambda found: found.cancelled() or told({"laws": found.result()}))
@@ -41,9 +42,9 @@ class Choice:
     async def _look(self) -> dict[str, str]:
         try:
             found: dict[str, str] = await self._plan(refusals, *self._files)
-        except Exception:
+        except BrokenProcessPool:
             self._found = None  # whoever asks next has it tried again
-            raise
+            return {}
         return found
 
 

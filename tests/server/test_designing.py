@@ -49,20 +49,25 @@ def test_laws_are_looked_for_once_and_everybody_who_asks_is_told():
     assert told == [(name, {"laws": {"youla": ""}}) for name in ("first", "meanwhile", "late")]
 
 
-def test_a_server_that_ends_waits_for_no_design(tmp_path, monkeypatch):
+def test_a_server_that_ends_waits_for_no_design(tmp_path, monkeypatch, capfd):
     monkeypatch.setenv("XDG_RUNTIME_DIR", str(tmp_path))
     desk = Desk(Link("nobody"), Planner(*ON_2K[:1], "youla", ON_2K[1]), asyncio.to_thread, tmp_path)
 
     async def serve() -> asyncio.Task[Any]:
         app = app_of(desk, "token", frozenset())
         async with app.router.lifespan_context(app):
-            designing = asyncio.create_task(asyncio.to_thread(refusals, *ON_2K))
-            while not multiprocessing.active_children():
+            designing = asyncio.create_task(asyncio.to_thread(offer_of, *ON_2K, "lqg", None, 1))
+            desk._choice.tell(told.append)
+            while len(multiprocessing.active_children()) < 2:
                 await asyncio.sleep(0.01)
-        await asyncio.wait([designing])
+        await asyncio.wait([designing, desk._choice._found])
+        await asyncio.sleep(0)
         return designing
 
+    told: list[Any] = []
     assert isinstance(asyncio.run(serve()).exception(), BrokenProcessPool)
+    assert told == [{"laws": {}}], "nothing is known of them"
+    assert "Traceback" not in capfd.readouterr().err
 
 
 def test_weights_that_no_gain_fulfils_are_refused_like_any_other_text():
