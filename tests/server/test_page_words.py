@@ -8,6 +8,7 @@ import pytest
 import hil
 from hil.commands.operation.ask import _OTHERS, _PLAIN
 from hil.server.app import PAGE
+from hil.server.designing import CHOICE
 from pkxyz_ctrl.client.plain import Stage
 
 SOURCES = {path.name: path.read_text(encoding="utf-8") for path in [*PAGE.glob("*.js"), PAGE / "index.html"]}
@@ -36,5 +37,10 @@ def test_every_other_command_and_line_exists():
 def test_whatever_is_said_to_the_server_by_a_click_is_told_as_command_and_line():
     """What is said without that is only looked at, or goes on with what was told."""
     quietly = set(re.findall(r'link\??\.say\(\{ do: "(\w+)"', SCRIPTS))
-    assert quietly == {"subscribe", "recordings", "body", "jog_again", "jog_end", "parameters", "values"}
+    assert quietly == {"subscribe", "recordings", "body", "jog_again", "jog_end", "parameters", "values", "laws"}
     assert Path(PAGE / "main.js").read_text(encoding="utf-8").count("link.say(message)") == 1  # of `ask` itself
+
+
+def test_the_laws_of_the_list_are_those_that_are_looked_for():
+    listed = SOURCES["index.html"].partition('<select name="law">')[2].partition("</select>")[0]
+    assert re.findall(r"<option>(\w+)</option>", listed) == list(CHOICE)

@@ -10,7 +10,7 @@ import { Tree } from "./tree.js";
 const FIELDS = ["reference_m", "estimate_m", "voltage_v", "disturbance_n"];
 const FREE = new Set(["stop", "release"]);
 const AXES = ["x", "y", "z"];
-const QUIETLY = new Set(["settings", "values", "parameters", "recordings", "open_recording"]);  // looks, not deeds
+const QUIETLY = new Set(["settings", "values", "parameters", "recordings", "open_recording", "laws"]);  // looks, not deeds
 const JOG_MS = 60;  // a jog is said again: at least 10 times a second
 const at = (id) => document.getElementById(id);
 const history = new History(FIELDS, 1 << 15);
@@ -23,7 +23,7 @@ let mine = false, held = false, status = null, hello = {}, previewTag = null;
 // -- what the server says
 
 const link = new Link({
-  open() { link.say({ do: "subscribe", fields: FIELDS, precision: "f4" }); link.say({ do: "recordings" }); },
+  open() { setting.asksLaws = false; link.say({ do: "subscribe", fields: FIELDS, precision: "f4" }); link.say({ do: "recordings" }); },
   hello(value) {
     hello = value;
     if (value.period_us) scope.periodS = value.period_us * 1e-6;
@@ -31,14 +31,15 @@ const link = new Link({
     if (value.period_us) bodyOf();
   },
   block(block) {
-    if (opened && !opened.isFilled) { opened.isFilled = true; history.clear(); history.take(block); seek(); return; }
+    if (opened && !opened.isFilled) { opened.isFilled = true; history.clear(); history.take(block); at("opened-at").disabled = false; seek(); return; }
     if (!opened) history.take(block);
   },
   settings(value) { setting.show(value); if (hello.period_us) bodyOf(); },
   values(value) { tree.values(value); },
+  laws(value) { setting.showLaws(value); },
   parameters(value) { tree.parameters(value); },
   recordings: listRecordings,
-  recording(value) { opened = { ...value, isFilled: false, live: scope.periodS }; showOpened(); },
+  recording(value) { opened = { ...value, isFilled: false, live: opened?.live ?? scope.periodS }; showOpened(); },
   status: show,
   control(value) { mine = value.yours; held = value.held; showControl(); },
   answer,
@@ -48,7 +49,7 @@ const link = new Link({
     at("scan-words").textContent = `${value.duration_s.toFixed(2)} s; from (${um(value.low_m)}) to (${um(value.high_m)}) um; the combs can follow`;
   },
   body(value) { plane.body = value; },
-  gone(why, wasOpen) { if (wasOpen) log("connection", why, "aborted"); mine = held = false; history.clear(); endJog(); showControl(); at("words").textContent = "no connection to the server"; document.querySelector(".state").dataset.activity = "gone"; },
+  gone(why, wasOpen) { if (wasOpen) log("connection", why, "aborted"); mine = held = false; closeOpened(); endJog(); showControl(); at("words").textContent = "no connection to the server"; document.querySelector(".state").dataset.activity = "gone"; },
 });
 
 function bodyOf() { link.say({ do: "body" }); }
@@ -63,7 +64,7 @@ function show(value) {
   if (value.position_m) for (const [n, axis] of AXES.entries()) {
     at(`set-${axis}`).textContent = (value.setpoint_m[n] * 1e6).toFixed(4);
     at(`now-${axis}`).textContent = (value.position_m[n] * 1e6).toFixed(4);
-    at(`err-${axis}`).textContent = value.driven ? (value.error_m[n] * 1e9).toFixed(1) : "-";
+    at(`err-${axis}`).textContent = value.driven ? (Math.round(value.error_m[n] * 1e10) / 10 + 0).toFixed(1) : "-";
   }
   const facts = value.t_s === undefined ? [] : [
     ["in position", value.in_position ? "yes" : "no"], ["axes", value.in_sample_axes ? "sample" : "stage"], ["homed", value.homed ? "yes" : "no"],
@@ -131,11 +132,12 @@ function ask(message, command, python) {
   return tag;
 }
 
-const setting = new Setting(ask);
+const setting = new Setting(ask, () => link.say({ do: "laws" }));
 
 // -- recordings: the same page, the same code
 
 function listRecordings({ folder, names }) {
+  if (!names.length) { const none = document.createElement("li"); none.className = "hint"; none.textContent = "none yet: of a fault the 2 s before it are kept"; at("recordings").replaceChildren(none); return; }
   at("recordings").replaceChildren(...names.map((name) => {
     const row = document.createElement("li"), words = document.createElement("span"), open = document.createElement("button");
     words.textContent = name; open.className = "quiet small"; open.textContent = "Open";
@@ -155,13 +157,15 @@ function showOpened() {
   const faults = opened.events.filter((event) => event.kind === "fault").map((event) => event.words.split(":")[0]);
   at("opened-words").textContent = `${(opened.ticks * scope.periodS).toFixed(1)} s, ${opened.events.length} events${faults.length ? `: ${[...new Set(faults)].join("; ")}` : ""}`;
   at("opened-at").value = 1;
+  at("opened-at").disabled = true;  // until its rows are there
 }
 function seek() {
   const share = Number(at("opened-at").value), count = Math.round(scope.spanS / scope.periodS);
   scope.end = Math.min(history.end - 1, Math.round(history.begin + count + share * Math.max(0, history.end - 1 - history.begin - count)));
 }
 at("opened-at").oninput = seek;
-at("opened-close").onclick = () => { scope.periodS = opened.live; opened = null; history.clear(); showOpened(); };
+function closeOpened() { if (opened) scope.periodS = opened.live; opened = null; history.clear(); showOpened(); }
+at("opened-close").onclick = closeOpened;
 at("recordings-again").onclick = () => link.say({ do: "recordings" });
 at("keep").onclick = () => { ask({ do: "save", seconds: 60 }, "pkxyz ask save", "stage.save(60.0)"); setTimeout(() => link.say({ do: "recordings" }), 3000); };
 
@@ -256,7 +260,7 @@ function asPath(verb, method) {
 }
 
 at("step").onchange = at("speed").onchange = jogLabels;
-at("view").onchange = () => { plane.view = at("view").value; at("view-hint").textContent = plane.view === "3d" ? "body: what the combs hold; drag to turn" : "shaded: what the combs hold"; };
+at("view").onchange = () => { plane.view = at("view").value; at("view-hint").textContent = plane.view === "3d" ? "what combs hold; drag to turn" : "shaded: what the combs hold"; };
 at("shown").onchange = () => { scope.what = at("shown").value; scope.rebuild(); };
 at("span").onchange = () => { scope.spanS = Number(at("span").value); if (opened) seek(); };
 function setTrigger() { const axis = AXES.indexOf(at("trigger").value); scope.trigger = axis < 0 ? null : { axis, level: number(at("level").value) ?? 0 }; }
@@ -273,7 +277,8 @@ function save(url, name) { const a = document.createElement("a"); a.href = url; 
 at("theme").onclick = () => paint(document.documentElement.dataset.theme === "dark" ? "light" : "dark");
 function paint(theme) { document.documentElement.dataset.theme = theme; localStorage.setItem("theme", theme); scope.rebuild(); }
 const um = (m) => m.map((v) => (v * 1e6).toFixed(2)).join(", ");
-const clock = (s) => (s < 60 ? `${s.toFixed(1)} s` : `${Math.floor(s / 60)} min ${Math.floor(s % 60)} s`);
+const twoDigits = (v) => String(Math.floor(v)).padStart(2, "0");
+const clock = (s) => (s < 60 ? `${s.toFixed(1)} s` : `${s < 3600 ? Math.floor(s / 60) : `${Math.floor(s / 3600)}:${twoDigits((s / 60) % 60)}`}:${twoDigits(s % 60)}`);
 
 jogLabels();
 showControl();

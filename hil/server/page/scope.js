@@ -3,12 +3,15 @@
 import { spectrum } from "./spectrum.js";
 
 const SHOWN = {
-  error: { unit: "nm", scale: 1e9, lines: [["error", (h, a, n) => h.value("estimate_m", a, n) - h.value("reference_m", a, n)]] },
-  position: { unit: "um", scale: 1e6, lines: [["", (h, a, n) => h.value("estimate_m", a, n)], ["set-point", (h, a, n) => h.value("reference_m", a, n)]] },
-  voltage: { unit: "V", scale: 1, names: ["1", "2", "3"], lines: [["comb", (h, a, n) => h.value("voltage_v", a, n)]] },
-  disturbance: { unit: "uN", scale: 1e6, lines: [["disturbance", (h, a, n) => h.value("disturbance_n", a, n)]] },
+  error: { unit: "nm", scale: 1e9, density: { unit: "nm", scale: 1e9 }, lines: [["error", (h, a, n) => h.value("estimate_m", a, n) - h.value("reference_m", a, n)]] },
+  position: { unit: "um", scale: 1e6, density: { unit: "nm", scale: 1e9 }, lines: [["", (h, a, n) => h.value("estimate_m", a, n)], ["set-point", (h, a, n) => h.value("reference_m", a, n)]] },
+  voltage: { unit: "V", scale: 1, density: { unit: "mV", scale: 1e3 }, names: ["1", "2", "3"], lines: [["comb", (h, a, n) => h.value("voltage_v", a, n)]] },
+  disturbance: { unit: "uN", scale: 1e6, density: { unit: "nN", scale: 1e9 }, lines: [["disturbance", (h, a, n) => h.value("disturbance_n", a, n)]] },
 };
-const POINTS = 2000;
+const POINTS = 2000, LEGEND = 36;
+const DENSITY_MIN = 1e-9;  // of a unit: what stands has none but of rounding, and no end of decades to label
+/** A label of a logarithmic axis: powers of ten alone, in few characters. */
+const decade = (v) => { const power = Math.log10(v), whole = Math.round(power); return v === null || Math.abs(power - whole) > 1e-6 ? "" : Math.abs(whole) < 4 ? String(+v.toPrecision(2)) : `1e${whole}`; };
 
 export class Scope {
   constructor(place, history) {
@@ -18,7 +21,11 @@ export class Scope {
     new ResizeObserver(() => this.plot?.setSize(this.size())).observe(place);
   }
 
-  size() { return { width: Math.max(200, this.place.clientWidth), height: 280 }; }
+  /** As high as there is room in its card and in the window before it is scrolled. */
+  size() {
+    const { place } = this, seen = innerHeight - place.getBoundingClientRect().top - scrollY;
+    return { width: Math.max(200, place.clientWidth), height: Math.max(280, Math.min(place.clientHeight, seen) - LEGEND) };
+  }
 
   /** Everything anew: another quantity, another axis, other colours. */
   rebuild() {
@@ -32,8 +39,9 @@ export class Scope {
         value: (_, v) => (v == null ? "" : v.toPrecision(4)),
       }));
     }
-    const axes = ["", this.inSpectrum ? `${shown.unit}/rtHz` : shown.unit].map((label) => ({
-      label, stroke: colour("--soft"), grid: { stroke: colour("--line"), width: 1 }, ticks: { stroke: colour("--line") }, labelSize: 16, size: label ? 58 : 32,
+    const axes = [this.inSpectrum ? "Hz" : "s", this.inSpectrum ? `${shown.density.unit}/\u221aHz` : shown.unit].map((label, n) => ({
+      label, stroke: colour("--soft"), grid: { stroke: colour("--line"), width: 1 }, ticks: { stroke: colour("--line") }, labelSize: 16, size: n ? 58 : 32, labelGap: n ? 0 : -4,
+      ...(this.inSpectrum ? { values: (_, splits) => splits.map(decade) } : {}),
     }));
     const scales = this.inSpectrum ? { x: { time: false, distr: 3 }, y: { distr: 3 } } : { x: { time: false } };
     this.plot?.destroy();
@@ -74,10 +82,10 @@ export class Scope {
   spectra(shown, first, end) {
     let hz;
     const lines = shown.lines.flatMap(([, value]) => [0, 1, 2].map((axis) => {
-      const values = Float64Array.from({ length: end - first }, (_, k) => value(this.history, axis, first + k) * shown.scale);
+      const values = Float64Array.from({ length: end - first }, (_, k) => value(this.history, axis, first + k) * shown.density.scale);
       const [f, density] = spectrum(values, this.periodS);
       hz = f;
-      return density;
+      return Array.from(density, (v) => (v > DENSITY_MIN ? v : null));
     }));
     return [hz, ...lines];
   }
@@ -88,7 +96,7 @@ export class Scope {
     const css = getComputedStyle(document.documentElement), { left, top, width, height } = plot.bbox, g = plot.ctx;
     let free = -Infinity;
     g.save();
-    g.font = `${11 * devicePixelRatio}px system-ui`;
+    g.font = `${11 * devicePixelRatio}px system-ui`; g.textAlign = "left"; g.setLineDash([]);
     for (const { tick, kind, words } of this.events) {
       const x = plot.valToPos((tick - this.history.tickOf(this.zero)) * this.periodS, "x", true);
       if (!(x >= left && x <= left + width)) continue;
@@ -102,7 +110,8 @@ export class Scope {
   draw() { if (!this.held && this.plot) this.plot.setData(this.data(), true); }
 
   csv() {
-    const names = this.plot.series.map((s, n) => (n === 0 ? `time_${s.label}` : `${s.label.replace(/\s+/g, "_")}_${SHOWN[this.what].unit}`));
+    const shown = SHOWN[this.what], unit = this.inSpectrum ? `${shown.density.unit}_per_rtHz` : shown.unit;
+    const names = this.plot.series.map((s, n) => (n === 0 ? `${this.inSpectrum ? "frequency" : "time"}_${s.label}` : `${s.label.replace(/\s+/g, "_")}_${unit}`));
     const rows = this.plot.data[0].map((_, n) => this.plot.data.map((column) => column[n]).join(","));
     return `${names.join(",")}\n${rows.join("\n")}\n`;
   }

@@ -4,9 +4,9 @@ const at = (id) => document.getElementById(id);
 const numberOf = (text) => Number(String(text).trim().replace(",", "."));
 
 export class Setting {
-  /** `ask(message, command, python)` asks the server and shows what does the same. */
-  constructor(ask) {
-    this.ask = ask; this.points = [];
+  /** `ask(message, command, python)` asks the server and shows what does the same; `lookAtLaws()` asks which can be had. */
+  constructor(ask, lookAtLaws) {
+    this.ask = ask; this.lookAtLaws = lookAtLaws; this.points = []; this.asksLaws = false;
     at("sample").onsubmit = (event) => { event.preventDefault(); this.setSample(); };
     at("plane-point").onclick = () => this.addPoint();
     at("name-position").onsubmit = (event) => {
@@ -19,6 +19,7 @@ export class Setting {
       const name = at("law-form").elements.law.value;
       this.do({ do: "law", controller: name }, `pkxyz ask law ${name}`, `stage.change_law("${name}")`);
     };
+    for (const begin of ["pointerdown", "focus"]) at("law-form").elements.law.addEventListener(begin, () => this.askLaws());
     at("quiet").onclick = () => { const on = !this.status?.quiet; this.do({ do: "quiet", on }, `pkxyz ask quiet ${on ? "on" : "off"}`, `stage.quiet_holds(${on ? "True" : "False"})`); };
     at("settle").onsubmit = (event) => {
       event.preventDefault();
@@ -29,6 +30,19 @@ export class Setting {
   }
 
   do(message, command, python) { this.ask({ ...message, who: "page" }, command, python); }
+
+  /** Which laws this stage and bus can have takes seconds to find out: asked once, when somebody is about to choose. */
+  askLaws() { if (!this.asksLaws && this.lookAtLaws() !== null) this.asksLaws = true; }
+
+  /** `told`: by law why not, nothing where it can be had. */
+  showLaws(told) {
+    for (const option of at("law-form").elements.law.options) option.disabled = Boolean(told[option.value]);
+    at("law-not").replaceChildren(...Object.entries(told).filter(([, why]) => why).map(([name, why]) => {
+      const row = document.createElement("li");
+      row.textContent = `no ${name}: ${why.replace(/^(controller|law) '[^']*': (law '[^']*': )?/, "")}`;
+      return row;
+    }));
+  }
 
   setSample() {
     const f = at("sample").elements, origin_m = ["x", "y", "z"].map((a) => numberOf(f[`origin_${a}`].value) * 1e-6);
