@@ -42,7 +42,7 @@ test-firmware: .venv/.ready
 	$(BIN)/python tests/firmware/run.py $(TICKS)
 
 test-page: .venv/.ready
-	$(BIN)/python tests/page/run.py
+	$(BIN)/python tests/page/run.py --goes 3
 
 bench: .venv/.ready
 	$(BIN)/pkxyz bench
