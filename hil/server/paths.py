@@ -30,7 +30,6 @@ Array = NDArray[np.float64]
 
 _AHEAD_ROWS = 5000
 _BLOCKS_AT_ONCE = 16
-_SHOWN_POINTS = 3000
 _LEADING = ("hold", "move")
 _MIDDLE_M = (0.0, 0.0, 18e-6)
 
@@ -97,12 +96,6 @@ class StagePath:
         """Of each line, whether it goes the other way than the first."""
         ways = [(self.sample(last, 1) - self.sample(first, 1))[0, 0:3] for first, last, _ in self.lines]
         return [bool(way @ ways[0] < 0.0) for way in ways]
-
-    def shown(self) -> Array:
-        """Positions (n, 3) of the sample to draw it by."""
-        step = max(1, self.rows // _SHOWN_POINTS)
-        points = np.concatenate([self.sample(n, 1)[:, 0:3] for n in range(0, self.rows, step)])
-        return self.trajectory.turn.to_sample(points)
 
 
 class Planner:
