@@ -4,6 +4,7 @@ Lengths in m, times in s unless a name says otherwise.
 """
 
 import json
+import math
 import struct
 from dataclasses import dataclass
 from typing import Any, Literal
@@ -41,7 +42,7 @@ class Block:
 
 def packed(block: Block, precision: Precision) -> bytes:
     """A block as bytes: the length of a JSON head, the head, then each field's values one after another."""
-    fields = [[name, int(np.prod(values.shape[1:]))] for name, values in block.columns.items()]
+    fields = [[name, math.prod(values.shape[1:])] for name, values in block.columns.items()]
     head = json.dumps(
         {"first": block.first_tick, "count": len(block), "lost": block.lost, "fields": fields, "dtype": f"<{precision}"}
     ).encode()
