@@ -116,6 +116,7 @@ def operate(browser: Browser, url: str, pictures: Path) -> None:
 
 def set_up(browser: Browser, pictures: Path) -> None:
     """Window, law, axes of the sample, a position with a name, and the way back."""
+    settings_px = browser.run("document.querySelector('#settings').offsetTop")
     fill(browser, "#settle [name=window]", "25")
     browser.click("#settle button")
     logged(browser, "settle done: settle window: settings ")
@@ -123,6 +124,8 @@ def set_up(browser: Browser, pictures: Path) -> None:
     logged(browser, "quiet done: holds are quiet")
     assert "stage.quiet_holds(True)" in browser.text("#as-python")
     browser.click("#quiet")
+    logged(browser, "quiet done: holds are as stiff as moves")
+    assert browser.run("document.querySelector('#settings').offsetTop") == settings_px, "what is asked moves no button"
     other_laws(browser, pictures)
     standing(browser)
     fill(browser, "#sample [name=origin_z]", "19")
