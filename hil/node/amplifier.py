@@ -116,7 +116,6 @@ class AmplifierNode:
         """Start as after power-up or reset: outputs at 0, all objects at their defaults, boot-up message to come."""
         self._holds.clear()
         self._restart(0x0000, 0xFFFF)
-        self._sense.power_on()
         self._set_outputs((0, 0, 0), self._clock.now_us)
         self.digital.put_out(0, self._clock.now_us)
 

@@ -102,10 +102,6 @@ class SenseTransmitter:
         if self._event_us:
             self._event.set(self._clock.now_us + self._event_us)
 
-    def power_on(self) -> None:
-        """No frame has been sent yet."""
-        self.counter = self.crc = 0
-
     def stop(self) -> None:
         """The node has left operational: what waits for the response time is not sent."""
         self._running = False

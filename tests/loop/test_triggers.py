@@ -83,7 +83,7 @@ def test_standing_noise_fires_nothing():
 
 def test_lines_pixels_and_frames_are_those_of_the_path():
     scenario = load_scenario("frames")
-    trajectory = _OfSample(scenario.config.reference, Turn(PLAIN), 16)
+    trajectory = _OfSample(scenario.config.reference, Turn(PLAIN), 16, np.zeros(3))
     first = -(-trajectory.begin_us // 200)
     path = StagePath(trajectory, 200, first, trajectory.duration_us // 200 - first, "frames")
     lines = np.array(path.lines, np.int64)

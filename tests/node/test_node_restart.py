@@ -67,14 +67,14 @@ def test_after_a_reset_of_the_node_process_values_read_as_after_power_up() -> No
     rig = Rig()
     rig.energise()
     rig.give(DRIVE, protected(DRIVE, (1, 2, 3), 200))
-    process = [(0x1001, 0), (0x1003, 0), *((index, sub) for index in (0x2000, 0x2001, 0x6411) for sub in (1, 2))]
+    process = [(0x1001, 0), (0x1003, 0), *((index, sub) for index in (0x2000, 0x6411) for sub in (1, 2))]
     assert all(rig.read(*key) for key in process)
     reset(rig, RESET_NODE)
     assert [rig.read(*key) for key in process] == [0] * len(process)
 
 
-def test_the_sense_counter_begins_anew_with_the_node_and_goes_on_with_the_communication() -> None:
-    """0x2001 is no object of the communication."""
+def test_the_sense_counter_goes_on_through_every_reset() -> None:
+    """So what is sent afterwards is told from what was on its way before."""
     rig = Rig()
     seen = []
     for command in (RESET_COMMUNICATION, RESET_NODE):
@@ -82,7 +82,7 @@ def test_the_sense_counter_begins_anew_with_the_node_and_goes_on_with_the_commun
         seen += [data[6] for data in rig.of(SENSE)]
         reset(rig, command)
     rig.energise()
-    assert seen + [data[6] for data in rig.of(SENSE)] == [1, 2, 3, 4, 1, 2]
+    assert seen + [data[6] for data in rig.of(SENSE)] == [1, 2, 3, 4, 5, 6]
 
 
 def test_what_was_written_holds_nobody_back_after_the_reset() -> None:

@@ -138,6 +138,7 @@ def test_an_end_while_the_server_is_loaded_comes_behind_that_is_no_error_and_lea
         loaded.append("whole")
 
     monkeypatch.setattr(serve, "say_if_compiling", asked_to_end)
+    signal.signal(signal.SIGINT, signal.default_int_handler)  # a shell has it ignored by what it runs behind
     assert serve.serve_beside(served(), lambda url: pytest.fail(f"told of {url}"), quiet=True) == 0
     assert loaded == ["whole"]
     assert log.read_text().splitlines()[2:] == ["operate ended", "plant ended"]
