@@ -4,9 +4,8 @@ import numpy as np
 import pytest
 from loop_rig import rows_of
 
-from hil.operate.sample_axes import PLAIN, Turn
 from hil.runs.scenario import load_scenario
-from hil.server.paths import StagePath, _OfSample
+from hil.server.paths import Planner
 from pkxyz_ctrl.config.triggers import FRAME, LINE, PIXEL, POSITION
 from pkxyz_ctrl.loop.outputs import POSITION_TRIGGER, position_bit
 from pkxyz_ctrl.safety.modes import Mode
@@ -82,10 +81,7 @@ def test_standing_noise_fires_nothing():
 
 
 def test_lines_pixels_and_frames_are_those_of_the_path():
-    scenario = load_scenario("frames")
-    trajectory = _OfSample(scenario.config.reference, Turn(PLAIN), 16, np.zeros(3))
-    first = -(-trajectory.begin_us // 200)
-    path = StagePath(trajectory, 200, first, trajectory.duration_us // 200 - first, "frames")
+    path = Planner("reconstructed", "youla", "fd_5k").of_scenario("frames", 16)
     lines = np.array(path.lines, np.int64)
     assert len(lines) == 80
     assert lines[:, 2].tolist() == [n // 10 for n in range(80)]
