@@ -146,6 +146,16 @@ class Browser:
             self.call("Input.dispatchMouseEvent", type=kind, x=x, y=y, button="left", clickCount=1)
             time.sleep(hold_s if kind == "mousePressed" else 0.0)
 
+    def drag(self, selector: str, begin: tuple[float, float], end: tuple[float, float]) -> None:
+        """Over an element with the mouse pressed, from and to shares of its width and height."""
+        box = self.run(
+            f"(() => {{ const r = document.querySelector({json.dumps(selector)}).getBoundingClientRect();"
+            " return [r.x, r.y, r.width, r.height]; })()"
+        )
+        (left, top, width, height), held = box, {"button": "left", "clickCount": 1}
+        for kind, (x, y) in (("mousePressed", begin), ("mouseMoved", end), ("mouseReleased", end)):
+            self.call("Input.dispatchMouseEvent", type=kind, x=left + x * width, y=top + y * height, buttons=1, **held)
+
     def press(self, key: str, hold_s: float = 0.0) -> None:
         """Press a key, and let it go."""
         for kind in ("keyDown", "keyUp"):

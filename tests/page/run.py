@@ -20,7 +20,10 @@ import time
 import traceback
 from pathlib import Path
 
+import numpy as np
+import pytest
 from chromium import Browser, fetched
+from numpy.typing import NDArray
 
 import pkxyz_ctrl
 from pkxyz_ctrl.client.reply import RefusedError
@@ -40,6 +43,18 @@ def logged(browser: Browser, words: str, timeout_s: float = 30.0) -> None:
 
 def fill(browser: Browser, selector: str, value: str) -> None:
     browser.run(f"document.querySelector({json.dumps(selector)}).value = {json.dumps(value)}")
+
+
+def come_up(folder: Path, url: str, begin_s: float) -> None:
+    """Tell how long it took from Enter to a page whose clock runs, and from another's address to its first plot."""
+    drawn = "document.querySelector('#plot canvas') && document.querySelector('#facts').innerText.includes('running')"
+    for name, asked_s in (("a living page, from Enter", 5), ("a first plot, from the address", 1)):
+        with Browser(folder / name) as browser:
+            opened_s = time.monotonic()
+            browser.open(url)
+            browser.until(drawn, 200)
+            print(f"{name}: {time.monotonic() - (begin_s or opened_s):.2f} s, {asked_s} are asked")
+        begin_s = 0.0
 
 
 def operate(browser: Browser, url: str, pictures: Path) -> None:
@@ -69,6 +84,7 @@ def operate(browser: Browser, url: str, pictures: Path) -> None:
     browser.click("#move button:not([type])")
     logged(browser, "x = 50 um is asked for, limits")
     ghost(browser, pictures)
+    look_closer(browser)
     fill(browser, "#scan [name=lines]", "200")
     fill(browser, "#scan [name=pitch]", "0.02")
     fill(browser, "#scan [name=rate]", "8")  # 25 s: a browser without a graphics card takes seconds for a picture
@@ -185,6 +201,75 @@ def standing(browser: Browser) -> None:
         browser.click("#spectrum")
 
 
+DRAWN = "document.querySelector('#plot canvas').toDataURL()"
+KEPT = """(() => {
+    window.kept = {};
+    HTMLAnchorElement.prototype.click = function () { window.kept[this.download] = this.href; };
+    const place = URL.createObjectURL;
+    URL.createObjectURL = (blob) => { window.blob = blob; return place.call(URL, blob); };
+})()"""
+"""What is saved from now on stays in the page: names with addresses, and the newest file."""
+
+
+def look_closer(browser: Browser) -> None:
+    """The scope by what it saves: begun by a set-point that it doesn't show; it stands while paused, and is zoomed."""
+    browser.run(KEPT)
+    fill(browser, "#level", "2.5")
+    fill(browser, "#trigger", "x")
+    fill(browser, "#shown", "voltage")
+    for chosen in ("level", "trigger", "shown"):
+        browser.run(f"document.querySelector('#{chosen}').onchange()")
+    assert saved(browser)["time_s"][-1] == pytest.approx(0.0, abs=0.005), "nothing has passed there yet"
+    fill(browser, "#move [name=x_m]", "3")
+    browser.click("#move button:not([type])")
+    logged(browser, "in position at (3, 0, ")
+    time.sleep(1.2)  # half of what is shown lies behind
+    columns = saved(browser)
+    assert columns["comb_1_V"].max() > 100.0
+    assert columns["time_s"][-1] == pytest.approx(1.0, abs=0.005)
+    fill(browser, "#shown", "position")
+    browser.run("document.querySelector('#shown').onchange()")
+    columns = saved(browser)
+    place_um, time_s = columns["set-point_x_um"], columns["time_s"]
+    passes = np.argmin(np.abs(time_s))
+    assert place_um[passes - 2] < 2.5 < place_um[passes + 2], "a point is a millisecond"
+    assert place_um[0] < 0.01 < 2.99 < place_um[-1]
+    browser.click("#hold")
+    browser.run(f"window.held = {DRAWN}")
+    time.sleep(0.5)
+    assert browser.run(f"{DRAWN} === window.held"), "it stands"
+    browser.drag("#plot .u-over", (0.4, 0.3), (0.6, 0.7))
+    browser.until(f"{DRAWN} !== window.held")
+    browser.click("#png")
+    assert browser.run(f"window.kept['scope.png'] === {DRAWN}"), "a picture of what is seen"
+    browser.click("#hold")
+    fill(browser, "#trigger", "none")
+    browser.run("document.querySelector('#trigger').onchange()")
+
+
+def saved(browser: Browser) -> dict[str, NDArray[np.float64]]:
+    """What the scope shows, once it is drawn anew, by the names of its columns."""
+    time.sleep(0.3)
+    browser.click("#csv")
+    assert str(browser.run("window.kept['scope.csv']")).startswith("blob:")
+    names, *rows = str(browser.run("window.blob.text()")).splitlines()
+    return dict(zip(names.split(","), np.array([row.split(",") for row in rows], np.float64).T, strict=True))
+
+
+def by_hand(browser: Browser) -> None:
+    """Moved for as long as a key is down and the window is looked at, and braked because of that, not of silence."""
+    fill(browser, "#step", "0")
+    browser.run("document.querySelector('#step').onchange(); document.querySelector('#middle').click()")
+    logged(browser, "move done")
+    for end in ("new KeyboardEvent('keyup', {key: 'ArrowRight'})", "new Event('blur')"):
+        browser.run("dispatchEvent(new KeyboardEvent('keydown', {key: 'ArrowRight'}))")
+        activity(browser, "jogging")
+        browser.run(f"dispatchEvent({end})")
+        activity(browser, "holding", timeout_s=5)
+        newest = "document.querySelector('#log').innerText.trim().split('\\n')[0]"
+        browser.until(f"{newest}.startsWith('jog done') && {newest}.endsWith('the jog was ended')")
+
+
 GREY = """(() => {
     const c = document.querySelector("#plane"), d = c.getContext("2d").getImageData(0, 0, c.width, c.height).data;
     let count = 0;
@@ -222,10 +307,9 @@ def look_back(browser: Browser, pictures: Path) -> None:
     assert "Stopped by hand" in browser.text("#opened-words")
     time.sleep(0.5)
     browser.picture(pictures / "recording.png")
-    drawn = "document.querySelector('#plot canvas').toDataURL()"
-    browser.run(f"window.newest = {drawn}")
+    browser.run(f"window.newest = {DRAWN}")
     browser.run("document.querySelector('#opened-at').value = 0; document.querySelector('#opened-at').oninput()")
-    browser.until(f"{drawn} !== window.newest")
+    browser.until(f"{DRAWN} !== window.newest")
     browser.click("#opened-close")
     browser.until("document.querySelector('#opened').hidden")
 
@@ -235,6 +319,7 @@ def go(pictures: Path) -> None:
     faulthandler.dump_traceback_later(_STUCK_S, exit=False)
     folder = Path(tempfile.mkdtemp(prefix="pkxyz-served-"))
     words = ["--silence-s", "0.25", "--saves", str(folder / "runs"), "--settings", str(folder / "settings")]
+    begin_s = time.monotonic()
     serving = subprocess.Popen(
         [sys.executable, "-m", "hil", "serve", "--name", "page", "--port", "0", "--json", *words],
         stdout=subprocess.PIPE, text=True,
@@ -242,13 +327,12 @@ def go(pictures: Path) -> None:
     try:
         assert serving.stdout is not None
         url = json.loads(serving.stdout.readline())["url"]
-        with tempfile.TemporaryDirectory() as profile, Browser(Path(profile)) as browser:
+        come_up(folder, url, begin_s)
+        with Browser(folder / "browser") as browser:
             operate(browser, url, pictures)
             assert browser.hosts == {url.split("/")[2]}, browser.hosts
             assert browser.errors == [], browser.errors
-            fill(browser, "#step", "0")
-            browser.run("document.querySelector('#step').onchange(); document.querySelector('#middle').click()")
-            logged(browser, "move done")
+            by_hand(browser)
             browser.run("dispatchEvent(new KeyboardEvent('keydown', {key: 'ArrowRight'}))")
             activity(browser, "jogging")
         with pkxyz_ctrl.connect(name="page") as stage:  # the tab is closed: control is free, and the jog has ended
