@@ -1,9 +1,11 @@
 """Hostile clients against `pkxyz serve` itself: ``python tests/server/hostile.py [MESSAGES]``; writes hostile.json.
 
-The stage holds in the middle, in closed loop, under a law and on a bus that bear a machine which stands still. Eight
-connections send random messages as fast as they are taken, others subscribe and never read, others come without a
-token or from another page. Nobody stops or releases the stage, which anyone may. Meanwhile one looks on. Reported are
-what moved, the server's memory, and ticks missed, beside as long with the same clients at a server without a stage.
+The stage holds in the middle, in closed loop: once as it is served, where no tick may be missed, and once in real time,
+under a law and on a bus that bear a machine which stands still. Eight connections send random messages as fast as they
+are taken, others subscribe and never read, others come without a token or from another page. Nobody stops or releases
+the stage, which anyone may. Meanwhile one looks on. Reported are what moved, the server's memory, and the ticks missed
+in each of five rounds, beside as long with the same clients at a server without a stage; their medians are compared, as
+a machine that stands still for a moment spoils a round.
 """
 
 import asyncio
@@ -17,6 +19,7 @@ import tempfile
 import time
 from collections.abc import Iterator
 from pathlib import Path
+from statistics import median
 from typing import Any
 
 import numpy as np
@@ -29,9 +32,9 @@ from patience import patient_bus, patient_law
 
 from hil.operate.commands import Verb
 from pkxyz_ctrl.client.protocol import SUBPROTOCOL, TOKEN_PREFIX
-from pkxyz_ctrl.client.stage import connect_async
+from pkxyz_ctrl.client.stage import AsyncStage, connect_async
 
-SENDERS, NOT_READING, STRANGERS = 8, 12, 200
+ROUNDS, SENDERS, NOT_READING, STRANGERS = 5, 8, 12, 40
 FREE = ("stop", "release")  # need no control, and do what they say
 MEMORY_MORE_MB, SOME_TICKS = 200.0, 20
 REPORT = Path(__file__).with_suffix(".json")
@@ -97,7 +100,7 @@ async def strangers(address: str) -> int:
 
 
 async def measured(url: str, token: str, server: int, messages: int) -> dict[str, Any]:
-    """The stage holds in closed loop, one looks on, the others come; then they go elsewhere."""
+    """The stage holds in closed loop, one looks on, the others come; then they go elsewhere; in rounds."""
     address = url.replace("http", "ws", 1).rstrip("/") + "/stage"
     async with connect_async(url, token, control=True) as stage:
         while stage.status.activity == "starting":
@@ -106,35 +109,51 @@ async def measured(url: str, token: str, server: int, messages: int) -> dict[str
             await verb()
         await stage.move_to(*stage.description["middle_m"])
         at_rest_mb, begun = resident_mb(server), await stage.next_status()
-        begin_s, activities, most_mb = time.monotonic(), set(), at_rest_mb
-        deaf = [await _deaf(address, token) for _ in range(NOT_READING)]
-        each = messages // SENDERS
-        work = asyncio.gather(*(sending(address, token, each, seed) for seed in range(SENDERS)), strangers(address))
-        while not work.done():
-            await asyncio.sleep(0.2)
-            activities.add(stage.status.activity)
-            most_mb = max(most_mb, resident_mb(server))
-        *senders, inside = await work
-        lasted_s, ended = time.monotonic() - begin_s, await stage.next_status()
-        activities.add(ended.activity)
-        for socket in deaf:
-            socket.transport.abort()
-        await asyncio.sleep(1.0)
-        quiet_from = (await stage.next_status()).missed_ticks
-        await _as_busy(lasted_s)
-        quiet_to = (await stage.next_status()).missed_ticks
+        rounds = [await _round(stage, address, token, server, messages // ROUNDS, n) for n in range(ROUNDS)]
+        ended = await stage.next_status()
         return {
-            "messages": sum(s["sent"] for s in senders), "thrown_out": sum(s["thrown_out"] for s in senders),
-            "strangers": STRANGERS, "strangers_inside": inside, "not_reading": NOT_READING,
-            "seconds": round(lasted_s, 1), "activities": sorted(activities), "last_fault": ended.last_fault,
+            "messages": sum(r["messages"] for r in rounds), "thrown_out": sum(r["thrown_out"] for r in rounds),
+            "strangers": ROUNDS * STRANGERS, "strangers_inside": sum(r["strangers_inside"] for r in rounds),
+            "not_reading": NOT_READING, "seconds": round(sum(r["seconds"] for r in rounds), 1),
+            "activities": sorted(set().union(*(r["activities"] for r in rounds))), "last_fault": ended.last_fault,
             "target_moved_m": float(np.abs(ended.target_m - begun.target_m).max()),
             "position_moved_m": float(np.abs(ended.position_m - begun.position_m).max()),
-            "memory_before_mb": round(at_rest_mb, 1), "memory_most_mb": round(most_mb, 1),
-            "ticks": round(lasted_s * 1e6 / stage.description["period_us"]),
-            "ticks_missed": ended.missed_ticks - begun.missed_ticks,
-            "ticks_missed_while_they_were_elsewhere": quiet_to - quiet_from,
+            "memory_before_mb": round(at_rest_mb, 1), "memory_most_mb": round(max(r["most_mb"] for r in rounds), 1),
+            "ticks": round(sum(r["seconds"] for r in rounds) * 1e6 / stage.description["period_us"]),
+            "ticks_missed": [r["missed"] for r in rounds],
+            "ticks_missed_while_they_were_elsewhere": [r["missed_elsewhere"] for r in rounds],
             "load_average": round(os.getloadavg()[0], 1), "cores": os.cpu_count(),
         }  # fmt: skip
+
+
+async def _round(
+    stage: AsyncStage, address: str, token: str, server: int, messages: int, number: int
+) -> dict[str, Any]:
+    """So many messages to the server of a stage, then for as long to one that has none."""
+    begun, begin_s = await stage.next_status(), time.monotonic()
+    activities, most_mb = {begun.activity}, 0.0
+    deaf = [await _deaf(address, token) for _ in range(NOT_READING)]
+    each, seeds = messages // SENDERS, range(number * SENDERS, (number + 1) * SENDERS)
+    senders = asyncio.gather(*(sending(address, token, each, seed) for seed in seeds))
+    others = asyncio.create_task(strangers(address))
+    while not (senders.done() and others.done()):
+        await asyncio.sleep(0.2)
+        activities.add(stage.status.activity)
+        most_mb = max(most_mb, resident_mb(server))
+    sent, inside = await senders, await others
+    lasted_s, ended = time.monotonic() - begin_s, await stage.next_status()
+    for socket in deaf:
+        socket.transport.abort()
+    await asyncio.sleep(1.0)
+    quiet_from = (await stage.next_status()).missed_ticks
+    await _as_busy(lasted_s)
+    quiet_to = (await stage.next_status()).missed_ticks
+    return {
+        "messages": sum(s["sent"] for s in sent), "thrown_out": sum(s["thrown_out"] for s in sent),
+        "strangers_inside": inside, "seconds": lasted_s, "activities": activities | {ended.activity},
+        "most_mb": most_mb, "missed": ended.missed_ticks - begun.missed_ticks,
+        "missed_elsewhere": quiet_to - quiet_from,
+    }  # fmt: skip
 
 
 async def _deaf(address: str, token: str) -> ClientConnection:
@@ -175,30 +194,41 @@ async def _as_busy(seconds: float) -> None:
             await asyncio.gather(*(sending(address, "", ENDLESS, seed) for seed in range(SENDERS)))
 
 
+def attacked(folder: Path, messages: int, *more: str) -> dict[str, Any]:
+    """A server of its own, with such words, and what became of its stage."""
+    words = ["serve", "--name", NAME, "--port", "0", "--json", *more, "--silence-s", "10"]
+    words += ["--saves", str(folder), "--settings", str(folder)]
+    process = subprocess.Popen([sys.executable, "-m", "hil", *words], stdout=subprocess.PIPE, text=True)
+    try:
+        assert process.stdout is not None
+        url, _, token = json.loads(process.stdout.readline())["url"].partition("#")
+        return asyncio.run(measured(url, token, process.pid, messages))
+    finally:
+        process.send_signal(signal.SIGTERM)
+        process.wait(30)
+
+
 def main() -> None:
     messages = int(sys.argv[1]) if len(sys.argv) > 1 else 100_000
     with tempfile.TemporaryDirectory() as place:
         folder = Path(place)
         law, bus = patient_law(folder, "youla"), patient_bus(folder / "bus.toml", "unix_2k")
-        words = ["serve", "--name", NAME, "--port", "0", "--json", "--controller", str(law), "--bus", str(bus)]
-        words += ["--silence-s", "10", "--saves", place, "--settings", place]
-        process = subprocess.Popen([sys.executable, "-m", "hil", *words], stdout=subprocess.PIPE, text=True)
-        try:
-            assert process.stdout is not None
-            url, _, token = json.loads(process.stdout.readline())["url"].partition("#")
-            found = asyncio.run(measured(url, token, process.pid, messages))
-        finally:
-            process.send_signal(signal.SIGTERM)
-            process.wait(30)
-    REPORT.write_text(json.dumps(found, indent=1) + "\n", encoding="utf-8")
-    print(json.dumps(found, indent=1))
-    assert found["messages"] == messages
-    assert found["activities"] == ["holding"]
-    assert found["target_moved_m"] == 0.0
-    assert found["position_moved_m"] < 30e-9
-    assert found["strangers_inside"] == 0
-    assert found["memory_most_mb"] < found["memory_before_mb"] + MEMORY_MORE_MB
-    assert found["ticks_missed"] <= 1.1 * found["ticks_missed_while_they_were_elsewhere"] + SOME_TICKS
+        both = {
+            "as_served": attacked(folder, messages),
+            "in_real_time": attacked(folder, messages, "--controller", str(law), "--bus", str(bus)),
+        }
+    REPORT.write_text(json.dumps(both, indent=1) + "\n", encoding="utf-8")
+    print(json.dumps(both, indent=1))
+    for found in both.values():
+        assert found["messages"] == messages
+        assert found["activities"] == ["holding"]
+        assert found["target_moved_m"] == 0.0
+        assert found["position_moved_m"] < 30e-9
+        assert found["strangers_inside"] == 0
+        assert found["memory_most_mb"] < found["memory_before_mb"] + MEMORY_MORE_MB
+        missed, elsewhere = found["ticks_missed"], found["ticks_missed_while_they_were_elsewhere"]
+        assert median(missed) <= 1.1 * median(elsewhere) + SOME_TICKS
+    assert not any(both["as_served"]["ticks_missed"])
 
 
 if __name__ == "__main__":
