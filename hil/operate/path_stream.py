@@ -11,7 +11,8 @@ Array = NDArray[np.float64]
 _KEPT_ROWS = 8192
 _STEP_MOST_M = 2e-6
 """Between two rows: what no path that was planned within its limits does; a jump belongs into a move."""
-_NEAR_M = 1e-12
+NEAR_M = 1e-12
+"""At the same place."""
 
 
 class PathStream:
@@ -59,7 +60,7 @@ class PathStream:
 
     def _end_objection(self, motion: Array) -> str | None:
         """Against rows (n, 9) of the path from its last on, if they have come."""
-        if not len(motion) or float(np.abs(motion[0, 0:3] - self.end_m).max()) <= _NEAR_M:
+        if not len(motion) or float(np.abs(motion[0, 0:3] - self.end_m).max()) <= NEAR_M:
             return None
         return f"the path does not end where it was said to, at {self._reach.where(self.end_m)}"
 

@@ -8,7 +8,7 @@ from numpy.typing import NDArray
 
 from hil.operate import law_change
 from hil.operate.loop import Loop
-from hil.operate.path_stream import PathStream
+from hil.operate.path_stream import NEAR_M, PathStream
 from hil.operate.reach import Reach
 from hil.operate.setpoints import Setpoints
 from hil.operate.settings import Settings
@@ -22,7 +22,6 @@ Steps = Generator[None, None, str]
 """Yields until the next tick; returns the words of what is done."""
 
 _REST = np.zeros(3)
-_NEAR_M = 1e-12
 _SETTLES_S, _STARTS_S = 2.0, 10.0
 _BUFFERED_ROWS = 512  # of a path, before it is begun
 _AXES = "xyz"
@@ -207,7 +206,7 @@ def follow(stage: Operated, path: PathStream) -> Steps:
     stage.require_holding("a path")
     if (why := stage.reach.target_refusal(path.end_m)) is not None:
         raise RefusedError(f"the path's end: {why}")
-    if float(np.abs(stage.setpoints.state()[0] - path.start_m).max()) > _NEAR_M or not stage.setpoints.has_arrived:
+    if float(np.abs(stage.setpoints.state()[0] - path.start_m).max()) > NEAR_M or not stage.setpoints.has_arrived:
         yield from move(stage, path.start_m, stage.settings.limits)
     stage.path = path
     for _ in stage.ticks(_STARTS_S):
