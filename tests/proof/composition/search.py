@@ -3,7 +3,7 @@
 from typing import Final, NamedTuple
 
 import numpy as np
-from kept import kernel
+from kept import kernel, kernel_with_memory
 from numpy.typing import NDArray
 from product import FULL, HELD_MOST, IN_FLIGHT, LATE, LOSE, MEND, SKIP, Array, Rows
 from ticks import options, settle, take
@@ -31,23 +31,29 @@ class Store(NamedTuple):
 
 
 @kernel
-def _mixed(words: Array) -> int:
+def _copy(words: Array, to: Array, count: int) -> None:
+    for place in range(count):
+        to[place] = words[place]
+
+
+@kernel
+def _mixed(words: Array, count: int) -> int:
     found = np.uint64(0)
-    for word in words:
-        found = (found ^ np.uint64(word)) * np.uint64(0x9E3779B97F4A7C15)
+    for place in range(count):
+        found = (found ^ np.uint64(words[place])) * np.uint64(0x9E3779B97F4A7C15)
         found ^= found >> np.uint64(29)
     return np.int64(found >> np.uint64(2))
 
 
 @kernel
 def find(table: Array, slots: NDArray[np.int32], words: Array) -> int:
-    """The slot where words stand, or are to stand."""
-    mask = len(slots) - 1
-    at = _mixed(words) & mask
+    """The slot where words stand, or are to stand, as many as a row of the table has."""
+    mask, count = len(slots) - 1, table.shape[1]
+    at = _mixed(words, count) & mask
     while slots[at] >= 0:
-        row, is_same = table[slots[at]], True
-        for place in range(len(words)):
-            if row[place] != words[place]:
+        row, is_same = slots[at], True
+        for place in range(count):
+            if table[row, place] != words[place]:
                 is_same = False
                 break
         if is_same:
@@ -88,9 +94,9 @@ def add(w: np.void, words: Array, r: Rows, s: Store, cursor: Array, origin: int,
     if cursor[STATES] == len(s.states) or cursor[FLIGHTS] == len(s.flights):
         return FULL
     _sort_held(w)
-    at = find(s.flights, s.flight_slots, words[:IN_FLIGHT])
+    at = find(s.flights, s.flight_slots, words)
     if s.flight_slots[at] < 0:
-        s.flights[cursor[FLIGHTS]] = words[:IN_FLIGHT]
+        _copy(words, s.flights[cursor[FLIGHTS]], IN_FLIGHT)
         s.flight_slots[at] = cursor[FLIGHTS]
         cursor[FLIGHTS] += 1
     key = s.states[cursor[STATES]]
@@ -117,9 +123,10 @@ def add(w: np.void, words: Array, r: Rows, s: Store, cursor: Array, origin: int,
 @kernel
 def put(w: np.void, words: Array, s: Store, number: int) -> None:
     """Make the world this state."""
-    words[:] = 0
     key = s.states[number]
-    words[:IN_FLIGHT] = s.flights[key[0] >> 42]
+    _copy(s.flights[key[0] >> 42], words, IN_FLIGHT)
+    for place in range(IN_FLIGHT, len(words)):
+        words[place] = 0
     w["controller"], w["node"] = key[0] & 0x3FFFFF, key[0] >> 22 & 0xFFFFF
     w["age_us"], w["phase"], w["faults_left"] = key[1] & 0x7FFF, key[1] >> 15 & 15, key[1] >> 19 & 7
     w["skipped"], w["since_decision"], w["quiet"] = key[1] >> 22 & 7, key[1] >> 25 & 15, key[1] >> 29 & 3
@@ -147,13 +154,13 @@ def expand(
         number = cursor[NUMBER]
         put(w, words, s, number)
         count = options(w, r, may)
-        kept[:] = words
+        _copy(words, kept, len(words))
         s.begins[number + 1] = cursor[TRANSITIONS] + count - cursor[OPTION]
         if s.begins[number + 1] > len(s.tails):
             return FULL
         while cursor[OPTION] < count:
             option = may[cursor[OPTION]]
-            words[:] = kept
+            _copy(kept, words, len(words))
             told = take(w, r, option)
             if told >= 0:
                 told = settle(w, r, then)
@@ -173,7 +180,7 @@ def expand(
 # -- what is not true of a state but of all ways from it ---------------------------------------------------------
 
 
-@kernel
+@kernel_with_memory
 def first_without_a_way_back(s: Store, count: int) -> int:
     """A state from which nothing leads to a closed loop, or to the end, without another fault; -1: there is none."""
     begins = np.zeros(count + 2, np.int64)  # of the transitions turned round
@@ -207,7 +214,7 @@ def first_without_a_way_back(s: Store, count: int) -> int:
     return -1
 
 
-@kernel
+@kernel_with_memory
 def first_start_without_end(s: Store, count: int) -> int:
     """A state on a circle of states that are all of the start-up, or behind one; -1: there is none."""
     into = np.zeros(count, np.int32)
