@@ -5,10 +5,10 @@ The same arithmetic whether called from Python (``sim.plant.Plant``) or from ano
 import math
 
 import numpy as np
-from numba import njit
 
 from sim.motion.amplifier import charge, drive, plan, snap, snapped
 from sim.motion.integrator import step
+from sim.motion.kernel import kernel
 from sim.motion.layout import BROKEN, BROWNIAN_STREAM, DRIFT_STREAM, EVENTS, PULLED_IN, STOP
 from sim.motion.noise import normal
 from sim.motion.parasitic import parasitic_step
@@ -25,7 +25,7 @@ REACH_M = 300e-6
 """Further than this from rest, on any axis, no flexure is whole: the stage is broken and stays where it was."""
 
 
-@njit(cache=True)
+@kernel
 def note(s: np.void, kind: int, chain: int) -> None:
     """Add an event, at the end of the step in which it happens."""
     n = s["event_count"]
@@ -36,7 +36,7 @@ def note(s: np.void, kind: int, chain: int) -> None:
     s["event_count"] = n + 1
 
 
-@njit(cache=True, error_model="numpy")
+@kernel
 def _constant_forces(p: np.void, s: np.void, dt_s: float) -> None:
     """External, weight, drift and thermal force of the coming step, held over it."""
     for j in range(3):
@@ -53,13 +53,13 @@ def _constant_forces(p: np.void, s: np.void, dt_s: float) -> None:
             s["force_n"][j] += size * normal(s["random"][BROWNIAN_STREAM], s["spare"][BROWNIAN_STREAM])
 
 
-@njit(cache=True)
+@kernel
 def _whole(motion: np.ndarray) -> bool:
     """False if the table is out of reach or not a number."""
     return bool(abs(motion[0]) < REACH_M and abs(motion[1]) < REACH_M and abs(motion[2]) < REACH_M)
 
 
-@njit(cache=True)
+@kernel
 def _note_contacts(s: np.void) -> None:
     """An event where a slider that did not touch its stop in the last step does now."""
     for i in range(3):
@@ -69,7 +69,7 @@ def _note_contacts(s: np.void) -> None:
                 note(s, STOP, i)
 
 
-@njit(cache=True, error_model="numpy")
+@kernel
 def _move(p: np.void, s: np.void, total_s: float) -> None:
     """Rigid motion, parasitic mode and voltages over total_s, from switch to switch of the amplifier."""
     remaining = total_s
@@ -97,7 +97,7 @@ def _move(p: np.void, s: np.void, total_s: float) -> None:
             remaining = 0.0
 
 
-@njit(cache=True, error_model="numpy")
+@kernel
 def _general(p: np.void, s: np.void, h: float, left_s: float) -> None:
     """A general step, fingers' balance and memory of the sense chain with it; ``left_s`` of the call follow."""
     remembers = p["sense_filter_s"] > 0.0 or p["sense_delay_us"] > 0.0
@@ -115,14 +115,14 @@ def _general(p: np.void, s: np.void, h: float, left_s: float) -> None:
         follow(p, s, h, s["t_us"] - 1e6 * left_s)
 
 
-@njit(cache=True)
+@kernel
 def _note_snap(s: np.void, chain: int) -> None:
     """Fingers of a chain have snapped together."""
     note(s, PULLED_IN, chain)
     s["base_v"][chain], s["error_v"][chain], s["slope_v_per_s"][chain] = 0.0, 0.0, 0.0
 
 
-@njit(cache=True)
+@kernel
 def _break(s: np.void) -> None:
     """The stage stays where this step began; its combs are dead."""
     if s["broken"] == 0:
@@ -137,7 +137,7 @@ def _break(s: np.void) -> None:
         s["base_v"][i], s["slope_v_per_s"][i], s["error_v"][i] = 0.0, 0.0, 0.0
 
 
-@njit(cache=True, error_model="numpy")
+@kernel
 def advance(params: np.ndarray, state: np.ndarray, dt_us: int) -> None:
     """Integrate over dt_us microseconds with what the converters hold now; nothing for dt_us <= 0."""
     if dt_us <= 0:

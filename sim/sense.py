@@ -12,16 +12,16 @@ delay see the strokes as a cubic through value and rate at both ends of each ste
 import math
 
 import numpy as np
-from numba import njit
 
 from sim.motion.geometry import strokes
+from sim.motion.kernel import kernel
 from sim.motion.layout import KNOTS, SENSE_DRIFT_STREAM, SENSE_STREAM
 from sim.motion.noise import normal, total
 from sim.structure.pose import combs_seen
 from sim.surroundings.tones import hum
 
 
-@njit(cache=True, error_model="numpy")
+@kernel
 def _filtered(tau: float, h: float, q0: float, v0: float, q1: float, v1: float, f0: float) -> float:
     """End value of f' = (q - f) / tau over h s, for the cubic q(t) with these values and rates at its ends, from f0."""
     a3 = (2.0 * (q0 - q1) / h + v0 + v1) / (h * h)
@@ -33,7 +33,7 @@ def _filtered(tau: float, h: float, q0: float, v0: float, q1: float, v1: float, 
     return c0 + h * (c1 + h * (c2 + h * c3)) + (f0 - c0) * math.exp(-h / tau)
 
 
-@njit(cache=True, error_model="numpy")
+@kernel
 def follow(p: np.void, s: np.void, h: float, t_us: float) -> None:
     """Move filter and memory of the sense chain on over the step of h s that just ended at t_us. s["before_m"] and
     s["before_m_per_s"] are the strokes and rates at its start."""
@@ -54,7 +54,7 @@ def follow(p: np.void, s: np.void, h: float, t_us: float) -> None:
         s["knot_m"][n, i] = f
 
 
-@njit(cache=True, error_model="numpy")
+@kernel
 def _remembered(p: np.void, s: np.void, out_m: np.ndarray) -> None:
     """Filtered strokes (3,) at the delay before now, by the cubic between the knots around that time; at most as old
     as the oldest knot."""
@@ -77,7 +77,7 @@ def _remembered(p: np.void, s: np.void, out_m: np.ndarray) -> None:
         out_m[i] = s["knot_m"][a, i] + u * (v0 + u * (3.0 * rise - 2.0 * v0 - v1 + u * (v0 + v1 - 2.0 * rise)))
 
 
-@njit(cache=True, error_model="numpy")
+@kernel
 def follow_voltages(p: np.void, s: np.void, h: float) -> None:
     """Move the filtered voltages on over the coming h s, in which V = base + slope t + error exp(-t / tau_a)."""
     tau, lag = p["sense_filter_s"], p["amplifier_s"]
@@ -91,7 +91,7 @@ def follow_voltages(p: np.void, s: np.void, h: float) -> None:
         s["filtered_v"][i] = end + (s["filtered_v"][i] - start) * kept
 
 
-@njit(cache=True, error_model="numpy")
+@kernel
 def pass_noise(p: np.void, s: np.void, dt_s: float) -> None:
     """Move the filtered noise of the channels on over dt_s, in deviations."""
     kept = math.exp(-dt_s / p["sense_filter_s"])
@@ -101,7 +101,7 @@ def pass_noise(p: np.void, s: np.void, dt_s: float) -> None:
         s["sense_chain_noise"][i] = s["sense_chain_noise"][i] * kept + fresh * normal(s["random"][n], s["spare"][n])
 
 
-@njit(cache=True, error_model="numpy")
+@kernel
 def _crosstalk(p: np.void, s: np.void, i: int) -> float:
     """What channel i shows of the drive, F."""
     volt, tau = s["filtered_v"] if p["sense_filter_s"] > 0.0 else s["voltage_v"], p["sense_filter_s"]
@@ -114,7 +114,7 @@ def _crosstalk(p: np.void, s: np.void, i: int) -> float:
     return float(farad)
 
 
-@njit(cache=True, error_model="numpy")
+@kernel
 def walk(p: np.void, s: np.void, dt_s: float) -> None:
     """Random walk of the channels' offsets over dt_s."""
     size = p["sense_walk_f_per_rt_s"] * math.sqrt(dt_s)
@@ -122,7 +122,7 @@ def walk(p: np.void, s: np.void, dt_s: float) -> None:
         s["sense_walk_f"][i] += size * normal(s["random"][SENSE_DRIFT_STREAM + i], s["spare"][SENSE_DRIFT_STREAM + i])
 
 
-@njit(cache=True, error_model="numpy")
+@kernel
 def sample(params: np.ndarray, state: np.ndarray, counts: np.ndarray) -> None:
     """Sample the three channels now into ``counts`` (3,) integers; draws their noise."""
     p = params[0]

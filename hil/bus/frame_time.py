@@ -11,10 +11,10 @@ takes over, so their CRC does not change their length.
 """
 
 import numpy as np
-from numba import njit
 from numpy.typing import NDArray
 
 from pkxyz_ctrl.can.frame import BIT_RATE_SWITCH, ERROR, EXTENDED, FD, REMOTE, Frame
+from pkxyz_ctrl.compiled.kernel import kernel
 
 FD_LENGTHS = (0, 1, 2, 3, 4, 5, 6, 7, 8, 12, 16, 20, 24, 32, 48, 64)
 
@@ -31,7 +31,7 @@ class FrameFormatError(ValueError):
     """A frame that no CAN controller could send: identifier, length or flags out of range."""
 
 
-@njit(cache=True)
+@kernel
 def _stuff(state: int, word: int, n_bits: int) -> int:
     """Pass the ``n_bits`` low bits of ``word``, most significant first, through the stuffing rule.
 
@@ -63,13 +63,13 @@ def _stuffed_bytes() -> NDArray[np.int16]:
 _STUFFED = _stuffed_bytes()
 
 
-@njit(cache=True)
+@kernel
 def _stuff_byte(state: int, byte: int) -> int:
     """``_stuff`` of eight bits, in one step."""
     return int((state & ~0xFF) + _STUFFED[state & 0xFF, byte])
 
 
-@njit(cache=True)
+@kernel
 def _crc15(crc: int, word: int, n_bits: int) -> int:
     for i in range(n_bits - 1, -1, -1):
         feedback = (crc >> 14) ^ ((word >> i) & 1)
@@ -77,7 +77,7 @@ def _crc15(crc: int, word: int, n_bits: int) -> int:
     return crc
 
 
-@njit(cache=True)
+@kernel
 def _fd_code(length: int) -> int:
     """Data length code of an FD frame, -1 if there is none."""
     if length <= 8:
@@ -87,7 +87,7 @@ def _fd_code(length: int) -> int:
     return 11 + length // 16 if length <= 64 and length % 16 == 0 else -1
 
 
-@njit(cache=True)
+@kernel
 def _id_bits(can_id: int, extended: bool) -> int:
     """Start of frame and identifier: 12 bits, or 32 with SRR and IDE (both recessive) in their places."""
     if extended:
@@ -95,7 +95,7 @@ def _id_bits(can_id: int, extended: bool) -> int:
     return can_id
 
 
-@njit(cache=True)
+@kernel
 def _bit_counts(can_id: int, data: bytes, flags: int) -> int:
     """Bits at nominal rate | bits at data rate << 16; -1 if there is no such frame."""
     length = len(data)
@@ -133,7 +133,7 @@ def _bit_counts(can_id: int, data: bytes, flags: int) -> int:
     return int(nominal | fast << 16 if switch else nominal + fast)
 
 
-@njit(cache=True)
+@kernel
 def duration_ns_kernel(nominal_bitrate: int, data_bitrate: int, can_id: int, data: bytes, flags: int) -> int:
     """``frame_duration_ns`` for the hot path: -1 if there is no such frame."""
     counts = _bit_counts(can_id, data, flags)

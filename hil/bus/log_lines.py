@@ -3,10 +3,10 @@
 from typing import Final
 
 import numpy as np
-from numba import njit
 from numpy.typing import NDArray
 
 from pkxyz_ctrl.can.frame import BIT_RATE_SWITCH, FD
+from pkxyz_ctrl.compiled.kernel import kernel
 
 Bytes = NDArray[np.uint8]
 
@@ -16,7 +16,7 @@ _BEGIN, _DOT, _CLOSE, _SPACE, _MARK, _END = b"(.) #\n"
 _US_DIGITS: Final = 6
 
 
-@njit(cache=True, error_model="numpy")
+@kernel
 def _decimal(text: Bytes, at: int, value: int, digits: int) -> int:
     """``value`` with at least so many digits; returns where it ends."""
     size, rest = digits, value // 10**digits
@@ -28,7 +28,7 @@ def _decimal(text: Bytes, at: int, value: int, digits: int) -> int:
     return at + size
 
 
-@njit(cache=True, error_model="numpy")
+@kernel
 def write_line(text: Bytes, at: int, channel: Bytes, t_us: int, can_id: int, flags: int, length: int, word: int) -> int:
     """A data frame with an 11-bit identifier and at most eight bytes, those of ``word``, the first one lowest. It ended
     at ``t_us``. Returns where the line ends in ``text``, at most ``LINE_MOST`` behind ``at``.

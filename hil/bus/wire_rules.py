@@ -7,10 +7,10 @@ A frame that carries data has at most eight bytes, as an integer of 64 bits, the
 from typing import Final
 
 import numpy as np
-from numba import njit
 from numpy.typing import NDArray
 
 from hil.bus.frame_time import duration_ns_kernel
+from pkxyz_ctrl.compiled.kernel import kernel
 
 Records = NDArray[np.void]
 
@@ -60,7 +60,7 @@ def clear(wire: Records) -> None:
     wire["end_us"], wire["waiting"] = NEVER_US, 0
 
 
-@njit(cache=True, error_model="numpy")
+@kernel
 def send(wire: np.void, sender: int, can_id: int, flags: int, length: int, word: int, now_us: int) -> bool:
     """Queue a frame; False if there is no room for it, or there can be no such frame."""
     for place in range(PLACES):
@@ -82,7 +82,7 @@ def send(wire: np.void, sender: int, can_id: int, flags: int, length: int, word:
     return False
 
 
-@njit(cache=True, error_model="numpy")
+@kernel
 def arbitrate(wire: np.void, now_us: int) -> None:
     """Choose the frame that starts next: the lowest identifier."""
     best = -1
@@ -98,7 +98,7 @@ def arbitrate(wire: np.void, now_us: int) -> None:
     wire["end_us"] = (start_ns + wire["queue"][best]["duration_ns"] + wire["to_end_ns"]) // _US_NS
 
 
-@njit(cache=True, error_model="numpy")
+@kernel
 def end(wire: np.void) -> None:
     """The frame under way has ended: it stands in ``done``. Who has seen to it lets the next one start."""
     frame, done = wire["queue"][wire["place"]], wire["done"][0]
@@ -114,7 +114,7 @@ def end(wire: np.void) -> None:
         errors[sender] -= 1
 
 
-@njit(cache=True, error_model="numpy")
+@kernel
 def received(wire: np.void) -> None:
     """The other one has got the frame in ``done``."""
     errors, receiver = wire["receive_errors"], 1 - wire["done"][0]["sender"]

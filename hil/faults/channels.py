@@ -10,6 +10,7 @@ from numba import njit
 from numpy.typing import NDArray
 
 from hil.plant.on_bus import at_look, at_sync
+from pkxyz_ctrl.compiled.kernel import kernel
 from sim.motion.noise import next_u64, normal, stream
 
 Records = NDArray[np.void]
@@ -50,19 +51,19 @@ def dice_of(seed: int, source: int) -> Records:
     return dice
 
 
-@njit(cache=True, error_model="numpy")
+@kernel
 def chance(words: NDArray[np.uint64]) -> float:
     """Uniform on [0, 1), 53 bits."""
     return float(np.int64(next_u64(words) >> np.uint64(11)) * 2.0**-53)
 
 
-@njit(cache=True, error_model="numpy")
+@kernel
 def below(words: NDArray[np.uint64], limit: int) -> int:
     """A whole number from 0 to ``limit`` - 1, for limits far below 2^63."""
     return int(np.int64(next_u64(words) >> np.uint64(1)) % limit)
 
 
-@njit(cache=True, error_model="numpy")
+@kernel
 def amplified(channels: Records, t_us: int, first: int, second: int, third: int) -> tuple[int, int, int]:
     """What the converters get of counts that the node puts out at ``t_us``, after the first sample."""
     a, b, c = float(first), float(second), float(third)
@@ -75,7 +76,7 @@ def amplified(channels: Records, t_us: int, first: int, second: int, third: int)
     return int(np.rint(a)), int(np.rint(b)), int(np.rint(c))
 
 
-@njit(cache=True, error_model="numpy")
+@kernel
 def _driven(channel: np.void, count: float, t_us: int) -> float:
     kind = channel["kind"]
     if kind == HELD:
@@ -88,7 +89,7 @@ def _driven(channel: np.void, count: float, t_us: int) -> float:
     return float(channel["count"])
 
 
-@njit(cache=True, error_model="numpy")
+@kernel
 def sensed(channels: Records, dice: Records, first: int, second: int, third: int) -> tuple[int, int, int]:
     """What the node reads of counts of the converters."""
     a, b, c = float(first), float(second), float(third)
@@ -101,12 +102,12 @@ def sensed(channels: Records, dice: Records, first: int, second: int, third: int
     return _whole(a), _whole(b), _whole(c)
 
 
-@njit(cache=True, error_model="numpy")
+@kernel
 def _whole(count: float) -> int:
     return int(max(LOWEST, min(UPPERMOST, np.rint(count))))
 
 
-@njit(cache=True, error_model="numpy")
+@kernel
 def _read(channel: np.void, dice: np.void, count: float) -> float:
     kind, first = channel["kind"], channel["first"]
     channel["samples"] += 1
@@ -134,7 +135,7 @@ def _read(channel: np.void, dice: np.void, count: float) -> float:
     return float(count + first * normal(dice["words"], dice["spare"]))  # NOISY
 
 
-@njit(cache=True, error_model="numpy")
+@kernel
 def at_faulty_sync(
     params: Records, state: Records, record: Records, channels: Records, dice: Records, t_us: int, advance_us: int,
     first: int, second: int, third: int,

@@ -1,10 +1,10 @@
 """Which faults of the wire meet a frame, compiled: the same dice event by event and in whole ticks."""
 
 import numpy as np
-from numba import njit
 from numpy.typing import NDArray
 
 from hil.faults.channels import chance
+from pkxyz_ctrl.compiled.kernel import kernel
 
 Records = NDArray[np.void]
 
@@ -21,7 +21,7 @@ RULE = np.dtype(
 )
 
 
-@njit(cache=True, error_model="numpy")
+@kernel
 def meets(rules: Records, dice: Records, count: int, can_id: int, sender: int) -> int:
     """The first of ``count`` rules that meets a frame, -1 if none does."""
     for n in range(count):

@@ -8,10 +8,10 @@ from collections.abc import Callable
 from functools import partial
 
 import numpy as np
-from numba import njit
 from numpy.typing import NDArray
 
 from hil.plant.truth import observe
+from pkxyz_ctrl.compiled.kernel import kernel
 from pkxyz_ctrl.core.demand import PREDICTIVE
 from pkxyz_ctrl.loop.cycle import cycle
 from pkxyz_ctrl.loop.outputs import decide
@@ -36,7 +36,7 @@ def runner_of(law: Records, outputs: Records | None = None) -> RunBlock:
     return partial(run_block_in_steps, period) if outputs is None else partial(run_outputs_in_steps, period, outputs)
 
 
-@njit(cache=True, error_model="numpy")
+@kernel
 def exchange(
     plant_params: Records,
     plant_state: Records,
@@ -52,7 +52,7 @@ def exchange(
     kernels.sample(plant_params, plant_state, sense_count)
 
 
-@njit(cache=True, error_model="numpy")
+@kernel
 def run_block(
     law: np.void,
     memory: np.void,
@@ -77,14 +77,14 @@ def run_block(
         rows[i] = row
 
 
-@njit(cache=True, error_model="numpy")
+@kernel
 def switch(seen: np.void, row: np.void, bits: int, late: int) -> None:
     """What was sent acts at this sample, or with an adapter that is a period ``late`` what was sent before."""
     row["terminal_output"] = bits if late == 0 else seen["output_acting"]
     seen["output_acting"] = bits
 
 
-@njit(cache=True, error_model="numpy")
+@kernel
 def run_block_with_outputs(
     outputs: Records,
     law: Records,

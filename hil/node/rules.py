@@ -8,10 +8,10 @@ A payload is its bytes as an integer of 64 bits, the first one lowest.
 from typing import Final
 
 import numpy as np
-from numba import njit
 from numpy.typing import NDArray
 
 from hil.node.crc import STEP, crc8h2f
+from pkxyz_ctrl.compiled.kernel import kernel
 
 Records = NDArray[np.void]
 
@@ -91,7 +91,7 @@ def crc_start(cob_id: int) -> int:
     return crc8h2f(cob_id.to_bytes(2, "little") + bytes(_CRC_BYTES))
 
 
-@njit(cache=True, error_model="numpy")
+@kernel
 def crc_of(start: int, word: int) -> int:
     """CRC of a payload's first seven bytes."""
     register = np.uint8(0)
@@ -100,13 +100,13 @@ def crc_of(start: int, word: int) -> int:
     return int(np.int64(register) ^ start)
 
 
-@njit(cache=True, error_model="numpy")
+@kernel
 def next_alarm_us(memory: np.void) -> int:
     """When the node acts by itself, if nothing comes before."""
     return min(memory["drive_deadline_us"], memory["beat_us"], memory["consumer_us"])
 
 
-@njit(cache=True, error_model="numpy")
+@kernel
 def on_drive(config: np.void, memory: np.void, length: int, word: int, t_us: int) -> bool:
     """A drive PDO. False, and nothing is done, for one that is refused or that ends an error."""
     counter, crc = word >> 48 & 0xFF, word >> 56 & 0xFF
@@ -123,7 +123,7 @@ def on_drive(config: np.void, memory: np.void, length: int, word: int, t_us: int
     return True
 
 
-@njit(cache=True, error_model="numpy")
+@kernel
 def on_sync(config: np.void, memory: np.void, length: int, word: int, t_us: int) -> bool:
     """A SYNC: what is pending becomes the output, and a sample is due. False, and nothing is done, for one that is out
     of step, finds nothing pending, asks for the signature or would make too large a step.
@@ -155,7 +155,7 @@ def on_sync(config: np.void, memory: np.void, length: int, word: int, t_us: int)
     return True
 
 
-@njit(cache=True, error_model="numpy")
+@kernel
 def on_digital(memory: np.void, length: int, word: int) -> bool:
     """A frame with digital outputs. False for one that has not their length."""
     if length != 1:
@@ -164,7 +164,7 @@ def on_digital(memory: np.void, length: int, word: int) -> bool:
     return True
 
 
-@njit(cache=True, error_model="numpy")
+@kernel
 def on_heartbeat(config: np.void, memory: np.void, length: int, word: int, t_us: int) -> bool:
     """The controller's. False for one that says anything else than that it works."""
     if length != 1 or word & 0xFF == 0:
@@ -173,7 +173,7 @@ def on_heartbeat(config: np.void, memory: np.void, length: int, word: int, t_us:
     return True
 
 
-@njit(cache=True, error_model="numpy")
+@kernel
 def answer(config: np.void, memory: np.void) -> int:
     """The payload of the sense PDO, a number with sign."""
     counter = np.int64(memory["sense_counter"]) + 1 & 0xFF
@@ -185,7 +185,7 @@ def answer(config: np.void, memory: np.void) -> int:
     return int(word | ((crc ^ 0x80) - 0x80) << 56)
 
 
-@njit(cache=True, error_model="numpy")
+@kernel
 def rides(config: np.void, memory: np.void, t_us: int) -> bool:
     """Whether the heartbeat goes along with the sense PDO, since behind the next one it would be too late."""
     if t_us + memory["cycle_us"] < memory["beat_us"]:
@@ -194,7 +194,7 @@ def rides(config: np.void, memory: np.void, t_us: int) -> bool:
     return True
 
 
-@njit(cache=True, error_model="numpy")
+@kernel
 def on_frame_at_rest(config: np.void, memory: np.void, can_id: int, length: int, word: int, t_us: int) -> bool:
     """A frame that comes in pre-operational. False, and nothing is done, for one that is for the node itself."""
     if can_id == config["sync_id"]:
@@ -206,7 +206,7 @@ def on_frame_at_rest(config: np.void, memory: np.void, can_id: int, length: int,
     return bool(can_id == config["drive_id"] or can_id == config["output_id"])  # not taken in this state
 
 
-@njit(cache=True, error_model="numpy")
+@kernel
 def on_frame_stopped(config: np.void, memory: np.void, can_id: int, length: int, word: int, t_us: int) -> bool:
     """A frame that comes to a stopped node, likewise."""
     if can_id == config["consumer_id"]:
@@ -214,7 +214,7 @@ def on_frame_stopped(config: np.void, memory: np.void, can_id: int, length: int,
     return bool(can_id != 0)  # NMT is all that it takes besides
 
 
-@njit(cache=True, error_model="numpy")
+@kernel
 def read(config: np.void, memory: np.void, length: int, word: int) -> int:
     """The reply to an SDO request, a number with sign. 0, and nothing is done, for one that is no upload, or of an
     object whose value has to be looked up.
@@ -231,7 +231,7 @@ def read(config: np.void, memory: np.void, length: int, word: int) -> int:
     return 0
 
 
-@njit(cache=True, error_model="numpy")
+@kernel
 def _count_sync(config: np.void, memory: np.void, length: int, word: int) -> bool:
     overflow, counter = config["sync_overflow"], word & 0xFF
     if length != (1 if overflow else 0) or (overflow and not 1 <= counter <= overflow):

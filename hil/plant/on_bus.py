@@ -6,6 +6,7 @@ from numpy.typing import NDArray
 
 from hil.plant.truth import observe
 from pkxyz_ctrl.compiled.direct_call import direct
+from pkxyz_ctrl.compiled.kernel import kernel
 from pkxyz_ctrl.loop.row import TRUTH_FIELDS
 from sim import kernels
 from sim.plant import Plant
@@ -20,7 +21,7 @@ RECORD = np.dtype(
 )
 
 
-@njit(cache=True)
+@kernel
 def at_sync(
     params: NDArray[np.void],
     state: NDArray[np.void],

@@ -1,13 +1,13 @@
 """The truth at a sample, compiled: what a recording sets beside the controller's own columns."""
 
 import numpy as np
-from numba import njit
 
+from pkxyz_ctrl.compiled.kernel import kernel
 from sim.motion.geometry import strokes
 from sim.structure.pose import combs_seen, stand
 
 
-@njit(cache=True, error_model="numpy")
+@kernel
 def observe(plant: np.void, state: np.void, out: np.void) -> None:
     """Write ``position_m``, ``stroke_m`` and ``comb_voltage_v`` (3,) of a plant's
     records to those fields of the record ``out``.

@@ -6,7 +6,6 @@ What a kernel here can't play it leaves alone and says so; the tick is then undo
 from typing import Final
 
 import numpy as np
-from numba import njit
 from numpy.typing import NDArray
 
 from hil.bus import wire_rules
@@ -15,6 +14,7 @@ from hil.bus.wire_rules import WIRE
 from hil.faults.channels import at_faulty_look, at_faulty_sync
 from hil.faults.frame_rules import meets
 from hil.node import rules
+from pkxyz_ctrl.compiled.kernel import kernel
 
 Records = NDArray[np.void]
 Bytes = NDArray[np.uint8]
@@ -60,7 +60,7 @@ BENCH = np.dtype(
 """What lies between controller, node and plant, and what is agreed between them."""
 
 
-@njit(cache=True, error_model="numpy")
+@kernel
 def send(memory: Records, wire: np.void, count: int, now_us: int) -> bool:
     """Put what the controller wants to send on the wire."""
     for place in range(count):
@@ -70,7 +70,7 @@ def send(memory: Records, wire: np.void, count: int, now_us: int) -> bool:
     return True
 
 
-@njit(cache=True, error_model="numpy")
+@kernel
 def take_first(lane: np.void) -> None:
     """The oldest frame of the inbox has been read."""
     lane["received"] -= 1
@@ -78,14 +78,14 @@ def take_first(lane: np.void) -> None:
         _copy(lane["inbox"][place + 1], lane["inbox"][place])
 
 
-@njit(cache=True, error_model="numpy")
+@kernel
 def _copy(frame: np.void, to: np.void) -> None:
     to["word"], to["can_id"], to["length"], to["flags"] = (
         frame["word"], frame["can_id"], frame["length"], frame["flags"]
     )  # fmt: skip
 
 
-@njit(cache=True, error_model="numpy")
+@kernel
 def next_us(lane: np.void, memory: np.void) -> int:
     """When something happens next."""
     soonest_us = min(lane["wire"][0]["end_us"], memory["due_us"])
@@ -94,7 +94,7 @@ def next_us(lane: np.void, memory: np.void) -> int:
     return int(min(soonest_us, memory["beat_us"]))
 
 
-@njit(cache=True, error_model="numpy")
+@kernel
 def pass_time(lane: np.void, node: np.void, memory: np.void, stage: Stage, line: Line, until_us: int) -> bool:
     """Let everything happen that is due until then, then included. False for what can't be played."""
     now_us = next_us(lane, memory)
@@ -105,7 +105,7 @@ def pass_time(lane: np.void, node: np.void, memory: np.void, stage: Stage, line:
     return bool(_left_alone_us(lane, memory) > until_us)
 
 
-@njit(cache=True, error_model="numpy")
+@kernel
 def _left_alone_us(lane: np.void, memory: np.void) -> int:
     """When the node does something that is not played here."""
     if lane["node_state"] == rules.OPERATIONAL:
@@ -113,7 +113,7 @@ def _left_alone_us(lane: np.void, memory: np.void) -> int:
     return int(memory["consumer_us"])
 
 
-@njit(cache=True, error_model="numpy")
+@kernel
 def happen(lane: np.void, node: np.void, memory: np.void, stage: Stage, line: Line, now_us: int) -> bool:
     """What is due now: a frame has ended, the node's response time has, or at rest its heartbeat. False for two at
     once, and for something else.
@@ -145,7 +145,7 @@ def happen(lane: np.void, node: np.void, memory: np.void, stage: Stage, line: Li
     return bool(told != REFUSED)
 
 
-@njit(cache=True, error_model="numpy")
+@kernel
 def _is_alone(lane: np.void, memory: np.void, now_us: int) -> bool:
     """Whether nothing of the node's is due now."""
     if _left_alone_us(lane, memory) <= now_us or memory["due_us"] == now_us:
@@ -153,7 +153,7 @@ def _is_alone(lane: np.void, memory: np.void, now_us: int) -> bool:
     return bool(lane["node_state"] == rules.OPERATIONAL or memory["beat_us"] != now_us)
 
 
-@njit(cache=True, error_model="numpy")
+@kernel
 def _act(lane: np.void, node: np.void, memory: np.void, now_us: int) -> bool:
     """The node acts by itself."""
     if _left_alone_us(lane, memory) <= now_us:
@@ -163,7 +163,7 @@ def _act(lane: np.void, node: np.void, memory: np.void, now_us: int) -> bool:
     return _beat(node, memory, lane, now_us)
 
 
-@njit(cache=True, error_model="numpy")
+@kernel
 def _hear(lane: np.void, node: np.void, memory: np.void, frame: np.void, now_us: int) -> int:
     """A frame reaches the other side."""
     can_id, length, word = frame["can_id"], frame["length"], frame["word"]
@@ -188,7 +188,7 @@ def _hear(lane: np.void, node: np.void, memory: np.void, frame: np.void, now_us:
     return REFUSED
 
 
-@njit(cache=True, error_model="numpy")
+@kernel
 def _serve(node: np.void, memory: np.void, wire: np.void, length: int, word: int, now_us: int) -> bool:
     """An SDO request."""
     reply = rules.read(node, memory, length, word)
@@ -197,7 +197,7 @@ def _serve(node: np.void, memory: np.void, wire: np.void, length: int, word: int
     return bool(wire_rules.send(wire, AMPLIFIER, node["reply_id"], node["flags"], rules.LENGTH, reply, now_us))
 
 
-@njit(cache=True, error_model="numpy")
+@kernel
 def _keep(lane: np.void, frame: np.void) -> bool:
     if lane["received"] == INBOX:
         return False
@@ -206,7 +206,7 @@ def _keep(lane: np.void, frame: np.void) -> bool:
     return True
 
 
-@njit(cache=True, error_model="numpy")
+@kernel
 def _exchange(lane: np.void, memory: np.void, stage: Stage, now_us: int) -> None:
     """The converters take the output, and the sense combs are sampled."""
     output, count, target_us = memory["output"], memory["count"], now_us - lane["origin_us"]
@@ -220,7 +220,7 @@ def _exchange(lane: np.void, memory: np.void, stage: Stage, now_us: int) -> None
     stage[2][0]["terminal_output"] = memory["digital"]
 
 
-@njit(cache=True, error_model="numpy")
+@kernel
 def look(lane: np.void, stage: Stage, now_us: int) -> None:
     """The truth is brought to now, without a sample."""
     counts, target_us = lane["commanded"], now_us - lane["origin_us"]
@@ -231,7 +231,7 @@ def look(lane: np.void, stage: Stage, now_us: int) -> None:
     lane["plant_us"] = target_us
 
 
-@njit(cache=True, error_model="numpy")
+@kernel
 def _answer(node: np.void, memory: np.void, wire: np.void, now_us: int) -> bool:
     """The node's sense PDO, and its heartbeat behind it if the next one would be too late."""
     word, flags = rules.answer(node, memory), node["flags"]
@@ -242,7 +242,7 @@ def _answer(node: np.void, memory: np.void, wire: np.void, now_us: int) -> bool:
     return bool(wire_rules.send(wire, AMPLIFIER, node["heartbeat_id"], flags, 1, rules.OPERATIONAL, now_us))
 
 
-@njit(cache=True, error_model="numpy")
+@kernel
 def _beat(node: np.void, memory: np.void, lane: np.void, now_us: int) -> bool:
     """The heartbeat of a node at rest."""
     memory["beat_us"] = now_us + node["beat_period_us"]

@@ -8,13 +8,13 @@ would be had it run all ticks. ``stretches`` asks for them.
 from typing import Final
 
 import numpy as np
-from numba import njit
 from numpy.typing import NDArray
 
 from hil.bus.log_lines import LINE_MOST
 from hil.node.rules import NEVER_US, OPERATIONAL
 from hil.whole_ticks.happenings import Bytes, Line, Records, Stage, happen, look, next_us, pass_time, send, take_first
 from pkxyz_ctrl.can.driver_rules import FRESH, RUNNING, START_UP
+from pkxyz_ctrl.compiled.kernel import kernel
 from pkxyz_ctrl.loop.exchange import BLOCKED, NOT_RESTARTED, RESTARTED, begin, finish, on_frame, period
 from pkxyz_ctrl.safety.modes import Mode
 
@@ -28,7 +28,7 @@ _MARK_TICKS: Final = 16  # from one state that is kept to the next
 _WORDS: Final = BLOCKED | RESTARTED | NOT_RESTARTED
 
 
-@njit(cache=True, error_model="numpy")
+@kernel
 def whole_ticks(
     controller: Pair, node: Pair, stage: Stage, line: Line, bench: Records, reference: Records, rows: Records,
     seen_v: NDArray[np.float64], live: Words, kept: Words,
@@ -57,13 +57,13 @@ def whole_ticks(
     return done
 
 
-@njit(cache=True, error_model="numpy")
+@kernel
 def _is_calm(lane: np.void, memory: np.void) -> bool:
     """Whether nothing is on its way."""
     return bool(lane["wire"][0]["waiting"] == 0 and memory["due_us"] == NEVER_US)
 
 
-@njit(cache=True, error_model="numpy")
+@kernel
 def _is_room(lane: np.void, text: Bytes) -> bool:
     """Whether a tick ends before something else is to happen, and the log has room for it."""
     if lane["t_us"] + lane["period_us"] >= lane["horizon_us"]:
@@ -71,7 +71,7 @@ def _is_room(lane: np.void, text: Bytes) -> bool:
     return bool(lane["logged"] + _LINES_MOST * LINE_MOST <= len(text))
 
 
-@njit(cache=True, error_model="numpy")
+@kernel
 def _copy_all(words: Words, to: Words) -> None:
     for part in range(len(words)):
         source, target = words[part], to[part]
@@ -79,7 +79,7 @@ def _copy_all(words: Words, to: Words) -> None:
             target[i] = source[i]
 
 
-@njit(cache=True, error_model="numpy")
+@kernel
 def _tick(
     controller: Pair, node: Pair, stage: Stage, line: Line, bench: Records, reference: Records, rows: Records,
     seen_v: NDArray[np.float64], done: int,
@@ -113,7 +113,7 @@ def _tick(
     return True
 
 
-@njit(cache=True, error_model="numpy")
+@kernel
 def _wait(
     config: Records, memory: Records, lane: np.void, its: np.void, own: np.void, stage: Stage, line: Line, now_us: int,
     is_at_work: bool,
@@ -142,7 +142,7 @@ def _wait(
             return NEVER_US
 
 
-@njit(cache=True, error_model="numpy")
+@kernel
 def _go_on_starting(memory: Records, lane: np.void, now_us: int) -> bool:
     """What a start-up sends in answer to a frame."""
     if memory[0]["blocked"] != 0:
@@ -150,7 +150,7 @@ def _go_on_starting(memory: Records, lane: np.void, now_us: int) -> bool:
     return bool(send(memory, lane["wire"][0], memory[0]["driver"][0]["outgoing"], now_us))
 
 
-@njit(cache=True, error_model="numpy")
+@kernel
 def _is_left_alone(lane: np.void, before: int, mode: int, is_at_work: bool) -> bool:
     """Whether nobody has to act on the mode after the cycle."""
     if not is_at_work or lane["node_state"] != OPERATIONAL:
@@ -158,7 +158,7 @@ def _is_left_alone(lane: np.void, before: int, mode: int, is_at_work: bool) -> b
     return bool(mode != _FAULT and (mode != _ENABLED or lane["is_begun_anew"] == 0))
 
 
-@njit(cache=True, error_model="numpy")
+@kernel
 def _record(
     memory: Records, lane: np.void, stage: Stage, rows: Records, seen_v: NDArray[np.float64], done: int, now_us: int
 ) -> None:

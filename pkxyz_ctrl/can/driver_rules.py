@@ -8,7 +8,6 @@ from enum import Enum, IntEnum, auto
 from typing import Final
 
 import numpy as np
-from numba import njit
 from numpy.typing import NDArray
 
 from pkxyz_ctrl.can import cob_id, process_pdo, sense_input
@@ -16,6 +15,7 @@ from pkxyz_ctrl.can.cob_id import NmtCommand, NmtState
 from pkxyz_ctrl.can.frame import UNUSUAL
 from pkxyz_ctrl.can.start_plan import START, START_MEMORY
 from pkxyz_ctrl.compiled.division import into_period
+from pkxyz_ctrl.compiled.kernel import kernel
 
 Records = NDArray[np.void]
 
@@ -138,7 +138,7 @@ _HEARTBEAT_ERROR: Final = 0x8130  # EMCY: what the node has to say in the trial
 _SYNC_COUNTER_OVERFLOW: Final = cob_id.SYNC_COUNTER_OVERFLOW
 
 
-@njit(cache=True, error_model="numpy")
+@kernel
 def put(config: np.void, memory: np.void, can_id: int, length: int, data: int) -> None:
     """One more frame to send."""
     place = memory["outgoing"]
@@ -149,7 +149,7 @@ def put(config: np.void, memory: np.void, can_id: int, length: int, data: int) -
         memory["outgoing"] = place + 1
 
 
-@njit(cache=True, error_model="numpy")
+@kernel
 def start(memory_array: Records) -> None:
     """Counters, events and failure anew; the start-up begins."""
     memory = memory_array[0]
@@ -160,7 +160,7 @@ def start(memory_array: Records) -> None:
     fall_silent(memory)
 
 
-@njit(cache=True, error_model="numpy")
+@kernel
 def switch_on(memory_array: Records) -> None:
     """Nothing has been sent or received, ever."""
     memory = memory_array[0]
@@ -171,13 +171,13 @@ def switch_on(memory_array: Records) -> None:
     memory["node_heartbeat_us"] = 0
 
 
-@njit(cache=True, error_model="numpy")
+@kernel
 def fall_silent(memory: np.void) -> None:
     """Nobody is watched, and our heartbeat stays away."""
     memory["node_deadline_us"] = memory["heartbeat_next_us"] = NEVER_US
 
 
-@njit(cache=True, error_model="numpy")
+@kernel
 def stop(config_array: Records, memory_array: Records) -> None:
     """0 V, then NMT pre-operational, where the node's outputs take their error value (0 V). State OFF."""
     config, memory = config_array[0], memory_array[0]
@@ -187,7 +187,7 @@ def stop(config_array: Records, memory_array: Records) -> None:
     put_nmt(config, memory, _PRE_OPERATIONAL)
 
 
-@njit(cache=True, error_model="numpy")
+@kernel
 def release(config_array: Records, memory_array: Records, t_us: int) -> None:
     """What takes the node out of operational, again and again, until its heartbeat says that it has left; from then on
     our heartbeat. One whose safety objects were changed is reset, since its error values may be voltages by now.
@@ -203,7 +203,7 @@ def release(config_array: Records, memory_array: Records, t_us: int) -> None:
     put_nmt(config, memory, _RESET if is_changed else _PRE_OPERATIONAL)
 
 
-@njit(cache=True, error_model="numpy")
+@kernel
 def sync(config_array: Records, memory_array: Records, t_us: int) -> None:
     """The SYNC that begins a tick. What was received before is old from now on."""
     config, memory = config_array[0], memory_array[0]
@@ -221,7 +221,7 @@ def sync(config_array: Records, memory_array: Records, t_us: int) -> None:
     put(config, memory, _SYNC, 1, memory["sync_count"])
 
 
-@njit(cache=True, error_model="numpy")
+@kernel
 def drive(config_array: Records, memory_array: Records, first: int, second: int, third: int) -> None:
     """The drive PDO, with its alive counter. A count that has no room in it becomes -1, which no gate lets pass."""
     config, memory = config_array[0], memory_array[0]
@@ -231,25 +231,25 @@ def drive(config_array: Records, memory_array: Records, first: int, second: int,
     memory["drive_counter"] = counter + 1 & 0xFF
 
 
-@njit(cache=True, error_model="numpy")
+@kernel
 def _in_range(count: int) -> int:
     return int(count) if -32768 <= count <= 32767 else -1
 
 
-@njit(cache=True, error_model="numpy")
+@kernel
 def revoke_drive(memory_array: Records) -> None:
     """The last drive PDO is not sent after all: its alive counter is the next one's."""
     memory_array[0]["drive_counter"] = memory_array[0]["drive_counter"] - 1 & 0xFF
 
 
-@njit(cache=True, error_model="numpy")
+@kernel
 def heartbeat(config_array: Records, memory_array: Records, t_us: int) -> None:
     """Ours; the next one is due a period after this one was due. Periods that were missed are skipped whole."""
     put(config_array[0], memory_array[0], config_array[0]["our_heartbeat_id"], 1, _OPERATIONAL)
     heartbeat_sent(config_array, memory_array, t_us)
 
 
-@njit(cache=True, error_model="numpy")
+@kernel
 def heartbeat_sent(config_array: Records, memory_array: Records, t_us: int) -> None:
     """Ours went out at ``t_us``."""
     config, memory = config_array[0], memory_array[0]
@@ -259,7 +259,7 @@ def heartbeat_sent(config_array: Records, memory_array: Records, t_us: int) -> N
         _keep_away(config, memory, t_us)
 
 
-@njit(cache=True, error_model="numpy")
+@kernel
 def _keep_away(config: np.void, memory: np.void, t_us: int) -> None:
     """A tick has room for one heartbeat: where ours would meet one of the node's, it goes out a little earlier, but not
     now, where the node's has just come.
@@ -272,7 +272,7 @@ def _keep_away(config: np.void, memory: np.void, t_us: int) -> None:
             memory["heartbeat_next_us"] -= after_us
 
 
-@njit(cache=True, error_model="numpy")
+@kernel
 def watch(memory: np.void, t_us: int) -> None:
     """Give up a node that was silent for too long."""
     if t_us > memory["node_deadline_us"]:
@@ -281,7 +281,7 @@ def watch(memory: np.void, t_us: int) -> None:
         _fail(memory, _LOST)
 
 
-@njit(cache=True, error_model="numpy")
+@kernel
 def receive(
     config_array: Records, memory_array: Records, can_id: int, flags: int, length: int, word: int, t_us: int
 ) -> int:
@@ -310,20 +310,20 @@ def receive(
     return told | (FRESH if sense[0]["fresh"] != 0 else 0)
 
 
-@njit(cache=True, error_model="numpy")
+@kernel
 def _is_for_us_to_send(config: np.void, can_id: int) -> bool:
     if can_id == _NMT or can_id == config["drive"][0]["cob_id"] or can_id == config["output_id"]:
         return True
     return can_id == _SYNC or can_id == _SDO_OUT + config["node_id"] or can_id == config["our_heartbeat_id"]
 
 
-@njit(cache=True, error_model="numpy")
+@kernel
 def is_starting_up(state: int) -> bool:
     """Whether the start-up decides what comes next."""
     return RESETTING <= state <= TRYING
 
 
-@njit(cache=True, error_model="numpy")
+@kernel
 def _on_heartbeat(config: np.void, memory: np.void, node_state: int, t_us: int) -> int:
     memory["node_state"] = node_state
     state = memory["state"]
@@ -345,7 +345,7 @@ def _on_heartbeat(config: np.void, memory: np.void, node_state: int, t_us: int) 
     return 0
 
 
-@njit(cache=True, error_model="numpy")
+@kernel
 def heard(config: np.void, memory: np.void, node_state: int, t_us: int) -> None:
     """A heartbeat of the node's while it ought to be operational."""
     memory["node_deadline_us"] = t_us + config["node_timeout_us"]
@@ -356,7 +356,7 @@ def heard(config: np.void, memory: np.void, node_state: int, t_us: int) -> None:
         _fail(memory, _LEFT)
 
 
-@njit(cache=True, error_model="numpy")
+@kernel
 def _on_emergency(memory: np.void, word: int, t_us: int) -> int:
     code, state = word & 0xFFFF, memory["state"]
     if STARTING <= state <= TRYING and (code == _HEARTBEAT_ERROR or code < 0x0100):
@@ -367,7 +367,7 @@ def _on_emergency(memory: np.void, word: int, t_us: int) -> int:
     return EMERGENCY
 
 
-@njit(cache=True, error_model="numpy")
+@kernel
 def _on_foreign(config: np.void, memory: np.void, can_id: int, length: int, word: int) -> int:
     """A frame that only we may send, and that we did not, since a controller does not receive its own.
 
@@ -385,7 +385,7 @@ def _on_foreign(config: np.void, memory: np.void, can_id: int, length: int, word
     return START_UP if STARTING <= state <= TRYING else 0
 
 
-@njit(cache=True, error_model="numpy")
+@kernel
 def _fail(memory: np.void, failure: int) -> None:
     if memory["failure"] == 0:  # the first cause counts
         memory["failure"] = failure
@@ -394,7 +394,7 @@ def _fail(memory: np.void, failure: int) -> None:
     memory["state"] = FAILED
 
 
-@njit(cache=True, error_model="numpy")
+@kernel
 def put_nmt(config: np.void, memory: np.void, command: int) -> None:
     """An NMT command to the node."""
     put(config, memory, _NMT, 2, command | config["node_id"] << 8)

@@ -3,10 +3,10 @@
 from typing import Final
 
 import numpy as np
-from numba import njit
 from numpy.typing import NDArray
 
 from pkxyz_ctrl.can import cob_id
+from pkxyz_ctrl.compiled.kernel import kernel
 
 Records = NDArray[np.void]
 
@@ -29,7 +29,7 @@ TRAFFIC = np.dtype(
 )
 
 
-@njit(cache=True, error_model="numpy")
+@kernel
 def note(traffic: Records, node_id: int, sense_id: int, can_id: int, t_us: int) -> None:
     """A frame that was read at ``t_us`` and was not a sense frame. Which identifier has the majority follows from one
     counter (Boyer and Moore, 1981).
@@ -47,7 +47,7 @@ def note(traffic: Records, node_id: int, sense_id: int, can_id: int, t_us: int) 
     seen["last_us"] = t_us
 
 
-@njit(cache=True, error_model="numpy")
+@kernel
 def forget(traffic: Records, t_us: int) -> None:
     """All is well at ``t_us``."""
     traffic[0]["frames"] = traffic[0]["lead"] = 0

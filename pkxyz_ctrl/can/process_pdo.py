@@ -6,8 +6,9 @@ A payload is its bytes as an integer of 64 bits, the first one lowest.
 from typing import Final
 
 import numpy as np
-from numba import njit
 from numpy.typing import NDArray
+
+from pkxyz_ctrl.compiled.kernel import kernel
 
 Records = NDArray[np.void]
 
@@ -61,7 +62,7 @@ def pdo_record(cob_id: int, protected: bool) -> NDArray[np.void]:
     return record
 
 
-@njit(cache=True, error_model="numpy")
+@kernel
 def encode(pdo: Records, first: int, second: int, third: int, counter: int) -> int:
     """The payload, a number with sign. Counts -32768..32767, counter 0..255: of what is beyond, only low bits go."""
     word = first & 0xFFFF | (second & 0xFFFF) << 16 | (third & 0xFFFF) << 32
@@ -71,13 +72,13 @@ def encode(pdo: Records, first: int, second: int, third: int, counter: int) -> i
     return word | _highest_byte(crc_of(pdo, word))
 
 
-@njit(cache=True, error_model="numpy")
+@kernel
 def _highest_byte(value: int) -> int:
     """A byte in its place, with the sign that it gives the word."""
     return int((value ^ 0x80) - 0x80) << 56
 
 
-@njit(cache=True, error_model="numpy")
+@kernel
 def crc_of(pdo: Records, word: int) -> int:
     """CRC of a payload's first seven bytes. A CRC is linear: what the identifier leaves is added at the end."""
     register = 0
@@ -86,19 +87,19 @@ def crc_of(pdo: Records, word: int) -> int:
     return register ^ pdo[0]["crc_start"]
 
 
-@njit(cache=True, error_model="numpy")
+@kernel
 def count_of(word: int, place: int) -> int:
     """Count 0, 1 or 2 of a payload, with its sign."""
     return (word >> 16 * place & 0xFFFF ^ 0x8000) - 0x8000
 
 
-@njit(cache=True, error_model="numpy")
+@kernel
 def counter_of(word: int) -> int:
     """The alive counter of a protected payload."""
     return word >> 48 & 0xFF
 
 
-@njit(cache=True, error_model="numpy")
+@kernel
 def is_right(pdo: Records, word: int) -> bool:
     """Whether the CRC is right, if there has to be one."""
     return pdo[0]["length"] != PROTECTED_LENGTH or word >> 56 & 0xFF == crc_of(pdo, word)

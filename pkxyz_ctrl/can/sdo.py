@@ -8,7 +8,7 @@ from dataclasses import dataclass
 from enum import IntEnum
 from typing import Final
 
-from numba import njit
+from pkxyz_ctrl.compiled.kernel import kernel
 
 TIMEOUT_ABORT = 0x05040000
 
@@ -91,19 +91,19 @@ class ReplyKind(IntEnum):
 _READ, _WRITTEN, _ABORTED, _OTHER = (int(kind) for kind in ReplyKind)
 
 
-@njit(cache=True, error_model="numpy")
+@kernel
 def message(command: int, index: int, subindex: int, value: int) -> int:
     """A message, a number with sign. ``value`` 0 to 0xFFFF_FFFF."""
     return command | index << 8 | subindex << 24 | ((value ^ 0x8000_0000) - 0x8000_0000) << 32
 
 
-@njit(cache=True, error_model="numpy")
+@kernel
 def download(size: int) -> int:
     """The command that writes ``size`` bytes: expedited, size indicated; bits 2 and 3 tell how many are empty."""
     return 0x23 | (4 - size) << 2
 
 
-@njit(cache=True, error_model="numpy")
+@kernel
 def kind_of(word: int) -> int:
     """What a server's message is, a ``ReplyKind``."""
     command = word & 0xFF
@@ -114,13 +114,13 @@ def kind_of(word: int) -> int:
     return _READ if command & 0xE2 == 0x42 else _OTHER  # initiate upload, expedited
 
 
-@njit(cache=True, error_model="numpy")
+@kernel
 def size_of(word: int) -> int:
     """Bytes of what was read; 0: it does not say."""
     return 4 - (word >> 2 & 3) if word & 1 else 0
 
 
-@njit(cache=True, error_model="numpy")
+@kernel
 def value_of(word: int) -> int:
     """What was read, or the abort code."""
     value, size = word >> 32 & 0xFFFF_FFFF, size_of(word)

@@ -3,12 +3,12 @@
 from typing import Final
 
 import numpy as np
-from numba import njit
 from numpy.typing import NDArray
 
 from pkxyz_ctrl.can.codec import ProcessCodec
 from pkxyz_ctrl.can.process_pdo import PDO, PROTECTED_LENGTH, count_of, counter_of, is_right
 from pkxyz_ctrl.compiled.direct_call import direct
+from pkxyz_ctrl.compiled.kernel import kernel
 
 Records = NDArray[np.void]
 
@@ -34,7 +34,7 @@ SENSE_MEMORY = np.dtype(
 )
 
 
-@njit(cache=True, error_model="numpy")
+@kernel
 def reset(memory_array: Records) -> None:
     """Forget everything: the node starts anew, with whatever counter."""
     memory = memory_array[0]
@@ -44,7 +44,7 @@ def reset(memory_array: Records) -> None:
     memory["syncs"] = memory["flags"] = memory["fresh"] = 0
 
 
-@njit(cache=True, error_model="numpy")
+@kernel
 def on_sync(config_array: Records, memory_array: Records) -> None:
     """A SYNC goes out: what has been received is old from now on."""
     memory = memory_array[0]
@@ -53,7 +53,7 @@ def on_sync(config_array: Records, memory_array: Records) -> None:
         memory["syncs"] += 1
 
 
-@njit(cache=True, error_model="numpy")
+@kernel
 def receive(config_array: Records, memory_array: Records, length: int, word: int) -> None:
     """A sense PDO's payload: its length, and its first eight bytes as an integer, the first one lowest."""
     config, memory = config_array[0], memory_array[0]
@@ -73,7 +73,7 @@ def receive(config_array: Records, memory_array: Records, length: int, word: int
     memory["fresh"] = 1
 
 
-@njit(cache=True, error_model="numpy")
+@kernel
 def _believe(config: np.void, memory: np.void, counter: int) -> bool:
     ahead = counter - memory["counter"] & 0xFF
     if memory["fresh"] != 0:
@@ -92,7 +92,7 @@ def _believe(config: np.void, memory: np.void, counter: int) -> bool:
     return True
 
 
-@njit(cache=True, error_model="numpy")
+@kernel
 def take(memory_array: Records) -> int:
     """What is wrong with this tick's counts, and what was with others since the last call; 0 is a good frame."""
     memory = memory_array[0]

@@ -6,10 +6,10 @@ The table is made in ``startup``, which also has the words.
 from typing import Final
 
 import numpy as np
-from numba import njit
 from numpy.typing import NDArray
 
 from pkxyz_ctrl.can import cob_id
+from pkxyz_ctrl.compiled.kernel import kernel
 
 ROWS_MOST: Final = 45
 STEPS_MOST: Final = 85
@@ -96,7 +96,7 @@ _BOTH: Final = SHOWN_HEARTBEAT_LOST | SHOWN_LEAVING
 _ALONE: Final = SHOWN_HEARTBEAT_LOST | SHOWN_DRIVE_TIMEOUT
 
 
-@njit(cache=True, error_model="numpy")
+@kernel
 def value_of(row: np.void, act: int) -> int:
     """What a step writes, or has to read."""
     if act == CLEAR:
@@ -104,7 +104,7 @@ def value_of(row: np.void, act: int) -> int:
     return int(row["value"]) | _INVALID if act == OFF else int(row["value"])
 
 
-@njit(cache=True, error_model="numpy")
+@kernel
 def identify(start: np.void, memory: np.void) -> None:
     """Steps that ask who it is; what was found before is forgotten."""
     memory["steps"] = memory["is_planned"] = 0
@@ -114,7 +114,7 @@ def identify(start: np.void, memory: np.void) -> None:
             _add(memory, place, IDENTIFY)
 
 
-@njit(cache=True, error_model="numpy")
+@kernel
 def survey(start: np.void, memory: np.void) -> None:
     """Steps that ask what it holds, and whether that is there at all."""
     memory["steps"] = 0
@@ -123,7 +123,7 @@ def survey(start: np.void, memory: np.void) -> None:
             _add(memory, place, ASK)
 
 
-@njit(cache=True, error_model="numpy")
+@kernel
 def plan(start: np.void, memory: np.void) -> int:
     """Steps for a node that holds what was found: writes, then the read-back of everything that has to hold, also of
     what stood already, since one answer that was damaged must not pass for a value that is there. Returns the row
@@ -153,25 +153,25 @@ def plan(start: np.void, memory: np.void) -> int:
     return -1
 
 
-@njit(cache=True, error_model="numpy")
+@kernel
 def is_proven(start: np.void, memory: np.void) -> bool:
     """Whether a report on this very module shows that its combs go to 0 V without us."""
     return shown(start, memory) & _ALONE != 0
 
 
-@njit(cache=True, error_model="numpy")
+@kernel
 def shown(start: np.void, memory: np.void) -> int:
     """Bits of what a report shows of the module that was found."""
     return int(start["shown"]) if has_identity(memory, start["proven"]) else 0
 
 
-@njit(cache=True, error_model="numpy")
+@kernel
 def is_known(memory: np.void) -> bool:
     """Whether it is the node that was tried last."""
     return memory["has_tried"] != 0 and has_identity(memory, memory["tried_identity"])
 
 
-@njit(cache=True, error_model="numpy")
+@kernel
 def remember_tried(memory: np.void) -> None:
     """The node that was found has shown what it does without us; one that does not tell who it is stays unknown."""
     memory["has_tried"] = 1
@@ -181,7 +181,7 @@ def remember_tried(memory: np.void) -> None:
             memory["has_tried"] = 0
 
 
-@njit(cache=True, error_model="numpy")
+@kernel
 def has_identity(memory: np.void, identity: NDArray[np.uint32]) -> bool:
     """Whether the node that was found says that it is this one."""
     for part in range(4):
@@ -190,7 +190,7 @@ def has_identity(memory: np.void, identity: NDArray[np.uint32]) -> bool:
     return True
 
 
-@njit(cache=True, error_model="numpy")
+@kernel
 def _add(memory: np.void, row: int, act: int) -> None:
     place = memory["steps"]
     if place < STEPS_MOST:
@@ -198,14 +198,14 @@ def _add(memory: np.void, row: int, act: int) -> None:
         memory["steps"] = place + 1
 
 
-@njit(cache=True, error_model="numpy")
+@kernel
 def stands(start: np.void, memory: np.void, place: int) -> bool:
     """Whether the node holds it already."""
     row, found = start["rows"][place], memory["found"][place]
     return memory["known"][place] == VALUE and (found ^ row["value"]) & ~row["alike"] == 0
 
 
-@njit(cache=True, error_model="numpy")
+@kernel
 def _is_absent(start: np.void, memory: np.void, place: int) -> bool:
     """Whether the node lacks the object of this row, or a part of it."""
     index = start["rows"][place]["index"]
@@ -216,7 +216,7 @@ def _is_absent(start: np.void, memory: np.void, place: int) -> bool:
     return False
 
 
-@njit(cache=True, error_model="numpy")
+@kernel
 def has_group(start: np.void, memory: np.void, group: int) -> bool:
     """Whether all rows of a group, OUTPUTS or READ_BACK_AT_WORK, are there and stand, as was read last; False where
     there are none.
@@ -231,7 +231,7 @@ def has_group(start: np.void, memory: np.void, group: int) -> bool:
     return asked != 0
 
 
-@njit(cache=True, error_model="numpy")
+@kernel
 def _is_wanted(start: np.void, memory: np.void, place: int) -> bool:
     """Whether a PDO is to be mapped: that of a group only on a node that has all of it."""
     group = start["rows"][place]["flags"] & _GROUPS
@@ -241,7 +241,7 @@ def _is_wanted(start: np.void, memory: np.void, place: int) -> bool:
     return True
 
 
-@njit(cache=True, error_model="numpy")
+@kernel
 def signature(start: np.void, memory: np.void) -> int:
     """CRC-16 (polynomial 0x1021, from 0xFFFF) over what the node was found to hold of all that keeps the combs safe:
     index, sub-index and value, little endian, in their order.
@@ -256,7 +256,7 @@ def signature(start: np.void, memory: np.void) -> int:
     return crc
 
 
-@njit(cache=True, error_model="numpy")
+@kernel
 def is_signed(start: np.void, memory: np.void) -> bool:
     """Whether the node can tell its signature at work, and signs what we do."""
     if not has_group(start, memory, READ_BACK_AT_WORK):
@@ -264,7 +264,7 @@ def is_signed(start: np.void, memory: np.void) -> bool:
     return bool(memory["found"][start["signature_row"]] == signature(start, memory))
 
 
-@njit(cache=True, error_model="numpy")
+@kernel
 def _crc16(crc: int, value: int, size: int) -> int:
     for byte in range(size):
         crc ^= (value >> 8 * byte & 0xFF) << 8
@@ -273,7 +273,7 @@ def _crc16(crc: int, value: int, size: int) -> int:
     return crc
 
 
-@njit(cache=True, error_model="numpy")
+@kernel
 def lacks(start: np.void, memory: np.void) -> int:
     """Of what is lacking and has nothing to stand in for it, the first by index; -1 if there is none."""
     refused, lowest = -1, 0x10000
@@ -285,7 +285,7 @@ def lacks(start: np.void, memory: np.void) -> int:
     return refused
 
 
-@njit(cache=True, error_model="numpy")
+@kernel
 def _is_dispensable(start: np.void, memory: np.void, index: int) -> bool:
     """Whether a node may be started without this object."""
     if index in (_ERROR_MODE, _ERROR_VALUE):
@@ -295,7 +295,7 @@ def _is_dispensable(start: np.void, memory: np.void, index: int) -> bool:
     return index in (_SYNC_ID, _SYNC_COUNTER, _ERROR_BEHAVIOUR)
 
 
-@njit(cache=True, error_model="numpy")
+@kernel
 def _is_mapped(start: np.void, memory: np.void, place: int) -> bool:
     """Whether entries and their number stand, of the PDO whose COB-ID is in row ``place``."""
     place += 2
@@ -306,12 +306,12 @@ def _is_mapped(start: np.void, memory: np.void, place: int) -> bool:
     return stands(start, memory, place)
 
 
-@njit(cache=True, error_model="numpy")
+@kernel
 def _is_as_wanted(start: np.void, memory: np.void, place: int) -> bool:
     return _is_mapped(start, memory, place) and stands(start, memory, place)
 
 
-@njit(cache=True, error_model="numpy")
+@kernel
 def _map(start: np.void, memory: np.void, place: int) -> None:
     """CiA 301, 7.5.2.36: PDO off, mapping empty, entries, number of entries; it goes on once all else is written. A PDO
     whose mapping stands is left alone.

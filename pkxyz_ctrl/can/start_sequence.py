@@ -10,7 +10,6 @@ from enum import IntEnum
 from typing import Final
 
 import numpy as np
-from numba import njit
 
 from pkxyz_ctrl.can import cob_id, driver_rules, sdo, start_plan
 from pkxyz_ctrl.can.cob_id import NmtCommand, NmtState
@@ -30,6 +29,7 @@ from pkxyz_ctrl.can.driver_rules import (
 )
 from pkxyz_ctrl.can.sdo import NO_SUCH_OBJECT, ReplyKind
 from pkxyz_ctrl.can.start_plan import ABSENT, ANY, ASK, IDENTIFY, READ_BACK, VALUE, WRITE
+from pkxyz_ctrl.compiled.kernel import kernel
 
 
 class Cause(IntEnum):
@@ -68,7 +68,7 @@ _OVERFLOW_MOST: Final = cob_id.SYNC_COUNTER_OVERFLOW
 _OVERFLOW: Final = 0x1019
 
 
-@njit(cache=True, error_model="numpy")
+@kernel
 def begin(config_array: Records, memory_array: Records, t_us: int) -> None:
     """Reset the node, from any state."""
     config, memory = config_array[0], memory_array[0]
@@ -81,7 +81,7 @@ def begin(config_array: Records, memory_array: Records, t_us: int) -> None:
     _enter(config, memory, was, t_us)
 
 
-@njit(cache=True, error_model="numpy")
+@kernel
 def poll(config_array: Records, memory_array: Records, t_us: int) -> None:
     """Time-outs and repetitions of the start-up; our heartbeat while no loop sends it."""
     config, memory = config_array[0], memory_array[0]
@@ -94,7 +94,7 @@ def poll(config_array: Records, memory_array: Records, t_us: int) -> None:
         driver_rules.heartbeat(config_array, memory_array, t_us)
 
 
-@njit(cache=True, error_model="numpy")
+@kernel
 def on_frame(
     config_array: Records, memory_array: Records, can_id: int, flags: int, length: int, word: int, t_us: int
 ) -> int:
@@ -105,7 +105,7 @@ def on_frame(
     return told
 
 
-@njit(cache=True, error_model="numpy")
+@kernel
 def _go_on(config: np.void, memory: np.void, can_id: int, length: int, word: int, t_us: int) -> None:
     was = memory["state"]
     if can_id == _HEARTBEAT + config["node_id"]:
@@ -120,7 +120,7 @@ def _go_on(config: np.void, memory: np.void, can_id: int, length: int, word: int
         driver_rules.heard(config, memory, memory["node_state"], t_us)
 
 
-@njit(cache=True, error_model="numpy")
+@kernel
 def _enter(config: np.void, memory: np.void, was: int, t_us: int) -> None:
     """What begins with another state: our heartbeat runs while the node is starting, and stays away while its loss is
     tried.
@@ -135,7 +135,7 @@ def _enter(config: np.void, memory: np.void, was: int, t_us: int) -> None:
         memory["heartbeat_next_us"] = t_us + FIRST_HEARTBEAT_US
 
 
-@njit(cache=True, error_model="numpy")
+@kernel
 def _fail(memory: np.void, cause: int) -> None:
     memory["state"] = FAILED
     memory["start"][0]["cause"] = cause
@@ -143,7 +143,7 @@ def _fail(memory: np.void, cause: int) -> None:
         memory["failure"], memory["failed_state"] = _START_FAILED, memory["node_state"]
 
 
-@njit(cache=True, error_model="numpy")
+@kernel
 def _on_time(config: np.void, memory: np.void, t_us: int) -> None:
     state, plan, start = memory["state"], config["start"][0], memory["start"][0]
     if state in (IDENTIFYING, CONFIGURING):
@@ -166,7 +166,7 @@ def _on_time(config: np.void, memory: np.void, t_us: int) -> None:
         put_nmt(config, memory, _PRE_OPERATIONAL)
 
 
-@njit(cache=True, error_model="numpy")
+@kernel
 def _on_heartbeat(config: np.void, memory: np.void, t_us: int) -> None:
     state, node_state = memory["state"], memory["node_state"]
     if node_state == _BOOT_UP:
@@ -180,14 +180,14 @@ def _on_heartbeat(config: np.void, memory: np.void, t_us: int) -> None:
 # -- reset --------------------------------------------------------------------------------------------------------
 
 
-@njit(cache=True, error_model="numpy")
+@kernel
 def _reset(config: np.void, memory: np.void, t_us: int) -> None:
     memory["state"] = RESETTING
     memory["start"][0]["deadline_us"] = t_us + config["start"][0]["boot_timeout_us"]
     put_nmt(config, memory, _RESET)
 
 
-@njit(cache=True, error_model="numpy")
+@kernel
 def _on_boot_up(config: np.void, memory: np.void, t_us: int) -> None:
     start = memory["start"][0]
     if start["never_booted"] != 0:  # it was only slow
@@ -203,7 +203,7 @@ def _on_boot_up(config: np.void, memory: np.void, t_us: int) -> None:
 # -- dialogue -----------------------------------------------------------------------------------------------------
 
 
-@njit(cache=True, error_model="numpy")
+@kernel
 def _identify(config: np.void, memory: np.void, t_us: int) -> None:
     """A node that starts by itself (CiA 302-2, object 1F80h) is not configured while it is operational."""
     memory["state"] = IDENTIFYING
@@ -212,13 +212,13 @@ def _identify(config: np.void, memory: np.void, t_us: int) -> None:
     _begin_to_ask(config, memory, t_us)
 
 
-@njit(cache=True, error_model="numpy")
+@kernel
 def _begin_to_ask(config: np.void, memory: np.void, t_us: int) -> None:
     memory["start"][0]["position"] = memory["start"][0]["tries"] = 0
     _ask(config, memory, t_us)
 
 
-@njit(cache=True, error_model="numpy")
+@kernel
 def _ask(config: np.void, memory: np.void, t_us: int) -> None:
     """The request of the open step."""
     start = memory["start"][0]
@@ -231,13 +231,13 @@ def _ask(config: np.void, memory: np.void, t_us: int) -> None:
         _put_sdo(config, memory, row, sdo.download(int(row["size"])), start_plan.value_of(row, act))
 
 
-@njit(cache=True, error_model="numpy")
+@kernel
 def _put_sdo(config: np.void, memory: np.void, row: np.void, command: int, value: int) -> None:
     word = sdo.message(command, int(row["index"]), int(row["subindex"]), value)
     put(config, memory, _SDO_OUT + config["node_id"], 8, word)
 
 
-@njit(cache=True, error_model="numpy")
+@kernel
 def _ask_again(config: np.void, memory: np.void, t_us: int) -> None:
     """A request without an answer is aborted and repeated, until it was often enough."""
     start = memory["start"][0]
@@ -253,7 +253,7 @@ def _ask_again(config: np.void, memory: np.void, t_us: int) -> None:
         _ask(config, memory, t_us)
 
 
-@njit(cache=True, error_model="numpy")
+@kernel
 def _fail_step(memory: np.void, cause: int, reply: int, size: int) -> None:
     """The open step can't be done; the words want to know what was answered."""
     start = memory["start"][0]
@@ -263,7 +263,7 @@ def _fail_step(memory: np.void, cause: int, reply: int, size: int) -> None:
     _fail(memory, cause)
 
 
-@njit(cache=True, error_model="numpy")
+@kernel
 def _on_answer(config: np.void, memory: np.void, word: int, t_us: int) -> None:
     """One that does not belong to the open request (late, repeated, for another object) is ignored."""
     start = memory["start"][0]
@@ -289,13 +289,13 @@ def _on_answer(config: np.void, memory: np.void, word: int, t_us: int) -> None:
         _on_value(config, memory, value, sdo.size_of(word), t_us)
 
 
-@njit(cache=True, error_model="numpy")
+@kernel
 def _note_absent(start: np.void, place: int) -> None:
     """Once there is a plan it stands; what then turns out to be lacking holds nothing."""
     start["found"][place], start["known"][place] = 0, VALUE if start["is_planned"] != 0 else ABSENT
 
 
-@njit(cache=True, error_model="numpy")
+@kernel
 def _on_value(config: np.void, memory: np.void, value: int, size: int, t_us: int) -> None:
     start = memory["start"][0]
     place, act = start["row"][start["position"]], start["act"][start["position"]]
@@ -310,7 +310,7 @@ def _on_value(config: np.void, memory: np.void, value: int, size: int, t_us: int
         _next(config, memory, t_us)
 
 
-@njit(cache=True, error_model="numpy")
+@kernel
 def _next(config: np.void, memory: np.void, t_us: int) -> None:
     plan, start = config["start"][0], memory["start"][0]
     start["position"] += 1
@@ -327,7 +327,7 @@ def _next(config: np.void, memory: np.void, t_us: int) -> None:
         _end_dialogue(config, memory, t_us)
 
 
-@njit(cache=True, error_model="numpy")
+@kernel
 def _configure(config: np.void, memory: np.void, t_us: int) -> None:
     plan, start = config["start"][0], memory["start"][0]
     refused = start_plan.plan(plan, start)
@@ -339,7 +339,7 @@ def _configure(config: np.void, memory: np.void, t_us: int) -> None:
     _begin_to_ask(config, memory, t_us)
 
 
-@njit(cache=True, error_model="numpy")
+@kernel
 def _end_dialogue(config: np.void, memory: np.void, t_us: int) -> None:
     plan, start, overflow = config["start"][0], memory["start"][0], 0
     for place in range(plan["count"]):
@@ -359,7 +359,7 @@ def _end_dialogue(config: np.void, memory: np.void, t_us: int) -> None:
 # -- start and trial ----------------------------------------------------------------------------------------------
 
 
-@njit(cache=True, error_model="numpy")
+@kernel
 def _start(config: np.void, memory: np.void, t_us: int) -> None:
     plan, start = config["start"][0], memory["start"][0]
     memory["state"] = STARTING
@@ -369,7 +369,7 @@ def _start(config: np.void, memory: np.void, t_us: int) -> None:
     put_nmt(config, memory, _START)
 
 
-@njit(cache=True, error_model="numpy")
+@kernel
 def _on_started(config: np.void, memory: np.void, t_us: int) -> None:
     start = memory["start"][0]
     if start["is_tried"] != 0:
@@ -380,7 +380,7 @@ def _on_started(config: np.void, memory: np.void, t_us: int) -> None:
     start["deadline_us"] = t_us + config["start"][0]["trial_us"]
 
 
-@njit(cache=True, error_model="numpy")
+@kernel
 def _left_or_not(config: np.void, memory: np.void, t_us: int) -> None:
     """It has left once it says so twice: one heartbeat may be damaged, late, or somebody else's."""
     start = memory["start"][0]

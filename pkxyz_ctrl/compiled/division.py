@@ -2,12 +2,12 @@
 
 from typing import Final
 
-from numba import njit
+from pkxyz_ctrl.compiled.kernel import kernel
 
 _FEW_PERIODS: Final = 2
 
 
-@njit(cache=True, error_model="numpy")
+@kernel
 def into_period(time_us: int, period_us: int) -> int:
     """``time_us % period_us``, 0 where the period, never negative, is 0. Divides only what is more than a few periods
     long: a time that is ``NEVER_US`` must not be counted down.

@@ -113,7 +113,7 @@ def _sources_of_kernels() -> dict[Path, bytes]:
     root = Path(__file__).parents[2]
     sources = {path: path.read_bytes() for package in _PACKAGES for path in sorted((root / package).rglob("*.py"))}
     relevant: set[Path] = set()
-    waiting = [path for path, source in sources.items() if b"njit" in source]
+    waiting = [path for path, source in sources.items() if b"njit" in source or b"@kernel" in source]
     while waiting:
         path = waiting.pop()
         if path not in relevant and path in sources:

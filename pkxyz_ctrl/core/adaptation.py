@@ -25,9 +25,9 @@ hinges), one number makes the innovations that the base would leave as small as 
 import math
 
 import numpy as np
-from numba import njit
 from numpy.typing import NDArray
 
+from pkxyz_ctrl.compiled.kernel import kernel
 from pkxyz_ctrl.core import kinematics
 from pkxyz_ctrl.core.elasticity import arcsine, link_force
 
@@ -105,7 +105,7 @@ ADAPTATION_STATE = np.dtype(
 )
 
 
-@njit(cache=True, error_model="numpy")
+@kernel
 def seen(adaptation: np.void, state: np.void, measured_m: Array, delay: int, out: Array) -> None:
     """Write what was measured (3,), less psi theta, to ``out`` (3,): what the filter's model would have shown."""
     row, acting, spread = state["motion"][delay - 1], state["acting"], adaptation["spread"]
@@ -114,7 +114,7 @@ def seen(adaptation: np.void, state: np.void, measured_m: Array, delay: int, out
         out[i] = measured_m[i] + late_s * row[3 + i] - bend_s2 * row[6 + i]
 
 
-@njit(cache=True, error_model="numpy")
+@kernel
 def learn(
     adaptation: np.void,
     state: np.void,
@@ -157,7 +157,7 @@ def learn(
             u[1, p] = phi[1, 0] * x + phi[1, 1] * v + phi[1, 2] * d - gamma[1] * f
 
 
-@njit(cache=True, error_model="numpy")
+@kernel
 def _show(adaptation: np.void, state: np.void, row: Array) -> None:
     """d nu at this sample, where the reference is at ``row`` (9,), and what the filter's gain makes of it."""
     tau, spread, shown = adaptation["sense_delay_s"], adaptation["spread"], state["shown"]
@@ -172,7 +172,7 @@ def _show(adaptation: np.void, state: np.void, row: Array) -> None:
                 u[s, p] += k[s] * shown[i, p]
 
 
-@njit(cache=True, error_model="numpy")
+@kernel
 def _update(adaptation: np.void, state: np.void, axis: int, innovation_m: float) -> None:
     """One step of recursive least squares with the innovation of an axis: nu is -d nu times what theta still lacks."""
     p, learnt, acting = state["covariance"], state["learnt"], state["acting"]
@@ -209,7 +209,7 @@ def _update(adaptation: np.void, state: np.void, axis: int, innovation_m: float)
         set_base(state)
 
 
-@njit(cache=True, error_model="numpy")
+@kernel
 def begin(adaptation: np.void, state: np.void) -> None:
     """Know no more than the spreads, or what an earlier run has learnt."""
     state["begun"] = 1
@@ -221,7 +221,7 @@ def begin(adaptation: np.void, state: np.void) -> None:
         set_base(state)
 
 
-@njit(cache=True, error_model="numpy")
+@kernel
 def set_base(state: np.void) -> None:
     """What is known now is what changes are counted from."""
     state["based"] = 1
@@ -233,7 +233,7 @@ def set_base(state: np.void) -> None:
         state["answer"][c] = state["clue"][c] = 0.0
 
 
-@njit(cache=True, error_model="numpy")
+@kernel
 def _compare(adaptation: np.void, state: np.void, by: Array, since: float, missing: float, scale: float) -> None:
     """Note what an innovation says of the base, in standard deviations of its noise, and name what has changed."""
     spread, forget = adaptation["spread"], adaptation["forget"]
@@ -261,7 +261,7 @@ def _compare(adaptation: np.void, state: np.void, by: Array, since: float, missi
         state["cause"], state["change"] = 0, 0.0
 
 
-@njit(cache=True, error_model="numpy")
+@kernel
 def _keep_within(bound: Array, p: Array, learnt: Array) -> None:
     """Take numbers back to their bounds, and the others along by as much as they depend on them."""
     for i in range(_PARAMETERS):
@@ -274,7 +274,7 @@ def _keep_within(bound: Array, p: Array, learnt: Array) -> None:
         learnt[i] = min(max(learnt[i], -bound[i]), bound[i])
 
 
-@njit(cache=True, error_model="numpy")
+@kernel
 def tell(state: np.void, age: int) -> None:
     """Write -phi theta (3,) of the interval of the force that was decided ``age`` ticks ago to ``told_n``: what the
     filter has to reckon with there.
@@ -287,7 +287,7 @@ def tell(state: np.void, age: int) -> None:
         out[i] = -total
 
 
-@njit(cache=True, error_model="numpy")
+@kernel
 def note(
     adaptation: np.void,
     state: np.void,
@@ -331,7 +331,7 @@ def note(
         added[i] = total
 
 
-@njit(cache=True, error_model="numpy")
+@kernel
 def _note_chain(
     fringe_m: float,
     geometry: np.void,
@@ -360,7 +360,7 @@ def _note_chain(
     out[2, LIFT] -= pull_n
 
 
-@njit(cache=True, error_model="numpy")
+@kernel
 def discount(state: np.void, inverse: Array, lack_n: Array) -> None:
     """Of what each comb (3,) lacks beyond what was learnt, leave what it would lack without that, too.
 
@@ -377,13 +377,13 @@ def discount(state: np.void, inverse: Array, lack_n: Array) -> None:
             lack_n[i] = max(lack_n[i], min(whole, 0.0))
 
 
-@njit(cache=True, error_model="numpy")
+@kernel
 def disturb(state: np.void) -> None:
     """Something is not as it should be for learning: a limit was met."""
     state["calm"] = 0
 
 
-@njit(cache=True, error_model="numpy")
+@kernel
 def clear(state: np.void) -> None:
     """The loop is open, or the filter begins anew: forget the motion, keep what was learnt."""
     for i in range(3):

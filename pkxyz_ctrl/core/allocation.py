@@ -8,8 +8,9 @@ Strictly convex as J is regular, hence one solution and at most 27 tries, in a f
 """
 
 import numpy as np
-from numba import njit
 from numpy.typing import NDArray
+
+from pkxyz_ctrl.compiled.kernel import kernel
 
 Array = NDArray[np.float64]
 
@@ -28,7 +29,7 @@ _SETS = np.array([[code % 3, code // 3 % 3, code // 9] for code in range(27)], d
 _SETS.setflags(write=False)
 
 
-@njit(cache=True, error_model="numpy")
+@kernel
 def allocate(
     jacobian: Array,
     inverse: Array,
@@ -52,7 +53,7 @@ def allocate(
     return _search(jacobian, demand_n, lower_n, upper_n, force_n, scratch)
 
 
-@njit(cache=True, error_model="numpy")
+@kernel
 def _search(jacobian: Array, demand_n: Array, lower_n: Array, upper_n: Array, best: Array, scratch: np.void) -> int:
     hessian, linear, trial = scratch["hessian"], scratch["linear"], scratch["trial_n"]
     scale = 0.0
@@ -78,7 +79,7 @@ def _search(jacobian: Array, demand_n: Array, lower_n: Array, upper_n: Array, be
     return 27
 
 
-@njit(cache=True, error_model="numpy")
+@kernel
 def _solve_fixed(
     hessian: Array, linear: Array, lower: Array, upper: Array, state: NDArray[np.int8], out: Array
 ) -> None:
@@ -100,7 +101,7 @@ def _solve_fixed(
         out[k] = (hessian[i, i] * rk - hessian[k, i] * ri) / determinant
 
 
-@njit(cache=True, error_model="numpy")
+@kernel
 def _residual(hessian: Array, linear: Array, state: NDArray[np.int8], fixed: Array, row: int) -> float:
     """Right-hand side of a free row after the fixed components went over to it."""
     total = linear[row]
@@ -110,7 +111,7 @@ def _residual(hessian: Array, linear: Array, state: NDArray[np.int8], fixed: Arr
     return total
 
 
-@njit(cache=True, error_model="numpy")
+@kernel
 def kkt_violation(
     hessian: Array, linear: Array, lower: Array, upper: Array, state: NDArray[np.int8], force: Array
 ) -> float:

@@ -1,9 +1,9 @@
 """The force that is asked for: feed-forward, the model's answer to set-points, and feedback. PURE and compiled."""
 
 import numpy as np
-from numba import njit
 from numpy.typing import NDArray
 
+from pkxyz_ctrl.compiled.kernel import kernel
 from pkxyz_ctrl.core import adaptation, feedback, linear_law, set_point_model, youla
 from pkxyz_ctrl.core.elasticity import energy_gradient, gradient_and_pulls
 from pkxyz_ctrl.core.linear3 import inverse3
@@ -31,7 +31,7 @@ that ask for it.
 """
 
 
-@njit(cache=True, error_model="numpy")
+@kernel
 def _look_ahead(law: np.void, begin: Array, end: Array, coming: np.void) -> None:
     """Write what the interval between two rows (9,) takes into ``coming``, a record of ``COMING``."""
     row, holding, needed = coming["row"], coming["holding_n"], coming["needed_n"]
@@ -42,7 +42,7 @@ def _look_ahead(law: np.void, begin: Array, end: Array, coming: np.void) -> None
     feedback.add_motion(law["feedback"], row, needed)
 
 
-@njit(cache=True, error_model="numpy")
+@kernel
 def ask(law: np.void, memory: np.void, now: Array, after: Array, later: Array) -> float:
     """Write the demand (3,) at the platform for the reference rows (9,) at the start and the end of the interval of
     action, and a period after that. Returns the feedback's authority. ``law``, ``memory``: the tick's.
@@ -100,7 +100,7 @@ def ask(law: np.void, memory: np.void, now: Array, after: Array, later: Array) -
     return float(share)
 
 
-@njit(cache=True, error_model="numpy")
+@kernel
 def _follow_plan(law: np.void, memory: np.void, share: float) -> None:
     """As ``_feed_back``, of a law that plans: the plan's force, or without one that of the regulator."""
     model, planned = memory["set_point_model"], memory["set_point_model"]["fed_back_n"]
@@ -121,14 +121,14 @@ def _follow_plan(law: np.void, memory: np.void, share: float) -> None:
         model["feedback_n"][i] = planned[i]
 
 
-@njit(cache=True, error_model="numpy")
+@kernel
 def feedforward(law: np.void, row: Array, out: Array) -> None:
     """Force (3,) at the platform that moves the stage along a reference row (9,): grad V + C v + m a."""
     energy_gradient(law["geometry"], law["elasticity"], row[0:3], out)
     feedback.add_motion(law["feedback"], row, out)
 
 
-@njit(cache=True, error_model="numpy")
+@kernel
 def _feed_back(law: np.void, memory: np.void, share: float) -> None:
     """Note the force (3,) at the platform by which the feedback answers to what the stage does otherwise than the model
     of the set-points; none in open loop. While the stage is led down it is a share of the last: a device that takes

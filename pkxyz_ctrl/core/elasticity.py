@@ -14,6 +14,7 @@ import numpy as np
 from numba import njit
 from numpy.typing import NDArray
 
+from pkxyz_ctrl.compiled.kernel import kernel
 from pkxyz_ctrl.core.kinematics import crank, crank_bend, jacobian, link, link_bend, stroke
 
 Array = NDArray[np.float64]
@@ -32,7 +33,7 @@ _SMALL = 0.1
 _HALVINGS = 4  # from a right angle
 
 
-@njit(cache=True, error_model="numpy")
+@kernel
 def arcsine(y: float) -> float:
     """asin(y) for |y| <= 1, to some units in the last place; NaN beyond. The same bits on every machine, which no
     library of mathematics promises.
@@ -50,7 +51,7 @@ def arcsine(y: float) -> float:
     return doubled * (y + y * s * (1 / 6 + s * (3 / 40 + s * (5 / 112 + s * tail))))
 
 
-@njit(cache=True, error_model="numpy")
+@kernel
 def energy(geometry: np.void, elasticity: np.void, position_m: Array) -> float:
     """Strain energy in J at ``position_m`` (3,), 0 at rest."""
     x, y = position_m[0], position_m[1]
@@ -66,7 +67,7 @@ def energy(geometry: np.void, elasticity: np.void, position_m: Array) -> float:
     return total + 0.5 * elasticity["link_n_m_per_rad"] * tilt * tilt
 
 
-@njit(cache=True, error_model="numpy")
+@kernel
 def _elevation_change(geometry: np.void, dz: float, delta: float) -> float:
     """alpha - alpha_0 in rad from its sine, z delta_0 - delta z_0 over L2^2, with the
     small difference written as a quotient.
@@ -75,7 +76,7 @@ def _elevation_change(geometry: np.void, dz: float, delta: float) -> float:
     return arcsine(dz * (delta0 + z0 * (dz + 2.0 * z0) / (delta + delta0)) / (reach * reach))
 
 
-@njit(cache=True, error_model="numpy")
+@kernel
 def _springs(
     geometry: np.void, elasticity: np.void, i: int, x: float, y: float, s: float, c: float, drop: float
 ) -> tuple[float, float]:
@@ -86,7 +87,7 @@ def _springs(
     return force, (force * s + elasticity["crank_n_m_per_rad"][i] * arcsine(s / geometry["crank_m"])) / c
 
 
-@njit(cache=True, error_model="numpy")
+@kernel
 def energy_gradient(geometry: np.void, elasticity: np.void, position_m: Array, out: Array) -> None:
     """dV/dx (3,) in N: the force at the platform that holds it at ``position_m``."""
     e, n = geometry["e"], geometry["n"]
@@ -104,7 +105,7 @@ def energy_gradient(geometry: np.void, elasticity: np.void, position_m: Array, o
     out[2] = (pull * z + elasticity["link_n_m_per_rad"] * _elevation_change(geometry, position_m[2], delta)) / delta
 
 
-@njit(cache=True, error_model="numpy")
+@kernel
 def gradient_and_pulls(geometry: np.void, elasticity: np.void, position_m: Array, out: Array, pulls_out: Array) -> None:
     """``energy_gradient`` (3,) and ``kinematics.pulls`` (3,3) at one position, whose cranks and links both need."""
     e, n = geometry["e"], geometry["n"]
@@ -127,7 +128,7 @@ def gradient_and_pulls(geometry: np.void, elasticity: np.void, position_m: Array
     out[2] = (pull * z + elasticity["link_n_m_per_rad"] * _elevation_change(geometry, position_m[2], delta)) / delta
 
 
-@njit(cache=True, error_model="numpy")
+@kernel
 def gradient_and_forces(
     geometry: np.void, elasticity: np.void, position_m: Array, comb_force_n: Array, other_n: Array, out: Array,
     other_out: Array,
@@ -159,7 +160,7 @@ def gradient_and_forces(
     return wx, wy, wz
 
 
-@njit(cache=True, error_model="numpy")
+@kernel
 def link_force(geometry: np.void, elasticity: np.void, dz: float) -> float:
     """Part of dV/dz in N that the out-of-plane hinges have at height ``dz`` above rest."""
     _, delta, _ = link(geometry, dz)

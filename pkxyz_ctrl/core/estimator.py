@@ -12,9 +12,9 @@ not in extra states. A sample shows x - tau v, tau being the sense chain's delay
 """
 
 import numpy as np
-from numba import njit
 from numpy.typing import NDArray
 
+from pkxyz_ctrl.compiled.kernel import kernel
 from pkxyz_ctrl.core.elasticity import gradient_and_forces
 
 Array = NDArray[np.float64]
@@ -54,7 +54,7 @@ FAR = np.dtype(
 """Room for ``predict_far``."""
 
 
-@njit(cache=True, error_model="numpy")
+@kernel
 def update(estimator: np.void, estimate: np.void, measured_m: Array, has_measurement: bool) -> None:
     """Measurement update at a sample: filtered = predicted + gain (y - h(predicted)).
     Without a measurement the prediction stands.
@@ -69,7 +69,7 @@ def update(estimator: np.void, estimate: np.void, measured_m: Array, has_measure
         )
 
 
-@njit(cache=True, error_model="numpy")
+@kernel
 def midway(estimator: np.void, s: Array, position_m: Array) -> None:
     """Position (3,) half a period after the state ``s`` (9,), where ``net_input`` is to be evaluated: at the start of
     the period it would lag behind a moving stage, and the disturbance would have to make up for it."""
@@ -77,7 +77,7 @@ def midway(estimator: np.void, s: Array, position_m: Array) -> None:
         position_m[i] = estimator["operating_point_m"][i] + s[i] + estimator["half_period_s"] * s[3 + i]
 
 
-@njit(cache=True, error_model="numpy")
+@kernel
 def net_input(
     geometry: np.void,
     elasticity: np.void,
@@ -109,7 +109,7 @@ def net_input(
     w[2] -= iz + apart_n[2]
 
 
-@njit(cache=True, error_model="numpy")
+@kernel
 def predict(estimator: np.void, s: Array, w: Array, w_change: Array, out: Array) -> None:
     """Time update over one period: write the state (9,) that follows from ``s`` and the input of ``net_input`` to
     ``out``, another array.
@@ -137,7 +137,7 @@ def predict(estimator: np.void, s: Array, w: Array, w_change: Array, out: Array)
 _FAR_M = 1e-6
 
 
-@njit(cache=True, error_model="numpy")
+@kernel
 def goes_far(estimator: np.void, s: Array, after: Array) -> bool:
     """Whether from a state (9,) to the one a period later the way, or what it differs by from the first half to the
     second, is so long that the input in mid-period no longer stands for all of it: at 10 um that errs by 80 nm. Up to
@@ -149,7 +149,7 @@ def goes_far(estimator: np.void, s: Array, after: Array) -> bool:
     return far
 
 
-@njit(cache=True, error_model="numpy")
+@kernel
 def predict_far(
     geometry: np.void,
     elasticity: np.void,

@@ -11,8 +11,9 @@ so position, velocity and acceleration stay steady where those of the path are.
 import math
 
 import numpy as np
-from numba import njit
 from numpy.typing import NDArray
+
+from pkxyz_ctrl.compiled.kernel import kernel
 
 Array = NDArray[np.float64]
 Records = NDArray[np.void]
@@ -21,7 +22,7 @@ SLOWING, STEADY, STARTING = -1, 0, 1
 """What the path speed does: it falls to 0, stays, rises to 1."""
 
 
-@njit(cache=True, error_model="numpy")
+@kernel
 def advance(direction: int, age: int, ramp_ticks: int) -> tuple[float, float, float]:
     """Ticks of the path since a change of speed began ``age`` ticks ago, the speed now, and its change per tick.
 
@@ -38,7 +39,7 @@ def advance(direction: int, age: int, ramp_ticks: int) -> tuple[float, float, fl
     return n * u**3 * (1.0 - 0.5 * u), u * u * (3.0 - 2.0 * u), slope
 
 
-@njit(cache=True, error_model="numpy")
+@kernel
 def row(rows: Records, index: int, out: Array) -> None:
     """Row (9,) of a path at full speed at one of its rows; before the first and past the last these."""
     motion = rows[min(max(index, 0), len(rows) - 1)]["motion"]
@@ -46,7 +47,7 @@ def row(rows: Records, index: int, out: Array) -> None:
         out[i] = motion[i]
 
 
-@njit(cache=True, error_model="numpy")
+@kernel
 def sample(rows: Records, phase: float, speed: float, change_per_tick: float, period_s: float, out: Array) -> None:
     """Row (9,) of a path at a phase between two of its rows, constant jerk between them, at a path speed.
     ``rows`` (n,) of a record with ``motion`` (9,).

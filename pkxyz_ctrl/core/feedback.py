@@ -9,8 +9,9 @@ take away: the feedback's authority g rises from 0 to 1 with the least of the fo
 """
 
 import numpy as np
-from numba import njit
 from numpy.typing import NDArray
+
+from pkxyz_ctrl.compiled.kernel import kernel
 
 Array = NDArray[np.float64]
 
@@ -34,7 +35,7 @@ FEEDBACK = np.dtype(
 _JUMP_M = 1e-9
 
 
-@njit(cache=True, error_model="numpy")
+@kernel
 def jump(period_s: float, now: Array, after: Array, i: int) -> float:
     """How far the reference jumps along axis ``i`` between two rows (9,) a period apart: 0.0 if it moves there."""
     v, a = period_s * now[3 + i], period_s * period_s * now[6 + i]
@@ -43,7 +44,7 @@ def jump(period_s: float, now: Array, after: Array, i: int) -> float:
     return 0.0 if abs(way) <= abs(speed) + abs(bend) + _JUMP_M else way
 
 
-@njit(cache=True, error_model="numpy")
+@kernel
 def stands_still(here: Array, later: Array) -> bool:
     """Whether the reference does, by two of its rows (9,)."""
     still = True
@@ -52,7 +53,7 @@ def stands_still(here: Array, later: Array) -> bool:
     return still
 
 
-@njit(cache=True, error_model="numpy")
+@kernel
 def ahead(feedback: np.void, now: Array, after: Array, out: Array) -> None:
     """Reference row (9,) at ``lead_s`` past the row ``now``, on the quintic that joins it
     to the row ``after``, one period later.
@@ -79,7 +80,7 @@ def ahead(feedback: np.void, now: Array, after: Array, out: Array) -> None:
         out[6 + i] = (a + s * (6.0 * cubic + s * (12.0 * quartic + s * 20.0 * quintic))) * (rate * rate)
 
 
-@njit(cache=True, error_model="numpy")
+@kernel
 def add_motion(feedback: np.void, row: Array, out: Array) -> None:
     """Add damping and inertia of a reference row (9,) to the force ``out`` (3,): C v + m a."""
     damping, mass = feedback["damping_n_s_per_m"], feedback["mass_kg"]
@@ -92,7 +93,7 @@ def add_motion(feedback: np.void, row: Array, out: Array) -> None:
         out[i] += mass * row[6 + i] + (damping[i, 0] * vx + damping[i, 1] * vy + damping[i, 2] * vz)
 
 
-@njit(cache=True, error_model="numpy")
+@kernel
 def add_held_share(feedforward_n: Array, last_n: Array, next_n: Array, share: float, out: Array) -> None:
     """Subtract share times h = (next - 2 present + last) / 24 from ``out`` (3,): feed-forward forces at mid-interval.
 
@@ -103,7 +104,7 @@ def add_held_share(feedforward_n: Array, last_n: Array, next_n: Array, share: fl
         out[i] -= share * (next_n[i] - 2.0 * feedforward_n[i] + last_n[i]) / 24.0
 
 
-@njit(cache=True, error_model="numpy")
+@kernel
 def sampled_target(feedback: np.void, now: Array, feedforward_n: Array, feedforward_last_n: Array, out: Array) -> None:
     """The row (9,) that the sampled state has to meet: ``now``, with the velocity
     that held forces really give at a sample.
@@ -120,7 +121,7 @@ def sampled_target(feedback: np.void, now: Array, feedforward_n: Array, feedforw
         out[6 + i] = now[6 + i]
 
 
-@njit(cache=True, error_model="numpy")
+@kernel
 def authority(feedback: np.void, inverse: Array, holding_n: Array) -> float:
     """g in 0..1 from the least comb force of J^-T ``holding_n``; ``inverse`` is J^-1 at the set-point."""
     least = np.inf
@@ -129,7 +130,7 @@ def authority(feedback: np.void, inverse: Array, holding_n: Array) -> float:
     return min(max(least / feedback["authority_force_n"], 0.0), 1.0)
 
 
-@njit(cache=True, error_model="numpy")
+@kernel
 def add_feedback(
     feedback: np.void, origin_m: Array, predicted: Array, reference: Array, share: float, out: Array
 ) -> None:

@@ -16,6 +16,7 @@ import numpy as np
 from numba import njit
 from numpy.typing import NDArray
 
+from pkxyz_ctrl.compiled.kernel import kernel
 from pkxyz_ctrl.config.stage import GeometryConfig
 
 Array = NDArray[np.float64]
@@ -52,7 +53,7 @@ def geometry_record(config: GeometryConfig) -> NDArray[np.void]:
     return record
 
 
-@njit(cache=True, error_model="numpy")
+@kernel
 def in_domain(geometry: np.void, position_m: Array) -> int:
     """0 if the links can reach ``position_m`` (3,); 1, 2, 3 if the crank of that chain can't; 4 if the links can't
     (|z_0 + z| >= L2).
@@ -66,7 +67,7 @@ def in_domain(geometry: np.void, position_m: Array) -> int:
     return 0
 
 
-@njit(cache=True, error_model="numpy")
+@kernel
 def link(geometry: np.void, dz: float) -> tuple[float, float, float]:
     """The out-of-plane links at height ``dz`` above rest: height z, projection delta, and delta_0 - delta, all in m."""
     reach, z0 = geometry["link_m"], geometry["height_rest_m"]
@@ -75,7 +76,7 @@ def link(geometry: np.void, dz: float) -> tuple[float, float, float]:
     return z, delta, dz * (z + z0) / (delta + geometry["projection_rest_m"])
 
 
-@njit(cache=True, error_model="numpy")
+@kernel
 def crank(geometry: np.void, i: int, x: float, y: float) -> tuple[float, float]:
     """Chain i's crank at (x, y): s = L1 sin(theta), across its direction of action, and c = L1 cos(theta), in m."""
     n, length = geometry["n"], geometry["crank_m"]
@@ -83,14 +84,14 @@ def crank(geometry: np.void, i: int, x: float, y: float) -> tuple[float, float]:
     return s, math.sqrt((length - s) * (length + s))
 
 
-@njit(cache=True, error_model="numpy")
+@kernel
 def stroke(geometry: np.void, i: int, x: float, y: float, s: float, c: float, drop: float) -> float:
     """q_i in m from what ``crank`` and ``link`` say."""
     e = geometry["e"]
     return e[i, 0] * x + e[i, 1] * y + drop + s * s / (geometry["crank_m"] + c)
 
 
-@njit(cache=True, error_model="numpy")
+@kernel
 def strokes(geometry: np.void, position_m: Array, out: Array) -> None:
     """Inverse kinematics (Eq. 8): strokes q (3,) in m relative to rest. ``position_m`` must be ``in_domain``."""
     x, y = position_m[0], position_m[1]
@@ -100,7 +101,7 @@ def strokes(geometry: np.void, position_m: Array, out: Array) -> None:
         out[i] = stroke(geometry, i, x, y, s, c, drop)
 
 
-@njit(cache=True, error_model="numpy")
+@kernel
 def jacobian(geometry: np.void, position_m: Array, out: Array) -> None:
     """dq/dx (3,3) at ``position_m``: rows [e_i + n_i tan(theta_i), tan(alpha)]. Eq. 12 is its value at rest."""
     e, n = geometry["e"], geometry["n"]
@@ -114,7 +115,7 @@ def jacobian(geometry: np.void, position_m: Array, out: Array) -> None:
         out[i, 2] = slope
 
 
-@njit(cache=True, error_model="numpy")
+@kernel
 def pulls(geometry: np.void, position_m: Array, out: Array) -> None:
     """B (3,3) at ``position_m``: row i is the force at the platform by the pull of comb i, the gradient of its stroke
     and what lifts its fingers. Without lift the Jacobian.
@@ -124,21 +125,21 @@ def pulls(geometry: np.void, position_m: Array, out: Array) -> None:
         out[i, 2] += geometry["lift"]
 
 
-@njit(cache=True, error_model="numpy")
+@kernel
 def crank_bend(geometry: np.void, c: float) -> float:
     """Curvature of a stroke across its direction in 1/m, L1^2 / c^3 with ``crank``'s c: along n_i n_i^T."""
     length: float = geometry["crank_m"]
     return length * length / c**3
 
 
-@njit(cache=True, error_model="numpy")
+@kernel
 def link_bend(geometry: np.void, delta: float) -> float:
     """Curvature of every stroke along z in 1/m, L2^2 / delta^3 with ``link``'s delta."""
     reach: float = geometry["link_m"]
     return reach * reach / delta**3
 
 
-@njit(cache=True, error_model="numpy")
+@kernel
 def curvature(geometry: np.void, position_m: Array, out: Array) -> None:
     """d2q_i/dx2 (3,3,3) in 1/m at ``position_m``, first axis the chain."""
     n = geometry["n"]
@@ -153,7 +154,7 @@ def curvature(geometry: np.void, position_m: Array, out: Array) -> None:
         out[i, 2, 2] = link_bend(geometry, delta)
 
 
-@njit(cache=True, error_model="numpy")
+@kernel
 def newton_step(geometry: np.void, strokes_m: Array, position_m: Array, residual_m: Array) -> float:
     """Move ``position_m`` (3,) in place by one Newton step towards q(x) = ``strokes_m``; the size of the step in m.
     ``residual_m`` (3,) is by how much the strokes are more than those of the position handed in.

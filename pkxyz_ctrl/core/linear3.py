@@ -1,13 +1,14 @@
 """Three by three linear algebra without allocation, by the adjugate."""
 
 import numpy as np
-from numba import njit
 from numpy.typing import NDArray
+
+from pkxyz_ctrl.compiled.kernel import kernel
 
 Array = NDArray[np.float64]
 
 
-@njit(cache=True, error_model="numpy")
+@kernel
 def inverse3(matrix: Array, out: Array) -> float:
     """Write the inverse of a (3,3) matrix to ``out`` and return its determinant; ``out`` is undefined if that is 0."""
     a, b, c = matrix[0, 0], matrix[0, 1], matrix[0, 2]
@@ -24,14 +25,14 @@ def inverse3(matrix: Array, out: Array) -> float:
     return determinant
 
 
-@njit(cache=True, error_model="numpy")
+@kernel
 def multiply3(matrix: Array, vector: Array, out: Array) -> None:
     """out = M v for (3,3) and (3,); ``out`` must not be ``vector``."""
     for i in range(3):
         out[i] = matrix[i, 0] * vector[0] + matrix[i, 1] * vector[1] + matrix[i, 2] * vector[2]
 
 
-@njit(cache=True, error_model="numpy")
+@kernel
 def multiply3_transposed(matrix: Array, vector: Array, out: Array) -> None:
     """out = M^T v for (3,3) and (3,); ``out`` must not be ``vector``."""
     for i in range(3):

@@ -8,8 +8,9 @@ nothing winds up while g is below 1, and the law takes over without a jump. What
 """
 
 import numpy as np
-from numba import njit
 from numpy.typing import NDArray
+
+from pkxyz_ctrl.compiled.kernel import kernel
 
 Array = NDArray[np.float64]
 
@@ -38,7 +39,7 @@ LINEAR_STATE = np.dtype(
 )
 
 
-@njit(cache=True, error_model="numpy")
+@kernel
 def add_feedback(linear: np.void, state: np.void, seen_m: Array, expected_m: Array, share: float, out: Array) -> None:
     """Add share times w to ``out`` (3,) for the position seen (3,) and the one expected (3,) of the same sample."""
     order, error = linear["order"], state["error_m"]
@@ -54,7 +55,7 @@ def add_feedback(linear: np.void, state: np.void, seen_m: Array, expected_m: Arr
         out[i] -= share * total
 
 
-@njit(cache=True, error_model="numpy")
+@kernel
 def advance(linear: np.void, state: np.void, share: float) -> None:
     """Time update with error and force of ``add_feedback``, and the authority of this tick."""
     order, x, following, w = linear["order"], state["x"], state["next"], state["w_n"]
@@ -69,7 +70,7 @@ def advance(linear: np.void, state: np.void, share: float) -> None:
         x[i] = following[i]
 
 
-@njit(cache=True, error_model="numpy")
+@kernel
 def clear(state: np.void) -> None:
     """Forget: the loop is open."""
     for i in range(ORDER_MAX):

@@ -15,9 +15,9 @@ would brake too late.
 import math
 
 import numpy as np
-from numba import njit
 from numpy.typing import NDArray
 
+from pkxyz_ctrl.compiled.kernel import kernel
 from pkxyz_ctrl.core import estimator as filtering
 from pkxyz_ctrl.core.feedback import jump
 
@@ -54,7 +54,7 @@ SET_POINT_MODEL = np.dtype(
 )
 
 
-@njit(cache=True, error_model="numpy")
+@kernel
 def set_out(estimator: np.void, model: np.void, position_m: Array) -> None:
     """Begin at a position (3,), at rest."""
     for i in range(9):
@@ -71,7 +71,7 @@ def set_out(estimator: np.void, model: np.void, position_m: Array) -> None:
             model["sample_m"][age, i] = position_m[i]
 
 
-@njit(cache=True, error_model="numpy")
+@kernel
 def approach(set_points: np.void, model: np.void, period_s: float, now: Array, after: Array, later: Array) -> bool:
     """Write the rows ``aim`` to be led along: the reference at the start and the end of the interval of action and a
     period after that, less what is still missing of its jumps. Returns whether the reference went on as it was
@@ -106,7 +106,7 @@ def approach(set_points: np.void, model: np.void, period_s: float, now: Array, a
     return bool(goes_on)
 
 
-@njit(cache=True, error_model="numpy")
+@kernel
 def _step(set_points: np.void, short: Array) -> None:
     """A tick's share of the way is made."""
     square = short[0] * short[0] + short[1] * short[1] + short[2] * short[2]
@@ -116,7 +116,7 @@ def _step(set_points: np.void, short: Array) -> None:
         short[i] *= left
 
 
-@njit(cache=True, error_model="numpy")
+@kernel
 def is_astray(model: np.void, origin_m: Array, row: Array) -> bool:
     """Whether the model is elsewhere than the row (9,) by more than rounding. At rest, where combs can't push, the rest
     of a sum would be a force that they lack.
@@ -127,7 +127,7 @@ def is_astray(model: np.void, origin_m: Array, row: Array) -> bool:
     return not near
 
 
-@njit(cache=True, error_model="numpy")
+@kernel
 def follow(
     geometry: np.void,
     elasticity: np.void,

@@ -10,9 +10,9 @@ while the loop is open. Everything works on two records: ``law`` (numbers that w
 import math
 
 import numpy as np
-from numba import njit
 from numpy.typing import NDArray
 
+from pkxyz_ctrl.compiled.kernel import kernel
 from pkxyz_ctrl.core import (
     adaptation,
     allocation,
@@ -124,7 +124,7 @@ MEMORY = np.dtype(
 )
 
 
-@njit(cache=True, error_model="numpy")
+@kernel
 def measure(law: np.void, memory: np.void, sense_count: NDArray[np.int32]) -> None:
     """Sense counts (3,) -> capacitances -> strokes -> ``measurement_m``, by one Newton step from the predicted
     position; ``residual_m`` is how far the strokes are from those expected there.
@@ -140,7 +140,7 @@ def measure(law: np.void, memory: np.void, sense_count: NDArray[np.int32]) -> No
     kinematics.newton_step(law["geometry"], stroke, position, residual)
 
 
-@njit(cache=True, error_model="numpy")
+@kernel
 def estimate(law: np.void, memory: np.void, has_measurement: bool) -> None:
     """Filter the measurement, then predict to the next sample and on to when this tick's force begins to act."""
     estimator, state, drive, scratch = law["estimator"], memory["estimate"], law["drive"], memory["scratch"]
@@ -186,7 +186,7 @@ def estimate(law: np.void, memory: np.void, has_measurement: bool) -> None:
                 state["predicted"][i] = ahead[i]
 
 
-@njit(cache=True, error_model="numpy")
+@kernel
 def act(law: np.void, memory: np.void, now: Array, after: Array, later: Array) -> bool:
     """Law, allocation and voltages for the reference rows (9,) at the start and the end of the interval of action, and
     a period after that.
@@ -215,7 +215,7 @@ def act(law: np.void, memory: np.void, now: Array, after: Array, later: Array) -
     return memory["active_set_steps"] > 1
 
 
-@njit(cache=True, error_model="numpy")
+@kernel
 def _follow(law: np.void, memory: np.void) -> None:
     """Tell the model of the set-points which forces are applied: those of the counts, so that no feedback takes their
     rounding for a disturbance. Open loop stays what it is, the yardstick of all feedback: nobody makes up for it there.
@@ -228,14 +228,14 @@ def _follow(law: np.void, memory: np.void) -> None:
     set_point_model.follow(geometry, elasticity, estimator, model, law["delay_periods"], acting, scratch)
 
 
-@njit(cache=True, error_model="numpy")
+@kernel
 def rest(law: np.void, memory: np.void) -> None:
     """The open loop: 0 V on every comb at once, no demand. A release to 0 V is never delayed by the slew limit."""
     _push(memory)
     release(law, memory)
 
 
-@njit(cache=True, error_model="numpy")
+@kernel
 def release(law: np.void, memory: np.void) -> None:
     """Take back what this tick decided: 0 V goes out instead."""
     for i in range(3):
@@ -257,7 +257,7 @@ def release(law: np.void, memory: np.void) -> None:
     set_point_model.set_out(law["estimator"], memory["set_point_model"], memory["scratch"]["nothing"])
 
 
-@njit(cache=True, error_model="numpy")
+@kernel
 def _push(memory: np.void) -> None:
     """Make room for this tick's counts: the history moves on by one."""
     count = memory["count"]
@@ -266,7 +266,7 @@ def _push(memory: np.void) -> None:
             count[age, i] = count[age - 1, i]
 
 
-@njit(cache=True, error_model="numpy")
+@kernel
 def set_position(law: np.void, memory: np.void, position_m: Array) -> None:
     """Start filter and model at a position (3,) at rest, without disturbance: after homing, and wherever a state is
     known.
@@ -283,7 +283,7 @@ def set_position(law: np.void, memory: np.void, position_m: Array) -> None:
         adaptation.clear(memory["adaptation"])
 
 
-@njit(cache=True, error_model="numpy")
+@kernel
 def set_at_rest(law: np.void, memory: np.void) -> None:
     """``set_position`` where the stage is without forces."""
     position = memory["scratch"]["position_m"]
@@ -292,14 +292,14 @@ def set_at_rest(law: np.void, memory: np.void) -> None:
     set_position(law, memory, position)
 
 
-@njit(cache=True, error_model="numpy")
+@kernel
 def is_discharged(memory: np.void) -> bool:
     """Whether the voltages of this tick are 0 V on every comb."""
     count = memory["count"]
     return bool(count[0, 0] == 0 and count[0, 1] == 0 and count[0, 2] == 0)
 
 
-@njit(cache=True, error_model="numpy")
+@kernel
 def unexplained_force(law: np.void, memory: np.void, out_n: Array) -> None:
     """Comb forces (3,) that would explain what was seen: B^-T (d + K_0 e), with ``pulls`` of the last
     ``act``; d is the estimated disturbance, which takes its time, and K_0 e what holds the stage
@@ -324,13 +324,13 @@ def unexplained_force(law: np.void, memory: np.void, out_n: Array) -> None:
         adaptation.discount(memory["adaptation"], inverse, out_n)
 
 
-@njit(cache=True, error_model="numpy")
+@kernel
 def commanded_force(law: np.void, memory: np.void, out_n: Array) -> None:
     """Comb forces (3,) by the voltages that act from this sample on, at the end of a tick."""
     voltage.forces_of_counts(law["drive"], memory["count"][law["delay_periods"]], out_n)
 
 
-@njit(cache=True, error_model="numpy")
+@kernel
 def is_finite(memory: np.void) -> bool:
     """Whether the estimate and the forces of this tick are numbers."""
     total = 0.0

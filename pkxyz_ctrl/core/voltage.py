@@ -9,8 +9,9 @@ lie on one. Then the factor may be |1 - s_1 z^-1 - s_2 z^-2 - s_3 z^-3|, with ze
 import math
 
 import numpy as np
-from numba import njit
 from numpy.typing import NDArray
+
+from pkxyz_ctrl.compiled.kernel import kernel
 
 Array = NDArray[np.float64]
 CountVector = NDArray[np.int32]
@@ -28,7 +29,7 @@ DRIVE = np.dtype(
 )
 
 
-@njit(cache=True, error_model="numpy")
+@kernel
 def force_limits(drive: np.void, count_last: CountVector, lower_n: Array, upper_n: Array) -> None:
     """Comb forces (3,) reachable in one tick from the last counts (3,): slew limit, no push, voltage limit."""
     slew, most, scale, gain = (
@@ -44,7 +45,7 @@ def force_limits(drive: np.void, count_last: CountVector, lower_n: Array, upper_
         upper_n[i] = gain[i] * high * high
 
 
-@njit(cache=True, error_model="numpy")
+@kernel
 def counts_for_forces(
     drive: np.void, force_n: Array, count_last: CountVector, carry_v: Array, count: CountVector
 ) -> None:
@@ -67,7 +68,7 @@ def counts_for_forces(
         carry_v[i] = min(max(wanted - scale * count[i], -scale), scale)
 
 
-@njit(cache=True, error_model="numpy")
+@kernel
 def shape(drive: np.void, stands_still: bool, carry_v: Array, error_v: Array) -> None:
     """What is to be carried into the next tick, in the place of this tick's error (3,); ``error_v`` (2,3) are those of
     the last two."""
@@ -80,7 +81,7 @@ def shape(drive: np.void, stands_still: bool, carry_v: Array, error_v: Array) ->
         error_v[0, i] = error
 
 
-@njit(cache=True, error_model="numpy")
+@kernel
 def forces_of_counts(drive: np.void, count: CountVector, force_n: Array) -> None:
     """Comb forces (3,) in N that counts (3,) give by the law."""
     gain = drive["force_gain_n_per_v2"]

@@ -9,9 +9,9 @@ quiet hold may have taps of its own: what lies between both sets of them is as s
 """
 
 import numpy as np
-from numba import njit
 from numpy.typing import NDArray
 
+from pkxyz_ctrl.compiled.kernel import kernel
 from pkxyz_ctrl.core.feedback import stands_still
 
 Array = NDArray[np.float64]
@@ -39,13 +39,13 @@ YOULA_STATE = np.dtype(
 )
 
 
-@njit(cache=True, error_model="numpy")
+@kernel
 def ask(state: np.void, wanted: bool, here: Array, later: Array) -> None:
     """Ask for a quiet hold, or no longer: only while the set-point stands still, by its rows (9,) here and later."""
     state["quiet"] = 1 if wanted and stands_still(here, later) else 0
 
 
-@njit(cache=True, error_model="numpy")
+@kernel
 def note(youla: np.void, state: np.void, innovation_m: Array) -> None:
     """Take in the innovation (3,) of this sample, and fade a tick further towards what is asked."""
     if youla["taps"] == 0:
@@ -61,7 +61,7 @@ def note(youla: np.void, state: np.void, innovation_m: Array) -> None:
         state["faded"] = max(state["faded"] - 1, 0)
 
 
-@njit(cache=True, error_model="numpy")
+@kernel
 def add_feedback(youla: np.void, state: np.void, share: float, out: Array) -> None:
     """Add share times w to ``out`` (3,)."""
     faded, ticks = state["faded"], youla["fade_ticks"]
@@ -71,7 +71,7 @@ def add_feedback(youla: np.void, state: np.void, share: float, out: Array) -> No
         _add_filtered(youla["quiet_tap_n_per_m"], youla["taps"], state, share * (faded / ticks), out)
 
 
-@njit(cache=True, error_model="numpy")
+@kernel
 def _add_filtered(tap: Array, taps: int, state: np.void, share: float, out: Array) -> None:
     innovation, at = state["innovation_m"], state["newest"]
     x, y, z = 0.0, 0.0, 0.0
@@ -84,7 +84,7 @@ def _add_filtered(tap: Array, taps: int, state: np.void, share: float, out: Arra
     out[2] -= share * z
 
 
-@njit(cache=True, error_model="numpy")
+@kernel
 def clear(state: np.void) -> None:
     """Forget: the loop is open."""
     for j in range(2 * TAPS_MAX):

@@ -6,9 +6,9 @@ counts, mode and record in ``memory["row"]``.
 """
 
 import numpy as np
-from numba import njit
 from numpy.typing import NDArray
 
+from pkxyz_ctrl.compiled.kernel import kernel
 from pkxyz_ctrl.core import demand, feed_hold, tick, youla
 from pkxyz_ctrl.loop import landing, set_points
 from pkxyz_ctrl.loop.row import ROW
@@ -120,7 +120,7 @@ def new_memory(mode: Mode = Mode.BOOT) -> NDArray[np.void]:
     return memory
 
 
-@njit(cache=True, error_model="numpy")
+@kernel
 def cycle(law_array: Records, memory_array: Records, reference: Records) -> None:
     """One period. ``law_array`` (1,) of ``LAW``, ``memory_array`` (1,) of
     ``MEMORY``, ``reference`` (n,) of ``REFERENCE``.
@@ -133,7 +133,7 @@ def cycle(law_array: Records, memory_array: Records, reference: Records) -> None
     respond(law_array, memory_array)
 
 
-@njit(cache=True, error_model="numpy")
+@kernel
 def observe(law_array: Records, memory_array: Records, reference: Records) -> None:
     """First part of the period: event and mode, measurement, estimate, the rows of the reference that count."""
     law, memory = law_array[0], memory_array[0]
@@ -161,7 +161,7 @@ def observe(law_array: Records, memory_array: Records, reference: Records) -> No
     youla.ask(memory["tick"]["youla"], quiet, memory["here"], memory["later"])
 
 
-@njit(cache=True, error_model="numpy")
+@kernel
 def respond(law_array: Records, memory_array: Records) -> None:
     """Second part: law and voltages, monitors, record. A plan made between the two stands in ``memory["tick"]``."""
     law, memory = law_array[0], memory_array[0]
@@ -185,7 +185,7 @@ def respond(law_array: Records, memory_array: Records) -> None:
     state["plan_known"] = state["solver_iterations"] = 0
 
 
-@njit(cache=True, error_model="numpy")
+@kernel
 def _asked(law: np.void, memory: np.void) -> int:
     """The event of this tick: what came in, else the next step of the automatic start. Nobody enables before homing."""
     event = memory["input"]["event"]
@@ -201,7 +201,7 @@ def _asked(law: np.void, memory: np.void) -> int:
     return clear_event(settled) if event == _CLEAR else event
 
 
-@njit(cache=True, error_model="numpy")
+@kernel
 def _handle(law: np.void, memory: np.void, event: int) -> None:
     """Let an event act on the mode, and prepare what the mode that is entered needs."""
     mode = memory["mode"]
@@ -237,7 +237,7 @@ def _handle(law: np.void, memory: np.void, event: int) -> None:
         memory["held"] = 0
 
 
-@njit(cache=True, error_model="numpy")
+@kernel
 def _go_on_landing(law: np.void, memory: np.void) -> None:
     """A tick of the way down; once the time is over the mode is left, wherever the stage is."""
     memory["landing_age"] += 1
@@ -246,7 +246,7 @@ def _go_on_landing(law: np.void, memory: np.void) -> None:
         _handle(law, memory, _LANDED if memory["landed_by"] == 0 else _TRIP)
 
 
-@njit(cache=True, error_model="numpy")
+@kernel
 def _suspects(law: np.void, memory: np.void) -> int:
     """Combs whose strokes are not to be believed, one bit each, and what the innovation would be; none in open loop."""
     if LOOP_CLOSED[memory["mode"]] == 0:
@@ -259,7 +259,7 @@ def _suspects(law: np.void, memory: np.void) -> int:
     return combs
 
 
-@njit(cache=True, error_model="numpy")
+@kernel
 def _average(law: np.void, memory: np.void) -> None:
     """Add this sample to the average at rest; once there are enough, that is where zero is."""
     for i in range(3):
@@ -276,7 +276,7 @@ def _average(law: np.void, memory: np.void) -> None:
     _handle(law, memory, _HOMED)
 
 
-@njit(cache=True, error_model="numpy")
+@kernel
 def _monitor(law: np.void, memory: np.void, saturated: int) -> int:
     """Let the monitors look at this tick. A trip takes the voltages of this very tick to 0, or begins the way down."""
     seen, state, obs = memory["input"], memory["tick"], memory["observation"]
@@ -311,7 +311,7 @@ def _monitor(law: np.void, memory: np.void, saturated: int) -> int:
     return trips
 
 
-@njit(cache=True, error_model="numpy")
+@kernel
 def _write_row(law: np.void, memory: np.void, trips: int, saturated: int) -> None:
     row, seen, state = memory["row"], memory["input"], memory["tick"]
     estimate, drive, origin = state["estimate"], law["tick"]["drive"], law["tick"]["estimator"]["operating_point_m"]

@@ -8,7 +8,6 @@ with the gate's verdict on it. The words are in ``controller``.
 from typing import Final
 
 import numpy as np
-from numba import njit
 from numpy.typing import NDArray
 
 from pkxyz_ctrl.can import driver_rules, sense_input, start_sequence
@@ -25,6 +24,7 @@ from pkxyz_ctrl.can.driver_rules import (
 )
 from pkxyz_ctrl.can.other_traffic import TRAFFIC, forget, note
 from pkxyz_ctrl.can.sense_input import take
+from pkxyz_ctrl.compiled.kernel import kernel
 from pkxyz_ctrl.loop import cycle as cycling
 from pkxyz_ctrl.loop import outputs
 from pkxyz_ctrl.safety import gate_rules
@@ -69,7 +69,7 @@ _SIGNATURE_TICKS: Final = 4  # in which it may come: when it is due, and a tick 
 _BOOT, _IDLE, _FAULT = int(Mode.BOOT), int(Mode.IDLE), int(Mode.FAULT)
 
 
-@njit(cache=True, error_model="numpy")
+@kernel
 def switch_on(memory_array: Records) -> None:
     """Nothing has been sent or received."""
     driver_rules.switch_on(memory_array[0]["driver"])
@@ -77,7 +77,7 @@ def switch_on(memory_array: Records) -> None:
     forget(memory_array[0]["others"], 0)
 
 
-@njit(cache=True, error_model="numpy")
+@kernel
 def start(config_array: Records, memory_array: Records, t_us: int) -> int:
     """The start-up begins, before there are periods. Returns the number of frames."""
     config, memory = config_array[0], memory_array[0]
@@ -87,7 +87,7 @@ def start(config_array: Records, memory_array: Records, t_us: int) -> int:
     return judge(config, memory, 0, t_us)
 
 
-@njit(cache=True, error_model="numpy")
+@kernel
 def wait(config_array: Records, memory_array: Records, t_us: int) -> int:
     """To be called where no frame comes during the start-up, every few milliseconds. Returns the number of frames."""
     config, memory = config_array[0], memory_array[0]
@@ -96,7 +96,7 @@ def wait(config_array: Records, memory_array: Records, t_us: int) -> int:
     return judge(config, memory, 0, t_us)
 
 
-@njit(cache=True, error_model="numpy")
+@kernel
 def come_up(memory_array: Records) -> int:
     """After ``wait`` and ``on_frame`` during the start-up: 1 once the node is operational and periods may begin, -1 if
     that failed, 0 until then.
@@ -113,7 +113,7 @@ def come_up(memory_array: Records) -> int:
     return 1
 
 
-@njit(cache=True, error_model="numpy")
+@kernel
 def begin(config_array: Records, memory_array: Records, t_us: int) -> int:
     """The period begins: SYNC, on which the amplifier applies the last voltages and samples. In FAULT the node is taken
     out of operational besides, since 0 V in a drive frame acts at a SYNC only. After a clear it is started again, one
@@ -130,7 +130,7 @@ def begin(config_array: Records, memory_array: Records, t_us: int) -> int:
     return told | judge(config, memory, 0, t_us)
 
 
-@njit(cache=True, error_model="numpy")
+@kernel
 def _go_on_starting(config: np.void, memory: np.void, t_us: int) -> int:
     """After a clear: one step of the start-up at the beginning of a period, without waiting for anything."""
     driver, told = memory["driver"][0], 0
@@ -152,7 +152,7 @@ def _go_on_starting(config: np.void, memory: np.void, t_us: int) -> int:
     return told
 
 
-@njit(cache=True, error_model="numpy")
+@kernel
 def on_frame(
     config_array: Records, memory_array: Records, can_id: int, flags: int, length: int, word: int, t_us: int
 ) -> int:
@@ -170,7 +170,7 @@ def on_frame(
     return told
 
 
-@njit(cache=True, error_model="numpy")
+@kernel
 def period(config_array: Records, memory_array: Records, reference: Records, overrun: int) -> int:
     """The cycle on what has come since the SYNC; ``overrun`` periods were skipped before this one. Returns the mode
     that is left, -1 if it stays.
@@ -182,7 +182,7 @@ def period(config_array: Records, memory_array: Records, reference: Records, ove
     return take_over(memory_array, was)
 
 
-@njit(cache=True, error_model="numpy")
+@kernel
 def hand_over(memory_array: Records, overrun: int) -> int:
     """What has come since the SYNC becomes the cycle's input. Returns the mode."""
     memory = memory_array[0]
@@ -207,7 +207,7 @@ def hand_over(memory_array: Records, overrun: int) -> int:
     return mode
 
 
-@njit(cache=True, error_model="numpy")
+@kernel
 def take_over(memory_array: Records, was: int) -> int:
     """After the cycle: returns the mode ``was`` if it was left, else -1."""
     memory = memory_array[0]
@@ -219,7 +219,7 @@ def take_over(memory_array: Records, was: int) -> int:
     return was
 
 
-@njit(cache=True, error_model="numpy")
+@kernel
 def finish(config_array: Records, memory_array: Records, t_us: int, heartbeat_until_us: int) -> int:
     """The voltages of this period; behind them, as far as there is room before the next SYNC, new digital outputs and
     our heartbeat if it is due. A voltage that the gate blocks becomes 0 V under the same alive counter. Returns the
@@ -249,7 +249,7 @@ def finish(config_array: Records, memory_array: Records, t_us: int, heartbeat_un
     return told & BLOCKED | driver["outgoing"]
 
 
-@njit(cache=True, error_model="numpy")
+@kernel
 def _short_frames(config: np.void, memory: np.void, begun_us: int, t_us: int, until_us: int) -> int:
     """How many frames of one byte, up to ``_SHORT_FRAMES_MOST``, still fit behind a drive frame that is sent at
     ``t_us``, of which the first had to be sent by ``until_us``; the node's heartbeat, where it is due in the period
@@ -264,7 +264,7 @@ def _short_frames(config: np.void, memory: np.void, begun_us: int, t_us: int, un
     return room - 1 if -config["period_us"] < ahead_us <= 2 * config["period_us"] else room
 
 
-@njit(cache=True, error_model="numpy")
+@kernel
 def _is_signature_near(config: np.void, memory: np.void) -> bool:
     """Whether the node may send its signature in this period, or would have to: one that is lost is not waited for."""
     every = config["signature_syncs"]
@@ -274,7 +274,7 @@ def _is_signature_near(config: np.void, memory: np.void) -> bool:
     )  # a third is not waited for: without two the node has tripped
 
 
-@njit(cache=True, error_model="numpy")
+@kernel
 def _put_outputs(config_array: Records, memory_array: Records, bits: int, t_us: int, room: int) -> int:
     """RPDO 1 with what the digital outputs are to be from the next SYNC on, where that is something new and there is
     ``room`` for it. Our heartbeat, if it is due, waits for it as long as it may. A bit that rose and found no room goes
@@ -295,7 +295,7 @@ def _put_outputs(config_array: Records, memory_array: Records, bits: int, t_us: 
     return 1
 
 
-@njit(cache=True, error_model="numpy")
+@kernel
 def ask_to_clear(memory_array: Records) -> None:
     """Somebody asks to forget the fault; without one, nothing happens."""
     memory = memory_array[0]
@@ -304,7 +304,7 @@ def ask_to_clear(memory_array: Records) -> None:
     memory["clearing"] = 1 if mode == _FAULT or is_failed else 0
 
 
-@njit(cache=True, error_model="numpy")
+@kernel
 def stop(config_array: Records, memory_array: Records, t_us: int) -> int:
     """0 V and pre-operational, whatever the mode. Returns the number of frames."""
     config, memory = config_array[0], memory_array[0]
@@ -313,7 +313,7 @@ def stop(config_array: Records, memory_array: Records, t_us: int) -> int:
     return judge(config, memory, 0, t_us)
 
 
-@njit(cache=True, error_model="numpy")
+@kernel
 def judge(config: np.void, memory: np.void, first: int, t_us: int) -> int:
     """The gate's verdict on all frames from ``first`` on. Returns how many stand there in all, and BLOCKED."""
     driver, told = memory["driver"][0], 0
@@ -324,7 +324,7 @@ def judge(config: np.void, memory: np.void, first: int, t_us: int) -> int:
     return told | driver["outgoing"]
 
 
-@njit(cache=True, error_model="numpy")
+@kernel
 def judge_one(config: np.void, memory: np.void, frame: np.void, t_us: int) -> int:
     """The verdict on one frame, 0 if it may be sent."""
     reason = check(
@@ -337,7 +337,7 @@ def judge_one(config: np.void, memory: np.void, frame: np.void, t_us: int) -> in
     return reason
 
 
-@njit(cache=True, error_model="numpy")
+@kernel
 def remember(gate: np.void, copy: np.void) -> None:
     """What the gate holds a drive frame against, for the words."""
     copy["time_us"], copy["counter_next"] = gate["time_us"], gate["counter_next"]

@@ -10,8 +10,9 @@ of that the estimate keeps (1 - K) m, which counts as off.
 import math
 
 import numpy as np
-from numba import njit
 from numpy.typing import NDArray
+
+from pkxyz_ctrl.compiled.kernel import kernel
 
 Array = NDArray[np.float64]
 
@@ -33,7 +34,7 @@ IN_POSITION = np.dtype(
 )
 
 
-@njit(cache=True, error_model="numpy")
+@kernel
 def look(
     state: np.void, gain: Array, target_m: Array, estimate_m: Array, innovation_m: Array, window_m: float, sigmas: float
 ) -> int:

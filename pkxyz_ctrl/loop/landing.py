@@ -7,13 +7,14 @@ whatever the mode's damping.
 """
 
 import numpy as np
-from numba import njit
 from numpy.typing import NDArray
+
+from pkxyz_ctrl.compiled.kernel import kernel
 
 Array = NDArray[np.float64]
 
 
-@njit(cache=True, error_model="numpy")
+@kernel
 def share(u: float) -> float:
     """s(u), from 1 to 0; before the beginning 1, past the end 0."""
     if u <= 0.0:
@@ -23,7 +24,7 @@ def share(u: float) -> float:
     return 1.0 - u**4 * (35.0 - u * (84.0 - u * (70.0 - 20.0 * u)))
 
 
-@njit(cache=True, error_model="numpy")
+@kernel
 def sample(begin: Array, u: float, duration_s: float, out: Array) -> None:
     """Row (9,) of the path from the row ``begin`` (9,): position m, velocity m/s, acceleration m/s^2. Past the end it
     is 0; a little before the beginning the path goes on backwards.

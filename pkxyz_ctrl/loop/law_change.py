@@ -6,9 +6,9 @@ law does not adapt likewise. A linear law has listened for a while before (``hil
 """
 
 import numpy as np
-from numba import njit
 from numpy.typing import NDArray
 
+from pkxyz_ctrl.compiled.kernel import kernel
 from pkxyz_ctrl.core import youla
 from pkxyz_ctrl.core.linear_law import ORDER_MAX
 from pkxyz_ctrl.loop import cycle as cycling
@@ -32,7 +32,7 @@ def change_to(new: Records, x: NDArray[np.float64], *, adapts_alike: bool) -> Re
     return change
 
 
-@njit(cache=True, error_model="numpy")
+@kernel
 def take_over(law_array: Records, memory_array: Records, change_array: Records) -> None:
     """Write the numbers of the new law into ``law_array`` (1,) of ``cycle.LAW``, which the loop reads, and its memory
     (1,) of ``cycle.MEMORY`` likewise. Between two ticks, the stage at rest or its loop open.
@@ -59,14 +59,14 @@ def take_over(law_array: Records, memory_array: Records, change_array: Records) 
         state["linear"]["x"][k] = change["x"][k]
 
 
-@njit(cache=True, error_model="numpy")
+@kernel
 def _move(estimate: np.void, i: int, by: float) -> None:
     estimate["predicted"][i] += by
     estimate["filtered"][i] += by
     estimate["ahead"][i] += by
 
 
-@njit(cache=True, error_model="numpy")
+@kernel
 def _forget(state: np.void) -> None:
     """Nothing of what was learnt is known any more."""
     state["learnt"][:] = 0.0

@@ -9,9 +9,9 @@ late, and by how much is said.
 import math
 
 import numpy as np
-from numba import njit
 from numpy.typing import NDArray
 
+from pkxyz_ctrl.compiled.kernel import kernel
 from pkxyz_ctrl.config.triggers import IN_POSITION, POSITION, TriggersConfig
 from pkxyz_ctrl.loop import in_position
 from pkxyz_ctrl.safety.modes import LOOP_CLOSED, Mode
@@ -77,7 +77,7 @@ def aim(outputs: Records, axis: int, direction: int, start_m: float, pitch_m: fl
     trigger["start_m"], trigger["pitch_m"] = start_m, pitch_m
 
 
-@njit(cache=True, error_model="numpy")
+@kernel
 def decide(law_array: Records, memory_array: Records, outputs_array: Records, reference: Records) -> None:
     """After the cycle of this tick: its outputs, into ``outputs_array`` (1,) of ``OUTPUTS`` and into the row."""
     law, memory, outputs = law_array[0], memory_array[0], outputs_array[0]
@@ -99,7 +99,7 @@ def decide(law_array: Records, memory_array: Records, outputs_array: Records, re
     outputs["bits"] = row["output"]
 
 
-@njit(cache=True, error_model="numpy")
+@kernel
 def _look(law: np.void, memory: np.void, outputs: np.void) -> None:
     """For how long the stage has been in position: within the window of a set-point that stands."""
     row, position = memory["row"], outputs["position"]
@@ -115,7 +115,7 @@ def _look(law: np.void, memory: np.void, outputs: np.void) -> None:
             position["ticks"] = 0
 
 
-@njit(cache=True, error_model="numpy")
+@kernel
 def _of_path(law: np.void, memory: np.void, reference: Records) -> int:
     """The bits of the row that is nearest to where the path will be when they act."""
     at = memory["row"]["reference_tick"] + law["tick"]["delay_periods"] + (1 if memory["phase"] >= 0.5 else 0)
@@ -123,7 +123,7 @@ def _of_path(law: np.void, memory: np.void, reference: Records) -> int:
     return int(reference[min(max(index, 0), len(reference) - 1)]["output"])
 
 
-@njit(cache=True, error_model="numpy")
+@kernel
 def position_bit(trigger: np.void, now_m: Array, then: Array, estimate_m: Array, period_s: float) -> int:
     """``POSITION`` if the stage passes a position of ``trigger`` within half a period of the instant of action, else 0.
 

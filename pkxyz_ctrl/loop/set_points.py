@@ -3,9 +3,9 @@
 import math
 
 import numpy as np
-from numba import njit
 from numpy.typing import NDArray
 
+from pkxyz_ctrl.compiled.kernel import kernel
 from pkxyz_ctrl.core import feed_hold
 from pkxyz_ctrl.loop import landing
 from pkxyz_ctrl.safety.modes import Mode
@@ -17,7 +17,7 @@ _ROW_LENGTH = 9
 _TRACKING, _LANDING = int(Mode.TRACKING), int(Mode.LANDING)
 
 
-@njit(cache=True, error_model="numpy")
+@kernel
 def reference_row(law: np.void, memory: np.void, reference: Records, ahead: int, out: Array) -> None:
     """Write the row (9,) of the set-point ``ahead`` ticks from this one to ``out``."""
     base = reference[0]["tick"]
@@ -39,7 +39,7 @@ def reference_row(law: np.void, memory: np.void, reference: Records, ahead: int,
             out[i] = memory["setpoint"][i]
 
 
-@njit(cache=True, error_model="numpy")
+@kernel
 def reference_rows(law: np.void, memory: np.void, reference: Records) -> None:
     """Write the rows that count in this tick: at its sample, at both ends of the interval in which its force acts, and
     a period after that. Beside them the position asked for at the sample, for the record: without a learnt shift,
@@ -64,7 +64,7 @@ def reference_rows(law: np.void, memory: np.void, reference: Records) -> None:
         asked[i] = here[i]
 
 
-@njit(cache=True, error_model="numpy")
+@kernel
 def excite(memory: np.void, reference: Records) -> None:
     """Add the excitation of this sample to the measurement; outside the rows handed in there is none."""
     index = memory["reference_tick"] - reference[0]["tick"]
@@ -75,7 +75,7 @@ def excite(memory: np.void, reference: Records) -> None:
                 memory["tick"]["measurement_m"][i] += added[i]
 
 
-@njit(cache=True, error_model="numpy")
+@kernel
 def turn_feed(law: np.void, memory: np.void, direction: int) -> None:
     """Begin to stop on the path, or to go on along it; in the middle of the other, from the speed that there is."""
     at = memory["reference_tick"] + memory["phase"]
@@ -90,7 +90,7 @@ def turn_feed(law: np.void, memory: np.void, direction: int) -> None:
     memory["feed_phase"] = at - covered
 
 
-@njit(cache=True, error_model="numpy")
+@kernel
 def scale_time(law: np.void, memory: np.void) -> None:
     """A tick of slowing down or starting has passed; at its end the path stands, or goes on at its own speed."""
     memory["feed_age"] += 1
@@ -105,7 +105,7 @@ def scale_time(law: np.void, memory: np.void) -> None:
     memory["phase"] = at - math.floor(at)
 
 
-@njit(cache=True, error_model="numpy")
+@kernel
 def begin_landing(memory: np.void) -> None:
     """The way down begins where the set-points were led to for the next action, jumps on the way included."""
     model = memory["tick"]["set_point_model"]
@@ -119,7 +119,7 @@ def begin_landing(memory: np.void) -> None:
     memory["tick"]["landing"] = 1
 
 
-@njit(cache=True, error_model="numpy")
+@kernel
 def end_landing(memory: np.void) -> None:
     """Leave nothing of the way down behind."""
     for i in range(_ROW_LENGTH):

@@ -8,10 +8,10 @@ from enum import IntEnum, IntFlag
 from typing import Final
 
 import numpy as np
-from numba import njit
 from numpy.typing import NDArray
 
 from pkxyz_ctrl.can.frame import FD, FD_FAST, UNUSUAL
+from pkxyz_ctrl.compiled.kernel import kernel
 from pkxyz_ctrl.safety.modes import Mode
 from pkxyz_ctrl.safety.sdo_rules import WRITES, is_read, write_refusal
 
@@ -180,7 +180,7 @@ def new_gate_memory() -> NDArray[np.void]:
     return memory
 
 
-@njit(cache=True, error_model="numpy")
+@kernel
 def forget(memory_array: Records) -> None:
     """Nothing has passed, and nothing was blocked: what the combs hold is unknown."""
     memory = memory_array[0]
@@ -192,7 +192,7 @@ def forget(memory_array: Records) -> None:
     memory["output_due"] = 0
 
 
-@njit(cache=True, error_model="numpy")
+@kernel
 def check(
     config_array: Records, memory_array: Records,
     can_id: int, flags: int, length: int, word: int, mode: int, t_us: int,
@@ -210,7 +210,7 @@ def check(
     return reason
 
 
-@njit(cache=True, error_model="numpy")
+@kernel
 def _judge(
     config: np.void, memory: np.void, can_id: int, flags: int, length: int, word: int, mode: int, t_us: int
 ) -> int:
@@ -244,7 +244,7 @@ def _judge(
     return _BAD_IDENTIFIER
 
 
-@njit(cache=True, error_model="numpy")
+@kernel
 def judge_drive(config: np.void, memory: np.void, length: int, word: int, permitted: int, t_us: int) -> int:
     """The reason for or against a drive frame; one that passes is remembered."""
     if length != config["drive_length"]:
@@ -295,7 +295,7 @@ def judge_drive(config: np.void, memory: np.void, length: int, word: int, permit
     return 0
 
 
-@njit(cache=True, error_model="numpy")
+@kernel
 def judge_outputs(memory: np.void, length: int, word: int, permitted: int) -> int:
     """The reason for or against a frame with digital outputs: one between two SYNCs, and no bit but the known ones."""
     if length != 1:
@@ -310,7 +310,7 @@ def judge_outputs(memory: np.void, length: int, word: int, permitted: int) -> in
     return 0
 
 
-@njit(cache=True, error_model="numpy")
+@kernel
 def crc_of(start: int, word: int) -> int:
     """CRC of the first seven bytes. A CRC is linear: ``start``, which the identifier leaves, is added at the end."""
     crc = 0
@@ -319,7 +319,7 @@ def crc_of(start: int, word: int) -> int:
     return crc ^ start
 
 
-@njit(cache=True, error_model="numpy")
+@kernel
 def _judge_nmt(config: np.void, memory: np.void, length: int, word: int, permitted: int) -> int:
     command = word & 0xFF
     if command == 0x01:  # CiA 301, 7.2.8.2
@@ -344,7 +344,7 @@ def _judge_nmt(config: np.void, memory: np.void, length: int, word: int, permitt
     return 0
 
 
-@njit(cache=True, error_model="numpy")
+@kernel
 def _judge_sdo(config: np.void, length: int, word: int, permitted: int) -> int:
     if length != 8:
         return _SDO_LENGTH
@@ -355,7 +355,7 @@ def _judge_sdo(config: np.void, length: int, word: int, permitted: int) -> int:
     return _SDO_WRITE if write_refusal(config["writes"], word) != 0 else 0
 
 
-@njit(cache=True, error_model="numpy")
+@kernel
 def clear(memory_array: Records) -> None:
     """Let the mode's frames pass again. What was sent last stays remembered, so the slew limit holds across it."""
     memory_array[0]["latched"] = 0

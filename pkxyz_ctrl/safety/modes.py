@@ -8,8 +8,9 @@ from enum import IntEnum
 from typing import Final, NamedTuple
 
 import numpy as np
-from numba import njit
 from numpy.typing import NDArray
+
+from pkxyz_ctrl.compiled.kernel import kernel
 
 
 class Mode(IntEnum):
@@ -163,7 +164,7 @@ _CLEAR_UNSETTLED = int(Event.CLEAR_UNSETTLED)
 _ENOUGH = 1 << 30  # counting further would only overflow
 
 
-@njit(cache=True, error_model="numpy")
+@kernel
 def next_mode(mode: int, event: int) -> int:
     """The mode after ``event``. An undefined pair, NONE or an unknown event: the same mode; an unknown mode: FAULT."""
     if mode < 0 or mode >= _MODE_COUNT:
@@ -174,7 +175,7 @@ def next_mode(mode: int, event: int) -> int:
     return mode if target < 0 else target
 
 
-@njit(cache=True, error_model="numpy")
+@kernel
 def next_safe_cycles(cycles: int, mode: int, is_usable: bool, is_discharged: bool) -> int:
     """Safe cycles in a row, this one included: 0 V commanded, and a usable sense frame where one is owed.
 
@@ -187,7 +188,7 @@ def next_safe_cycles(cycles: int, mode: int, is_usable: bool, is_discharged: boo
     return cycles + 1 if cycles < _ENOUGH else cycles
 
 
-@njit(cache=True, error_model="numpy")
+@kernel
 def enable_event(homed: bool, settled: bool) -> int:
     """The event that a wish to close the loop amounts to: ENABLE, or one that no mode accepts and that says why.
 
@@ -198,13 +199,13 @@ def enable_event(homed: bool, settled: bool) -> int:
     return _ENABLE if settled else _ENABLE_UNSETTLED
 
 
-@njit(cache=True, error_model="numpy")
+@kernel
 def clear_event(settled: bool) -> int:
     """The event that a wish to clear the fault amounts to: CLEAR, or CLEAR_UNSETTLED, which no mode accepts."""
     return _CLEAR if settled else _CLEAR_UNSETTLED
 
 
-@njit(cache=True, error_model="numpy")
+@kernel
 def next_homed(homed: bool, mode: int, event: int) -> bool:
     """Whether the sense offsets are known after ``event`` in ``mode``.
 

@@ -17,9 +17,9 @@ from enum import IntFlag
 from typing import Final
 
 import numpy as np
-from numba import njit
 from numpy.typing import NDArray
 
+from pkxyz_ctrl.compiled.kernel import kernel
 from pkxyz_ctrl.safety.modes import LOOP_CLOSED, NODE_EXPECTED, Mode
 from pkxyz_ctrl.safety.trips import Trip
 
@@ -170,31 +170,31 @@ _MODE_COUNT = len(Mode)
 _ENOUGH = 1 << 30  # counting further would only overflow
 
 
-@njit(cache=True, error_model="numpy")
+@kernel
 def _consecutive(ticks: int, bad: bool) -> int:
     if not bad:
         return 0
     return ticks + 1 if ticks < _ENOUGH else ticks
 
 
-@njit(cache=True, error_model="numpy")
+@kernel
 def _bucket(level: int, events: int, leak_ticks: int) -> int:
     if events > 0:
         return level + int(events) * int(leak_ticks) if level < _ENOUGH else level
     return level - 1 if level > 0 else 0
 
 
-@njit(cache=True, error_model="numpy")
+@kernel
 def _reached(ticks: int, limit: int, trip: int) -> int:
     return trip if limit >= 0 and ticks >= limit else 0
 
 
-@njit(cache=True, error_model="numpy")
+@kernel
 def _filled(level: int, limit: int, leak_ticks: int, trip: int) -> int:
     return trip if limit >= 0 and level >= int(limit) * int(leak_ticks) else 0
 
 
-@njit(cache=True, error_model="numpy")
+@kernel
 def clear_memory(memory: np.void) -> None:
     """Forget all; ``memory`` is a record of MONITOR_MEMORY."""
     memory["sequence_level"] = 0
@@ -208,7 +208,7 @@ def clear_memory(memory: np.void) -> None:
     _clear_loop(memory)
 
 
-@njit(cache=True, error_model="numpy")
+@kernel
 def _clear_loop(memory: np.void) -> None:
     memory["saturation"] = 0
     memory["slew"] = 0
@@ -223,7 +223,7 @@ def _clear_loop(memory: np.void) -> None:
     memory["moved_n"] = 0.0
 
 
-@njit(cache=True, error_model="numpy")
+@kernel
 def _note_motion(limits: np.void, memory: np.void, obs: np.void) -> None:
     """Add this tick's change of the commanded forces, which begin to act now, to what is remembered of them."""
     moved_n = memory["moved_n"] * (1.0 - limits["force_forget_share"])
@@ -233,13 +233,13 @@ def _note_motion(limits: np.void, memory: np.void, obs: np.void) -> None:
     memory["moved_n"] = moved_n if moved_n < np.inf else 0.0  # what is not finite leaves no trace
 
 
-@njit(cache=True, error_model="numpy")
+@kernel
 def _of_motion_m(limits: np.void, memory: np.void) -> float:
     """What an imperfect device may be off by, beside noise, as its forces change."""
     return float(limits["innovation_share_m_per_n"] * memory["moved_n"])
 
 
-@njit(cache=True, error_model="numpy")
+@kernel
 def implausible_combs(limits: np.void, memory: np.void, residual_m: NDArray[np.float64]) -> int:
     """Combs whose measured stroke is further from the expected one than plausible, bit 0 for comb 1.
 
@@ -256,7 +256,7 @@ def implausible_combs(limits: np.void, memory: np.void, residual_m: NDArray[np.f
     return combs
 
 
-@njit(cache=True, error_model="numpy")
+@kernel
 def _check_frames(limits: np.void, memory: np.void, obs: np.void) -> int:
     status = obs["sense_status"]
     leak = limits["frame_leak_ticks"]
@@ -274,7 +274,7 @@ def _check_frames(limits: np.void, memory: np.void, obs: np.void) -> int:
     return trips
 
 
-@njit(cache=True, error_model="numpy")
+@kernel
 def _check_channels(limits: np.void, memory: np.void, obs: np.void) -> int:
     """Range and frozen, per comb; only a usable frame is evidence, for or against."""
     trips: int = 0
@@ -293,7 +293,7 @@ def _check_channels(limits: np.void, memory: np.void, obs: np.void) -> int:
     return trips
 
 
-@njit(cache=True, error_model="numpy")
+@kernel
 def _check_residuals(limits: np.void, memory: np.void, obs: np.void) -> int:
     """Whose strokes have been implausible too often. One comb alone: something is wrong with that comb. Several: the
     stage has moved, along the axes that the innovation shows.
@@ -318,7 +318,7 @@ def _check_residuals(limits: np.void, memory: np.void, obs: np.void) -> int:
     return axes
 
 
-@njit(cache=True, error_model="numpy")
+@kernel
 def _check_forces(limits: np.void, memory: np.void, obs: np.void) -> int:
     """Whose force is not that of its voltage: by too much altogether, or by too much of what has changed of late.
 
@@ -342,7 +342,7 @@ def _check_forces(limits: np.void, memory: np.void, obs: np.void) -> int:
     return trips
 
 
-@njit(cache=True, error_model="numpy")
+@kernel
 def _check_loop(limits: np.void, memory: np.void, obs: np.void) -> int:
     """What has a meaning only while the loop is closed."""
     trips: int = 0
@@ -362,7 +362,7 @@ def _check_loop(limits: np.void, memory: np.void, obs: np.void) -> int:
     return trips | _check_forces(limits, memory, obs) | _check_residuals(limits, memory, obs)
 
 
-@njit(cache=True, error_model="numpy")
+@kernel
 def check(limits: np.void, memory: np.void, obs: np.void) -> int:
     """Trip bits of this tick; 0 when all is well. Call once per tick, in every mode.
 

@@ -9,8 +9,9 @@ from enum import IntEnum
 from typing import Final
 
 import numpy as np
-from numba import njit
 from numpy.typing import NDArray
+
+from pkxyz_ctrl.compiled.kernel import kernel
 
 _UPLOAD: Final = 0x40
 _UPLOAD_SEGMENT, _UPLOAD_SEGMENT_TOGGLED = 0x60, 0x70
@@ -127,7 +128,7 @@ _COMMAND, _BEHIND, _UNLISTED, _SIZE, _VALUE = (
 )
 
 
-@njit(cache=True, error_model="numpy")
+@kernel
 def is_read(word: int) -> bool:
     """Whether eight bytes are an upload request, the request of a further segment, or an abort; padding must be 0."""
     command = word & 0xFF
@@ -138,14 +139,14 @@ def is_read(word: int) -> bool:
     return command == _ABORT
 
 
-@njit(cache=True, error_model="numpy")
+@kernel
 def size_of(word: int) -> int:
     """Bytes of an expedited download that says its size; 0 for any other request: nothing else is let through."""
     command = word & 0xFF
     return 4 - (command >> 2 & 3) if command & 0xF3 == 0x23 else 0
 
 
-@njit(cache=True, error_model="numpy")
+@kernel
 def rule_of(word: int) -> int:
     """Place in ``WRITE_RULES`` of the rule for the object that a request names; -1: there is none."""
     index, subindex = word >> 8 & 0xFFFF, word >> 24 & 0xFF
@@ -156,7 +157,7 @@ def rule_of(word: int) -> int:
     return -1
 
 
-@njit(cache=True, error_model="numpy")
+@kernel
 def write_refusal(limits: np.void, word: int) -> int:
     """Why the eight bytes are not a permitted write, a ``WriteReason``; 0 if they are. ``limits`` of ``WRITES``."""
     size, value = size_of(word), word >> 32 & 0xFFFFFFFF
@@ -173,7 +174,7 @@ def write_refusal(limits: np.void, word: int) -> int:
     return 0 if _accepts(limits, rule, word >> 8 & 0xFFFF, word >> 24 & 0xFF, value) else _VALUE
 
 
-@njit(cache=True, error_model="numpy")
+@kernel
 def _accepts(limits: np.void, rule: np.void, index: int, subindex: int, value: int) -> bool:
     kind = rule["value"]
     if kind == _BETWEEN:
@@ -202,20 +203,20 @@ def _accepts(limits: np.void, rule: np.void, index: int, subindex: int, value: i
     return value == rule["low"] and _is_channel(limits, subindex)
 
 
-@njit(cache=True, error_model="numpy")
+@kernel
 def _is_own(cob_id: int, node_id: int) -> bool:
     """Of the node's four TPDOs."""
     base = cob_id - node_id
     return _FIRST_TPDO_ID <= base <= _LAST_TPDO_ID and (base - _FIRST_TPDO_ID) % _PDO_STEP == 0
 
 
-@njit(cache=True, error_model="numpy")
+@kernel
 def _is_channel(limits: np.void, subindex: int) -> bool:
     channel = limits["drive_channel"]
     return subindex == channel[0] or subindex == channel[1] or subindex == channel[2]
 
 
-@njit(cache=True, error_model="numpy")
+@kernel
 def _is_drive_field(limits: np.void, value: int) -> bool:
     """All that a PDO may write: three counts, alive counter, CRC. Never 0x6444, 0x2010 or 0x1016."""
     if value == 0 or value == 0x2000_0108 or value == 0x2000_0208:

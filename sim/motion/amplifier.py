@@ -9,12 +9,12 @@ switch every channel is  V(t) = base + slope t + error exp(-t / tau),  with slop
 import math
 
 import numpy as np
-from numba import njit
 
 from sim.motion.geometry import strokes
+from sim.motion.kernel import kernel
 
 
-@njit(cache=True)
+@kernel
 def drive(params: np.ndarray, state: np.ndarray, counts: np.ndarray) -> None:
     """Put ``counts`` (3,) integers on the converters now."""
     p = params[0]
@@ -25,7 +25,7 @@ def drive(params: np.ndarray, state: np.ndarray, counts: np.ndarray) -> None:
         s["target_v"][i] = coarse * p["volt_per_count"][i] + p["amplifier_offset_v"][i]
 
 
-@njit(cache=True, error_model="numpy")
+@kernel
 def plan(p: np.void, s: np.void, remaining_s: float) -> float:
     """Set base, slope and error of all channels from now on; returns how long they hold, s, at most ``remaining_s``."""
     tau = p["amplifier_s"]
@@ -50,7 +50,7 @@ def plan(p: np.void, s: np.void, remaining_s: float) -> float:
     return duration
 
 
-@njit(cache=True, error_model="numpy")
+@kernel
 def pass_time(s: np.void, h_s: float, decay: float) -> None:
     """Move the channels on by h_s, over which the exponential falls by the factor ``decay``."""
     for i in range(3):
@@ -59,7 +59,7 @@ def pass_time(s: np.void, h_s: float, decay: float) -> None:
         s["voltage_v"][i] = s["base_v"][i] + s["error_v"][i]
 
 
-@njit(cache=True, error_model="numpy")
+@kernel
 def charge(p: np.void, s: np.void, dt_s: float) -> None:
     """Dielectric charging over dt_s: the opposing voltage relaxes towards its share of the comb's voltage at the end
     of the step."""
@@ -69,7 +69,7 @@ def charge(p: np.void, s: np.void, dt_s: float) -> None:
         s["charge_v"][i] = goal + (s["charge_v"][i] - goal) * kept
 
 
-@njit(cache=True, error_model="numpy")
+@kernel
 def snapped(p: np.void, s: np.void) -> int:
     """Look for lateral pull-in; snapped fingers short their comb and hold the slider. Returns the chain or -1."""
     strokes(p, s["motion"], s["strokes_m"])
@@ -82,7 +82,7 @@ def snapped(p: np.void, s: np.void) -> int:
     return -1
 
 
-@njit(cache=True)
+@kernel
 def snap(s: np.void, i: int) -> None:
     """The fingers of chain i come together at its stroke s["strokes_m"]: shorted and held."""
     s["held"][i] = 1

@@ -14,7 +14,8 @@ Frame: origin of the table at rest, z up; e_i at 90, 210, 330 degrees, n_i = e_i
 import math
 
 import numpy as np
-from numba import njit
+
+from sim.motion.kernel import kernel
 
 HALF_ROOT3 = math.sqrt(3.0) / 2.0
 E_X = (0.0, -HALF_ROOT3, HALF_ROOT3)
@@ -26,13 +27,13 @@ STRAIGHT = 0.01
 """A link or crank is never taken shorter than this share of itself across its line: keeps numbers finite in a wreck."""
 
 
-@njit(cache=True)
+@kernel
 def leg(length_m: float, across_m: float) -> float:
     """Length of the other leg of a right triangle with hypotenuse ``length_m``."""
     return math.sqrt(max(length_m * length_m - across_m * across_m, (STRAIGHT * length_m) ** 2))
 
 
-@njit(cache=True, error_model="numpy")
+@kernel
 def lift(p: np.void, z_m: float) -> tuple[float, float, float]:
     """For a table z_m above rest: link height, its projection, and how far that has drawn the pins outward, m."""
     height_m = p["height_rest_m"] + z_m
@@ -40,7 +41,7 @@ def lift(p: np.void, z_m: float) -> tuple[float, float, float]:
     return height_m, projection_m, p["projection_rest_m"] - projection_m
 
 
-@njit(cache=True, error_model="numpy")
+@kernel
 def strokes(p: np.void, motion: np.ndarray, out_m: np.ndarray) -> None:
     """Strokes (3,) of the sliders from rest, positive inward, for the pose in motion[:3]."""
     _, _, drawn_m = lift(p, motion[2])
@@ -50,7 +51,7 @@ def strokes(p: np.void, motion: np.ndarray, out_m: np.ndarray) -> None:
         out_m[i] = u + drawn_m + p["crank_m"] - leg(p["crank_m"], w)
 
 
-@njit(cache=True, error_model="numpy")
+@kernel
 def stroke_rates(p: np.void, motion: np.ndarray, out_m_per_s: np.ndarray) -> None:
     """Rates (3,) of the strokes for pose and velocity in motion (6,)."""
     height_m, projection_m, _ = lift(p, motion[2])

@@ -17,9 +17,9 @@ Damping. From the start of a step, y = y_0 + exp(-D t / 2) u takes the velocity 
 import math
 
 import numpy as np
-from numba import njit
 
 from sim.motion.amplifier import pass_time
+from sim.motion.kernel import kernel
 from sim.motion.mechanics import comb_acceleration, undamped_acceleration
 from sim.motion.nystrom import B_RATE, STAGES, A, B, C
 
@@ -32,7 +32,7 @@ LAST = STAGES - 1
 """Stage at the end of the step."""
 
 
-@njit(cache=True, error_model="numpy")
+@kernel
 def tabulate(p: np.void, s: np.void, h: float) -> None:
     """E, exp(-D t / 2) and exp(D t / 2) at the stages of a step of h s, the last of
     which lies at its end. Kept until h changes."""
@@ -46,7 +46,7 @@ def tabulate(p: np.void, s: np.void, h: float) -> None:
         _exponentials(p["damping_per_s"], 0.5 * t, s["shrink"][i], s["swell"][i])
 
 
-@njit(cache=True, error_model="numpy")
+@kernel
 def _exponentials(d: np.ndarray, t: float, shrink: np.ndarray, swell: np.ndarray) -> None:
     """exp(-d t) and exp(d t) of a (3, 3) for |d t| well below 1, by their series, column by column."""
     for j in range(3):
@@ -68,7 +68,7 @@ def _exponentials(d: np.ndarray, t: float, shrink: np.ndarray, swell: np.ndarray
             shrink[2, j], swell[2, j] = shrink[2, j] + sign * c, swell[2, j] + c
 
 
-@njit(cache=True, error_model="numpy")
+@kernel
 def times(m: np.ndarray, x: float, y: float, z: float) -> tuple[float, float, float]:
     """m (3, 3) times a vector."""
     return (
@@ -78,7 +78,7 @@ def times(m: np.ndarray, x: float, y: float, z: float) -> tuple[float, float, fl
     )
 
 
-@njit(cache=True, error_model="numpy")
+@kernel
 def _transient(p: np.void, s: np.void) -> None:
     """Amplitudes (3,) of a transient at the pose where the step starts: of xi, s["fast_1_m"] and s["fast_2_m"], and of
     -(xi'' + D xi'), s["fast_1_m_per_s2"] and s["fast_2_m_per_s2"]. Zero if no channel is in one."""
@@ -101,7 +101,7 @@ def _transient(p: np.void, s: np.void) -> None:
     two_push[0], two_push[1], two_push[2] = times(p["response_2"], ax, ay, az)
 
 
-@njit(cache=True, error_model="numpy")
+@kernel
 def _weighted(slopes: np.ndarray, weights: np.ndarray, n: int) -> tuple[float, float, float]:
     """Sum of the first n rows of ``slopes`` (8, 3), each times its weight."""
     x, y, z = 0.0, 0.0, 0.0
@@ -113,7 +113,7 @@ def _weighted(slopes: np.ndarray, weights: np.ndarray, n: int) -> tuple[float, f
     return x, y, z
 
 
-@njit(cache=True, error_model="numpy")
+@kernel
 def _step(p: np.void, s: np.void, h: float) -> None:
     """Integrate motion and voltages over h s, without a look at stops."""
     tabulate(p, s, h)
@@ -160,7 +160,7 @@ def _step(p: np.void, s: np.void, h: float) -> None:
     pass_time(s, h, e1)
 
 
-@njit(cache=True, error_model="numpy")
+@kernel
 def step(p: np.void, s: np.void, h: float) -> None:
     """Integrate motion and voltages over h s, at most LONGEST_S. If any stage met a
     stop, the step is done again in short ones."""

@@ -11,12 +11,12 @@ energy is half of that times the square."""
 import math
 
 import numpy as np
-from numba import njit
 
 from sim.motion.geometry import E_X, E_Y, N_X, N_Y, leg, lift
+from sim.motion.kernel import kernel
 
 
-@njit(cache=True)
+@kernel
 def arcsine(y: float) -> float:
     """asin(y); near zero by its series, which is exact to rounding below 0.1 and cheaper than the library."""
     if abs(y) > 0.1:
@@ -26,14 +26,14 @@ def arcsine(y: float) -> float:
     return y * (1.0 + s * (1.0 / 6.0 + s * (3.0 / 40.0 + s * (15.0 / 336.0 + s * tail))))
 
 
-@njit(cache=True, error_model="numpy")
+@kernel
 def elevation_change(p: np.void, height_m: float, projection_m: float) -> float:
     """alpha - alpha_0, rad: the sine of the difference from the two legs now and at rest."""
     cross = height_m * p["projection_rest_m"] - projection_m * p["height_rest_m"]
     return float(arcsine(cross * p["per_link2"]))
 
 
-@njit(cache=True, error_model="numpy")
+@kernel
 def energy(p: np.void, motion: np.ndarray) -> float:
     """Elastic energy of the pose motion[:3], J."""
     height_m, projection_m, drawn_m = lift(p, motion[2])
@@ -46,7 +46,7 @@ def energy(p: np.void, motion: np.ndarray) -> float:
     return float(total)
 
 
-@njit(cache=True, error_model="numpy")
+@kernel
 def acceleration(
     p: np.void, s: np.void, volt2: np.ndarray, x: float, y: float, z: float, vx: float, vy: float, vz: float
 ) -> tuple[float, float, float]:
@@ -59,7 +59,7 @@ def acceleration(
     return ax, ay, az
 
 
-@njit(cache=True, error_model="numpy")
+@kernel
 def undamped_acceleration(
     p: np.void, s: np.void, volt2: np.ndarray, x: float, y: float, z: float, vx: float, vy: float, vz: float
 ) -> tuple[float, float, float]:
@@ -99,7 +99,7 @@ def undamped_acceleration(
     return fx * per_kg, fy * per_kg, fz * per_kg
 
 
-@njit(cache=True, error_model="numpy")
+@kernel
 def comb_acceleration(p: np.void, volt2: np.ndarray, x: float, y: float, z: float) -> tuple[float, float, float]:
     """The combs' own part of ``undamped_acceleration``, which is linear in ``volt2``."""
     height_m, projection_m, drawn_m = lift(p, z)
@@ -116,7 +116,7 @@ def comb_acceleration(p: np.void, volt2: np.ndarray, x: float, y: float, z: floa
     return fx * per_kg, fy * per_kg, combs * (height_m / projection_m + p["levitation"]) * per_kg
 
 
-@njit(cache=True)
+@kernel
 def _stop_force(p: np.void, s: np.void, i: int, q: float, rate: float) -> float:
     """Force of stops on slider i, N, positive inward: Hunt-Crossley k d (1 + c d'), which never pulls. Snapped
     fingers hold the slider with the same stiffness, both ways, near critically damped."""
@@ -133,7 +133,7 @@ def _stop_force(p: np.void, s: np.void, i: int, q: float, rate: float) -> float:
     return force
 
 
-@njit(cache=True, error_model="numpy")
+@kernel
 def stiffness(p: np.void, x: float, y: float, z: float) -> tuple[float, float, float, float, float, float]:
     """Hessian of the elastic energy at a pose, N/m: (k_xx, k_xy, k_xz, k_yy, k_yz, k_zz)."""
     height_m, projection_m, drawn_m = lift(p, z)

@@ -6,7 +6,8 @@ normal deviates by Marsaglia's polar method."""
 import math
 
 import numpy as np
-from numba import njit
+
+from sim.motion.kernel import kernel
 
 LOW_63 = np.uint64(0x7FFFFFFFFFFFFFFF)
 TOP_BIT = np.uint64(0x8000000000000000)
@@ -23,13 +24,13 @@ def stream(seed: int, source: int, offset: int) -> np.ndarray:
     return np.asarray(words, dtype=np.uint64)
 
 
-@njit(cache=True)
+@kernel
 def _add(a: np.uint64, b: np.uint64) -> np.uint64:
     """a + b modulo 2^64, without a carry out of 64 bits: interpreted NumPy scalars would warn of it."""
     return ((a & LOW_63) + (b & LOW_63)) ^ ((a ^ b) & TOP_BIT)
 
 
-@njit(cache=True)
+@kernel
 def next_u64(words: np.ndarray) -> np.uint64:
     """Next 64 random bits; ``words`` (4,) uint64 is the generator's memory."""
     a, b, c, counter = words[0], words[1], words[2], words[3]
@@ -41,13 +42,13 @@ def next_u64(words: np.ndarray) -> np.uint64:
     return out
 
 
-@njit(cache=True)
+@kernel
 def _uniform(words: np.ndarray) -> float:
     """Uniform on (-1, 1), 53 bits."""
     return float(np.int64(next_u64(words) >> ELEVEN) * 2.0**-52 - 1.0)
 
 
-@njit(cache=True, error_model="numpy")
+@kernel
 def normal(words: np.ndarray, spare: np.ndarray) -> float:
     """Standard normal deviate. Each accepted pair yields two: the second waits in
     ``spare`` (2,): [is there one, its value]."""
@@ -67,7 +68,7 @@ def normal(words: np.ndarray, spare: np.ndarray) -> float:
     return float(u * scale)
 
 
-@njit(cache=True, error_model="numpy")
+@kernel
 def total(values: np.ndarray) -> float:
     """Sum of (n,). numpy's own would bring its library along wherever this is loaded."""
     value = 0.0

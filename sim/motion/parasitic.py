@@ -8,12 +8,12 @@ side is a0 + a1 t + a2 t^2 + b1 E + b2 E^2, E = exp(-t / tau), whose response is
 import math
 
 import numpy as np
-from numba import njit
 
 from sim.motion.geometry import strokes
+from sim.motion.kernel import kernel
 
 
-@njit(cache=True, error_model="numpy")
+@kernel
 def parasitic_step(p: np.void, s: np.void, h: float) -> None:
     """Move the mode on by h s under the channels' base, slope and error; call before the rigid step."""
     strokes(p, s["motion"], s["strokes_m"])

@@ -13,17 +13,17 @@ taken out in the same way; steps are shorter, for the fastest mode."""
 import math
 
 import numpy as np
-from numba import njit
 
 from sim.motion.amplifier import pass_time
 from sim.motion.geometry import E_X, E_Y, N_X, N_Y, leg, lift
 from sim.motion.integrator import CONTACT_S, LAST, tabulate, times
+from sim.motion.kernel import kernel
 from sim.motion.layout import CUBIC, MODES
 from sim.motion.mechanics import comb_acceleration, undamped_acceleration
 from sim.motion.nystrom import B_RATE, STAGES, A, B, C
 
 
-@njit(cache=True, error_model="numpy")
+@kernel
 def cubic(coefficients: np.ndarray, j: int, t: float) -> float:
     """Value at t s of column j of coefficients (4, 3)."""
     value = 0.0
@@ -32,7 +32,7 @@ def cubic(coefficients: np.ndarray, j: int, t: float) -> float:
     return value
 
 
-@njit(cache=True, error_model="numpy")
+@kernel
 def _comb_forces(p: np.void, volt2: np.ndarray, x: float, y: float, z: float, out_n: np.ndarray) -> None:
     """Forces (3,) of the drive combs, N, with the mechanism at a pose."""
     _, _, drawn_m = lift(p, z)
@@ -42,7 +42,7 @@ def _comb_forces(p: np.void, volt2: np.ndarray, x: float, y: float, z: float, ou
         out_n[i] = p["force_gain_n_per_v2"][i] * (1.0 + p["fringe_per_m"] * q) * volt2[i]
 
 
-@njit(cache=True, error_model="numpy")
+@kernel
 def _generalise(p: np.void, forces_n: np.ndarray, ax: float, ay: float, az: float, modes: int, out: np.ndarray) -> None:
     """Accelerations (3 + modes,) from the mechanism's, P / m, and from the comb forces,
     without the modes' own springs."""
@@ -55,7 +55,7 @@ def _generalise(p: np.void, forces_n: np.ndarray, ax: float, ay: float, az: floa
         out[3 + k] = push * p["mode_per_kg"][k]
 
 
-@njit(cache=True, error_model="numpy")
+@kernel
 def accelerations(p: np.void, s: np.void, t: float, volt2: np.ndarray, out: np.ndarray) -> None:
     """z'' (3 + modes,) without damping at s["z_at"], s["rate_at"], t s into the call, with squared voltages (3,)."""
     z, rate, modes = s["z_at"], s["rate_at"], p["mode_count"]
@@ -77,7 +77,7 @@ def accelerations(p: np.void, s: np.void, t: float, volt2: np.ndarray, out: np.n
         out[j] += p["per_kg"] * s["steady_n"][j] - cubic(s["shake_m_per_s2"], j, t)
 
 
-@njit(cache=True, error_model="numpy")
+@kernel
 def _tabulate_modes(p: np.void, s: np.void, h: float) -> None:
     """exp(-d t / 2) of each mode at the stages of a step of h s; kept until h changes."""
     if s["mode_h_s"] == h:
@@ -88,7 +88,7 @@ def _tabulate_modes(p: np.void, s: np.void, h: float) -> None:
             s["mode_shrink"][i, k] = math.exp(-0.5 * p["mode_damping_per_s"][k] * C[i] * h)
 
 
-@njit(cache=True, error_model="numpy")
+@kernel
 def _answer(response: np.ndarray, vector: np.ndarray, n: int, out: np.ndarray) -> None:
     for j in range(n):
         out[j] = 0.0
@@ -96,7 +96,7 @@ def _answer(response: np.ndarray, vector: np.ndarray, n: int, out: np.ndarray) -
             out[j] += response[j, k] * vector[k]
 
 
-@njit(cache=True, error_model="numpy")
+@kernel
 def _transient(p: np.void, s: np.void, n: int) -> None:
     """As in ``sim.motion.integrator``, of all coordinates: s["general_one"], s["general_two"] and what they push."""
     error, pose, pull = s["error_v"], s["pose"], s["pull"]
@@ -124,7 +124,7 @@ def _transient(p: np.void, s: np.void, n: int) -> None:
     _answer(p["general_response_2"], pull, n, s["general_two_push"])
 
 
-@njit(cache=True, error_model="numpy")
+@kernel
 def _shrunk(m: np.ndarray, modes: np.ndarray, vector: np.ndarray, n: int, out: np.ndarray) -> None:
     """A table's matrix (3, 3) and the modes' factors times a vector (n,)."""
     out[0], out[1], out[2] = times(m, vector[0], vector[1], vector[2])
@@ -132,7 +132,7 @@ def _shrunk(m: np.ndarray, modes: np.ndarray, vector: np.ndarray, n: int, out: n
         out[3 + k] = modes[k] * vector[3 + k]
 
 
-@njit(cache=True, error_model="numpy")
+@kernel
 def _voltages(s: np.void, t: float, since_s: float, e1: float) -> None:
     """s["volt2"] (3,) t s into the step, which is ``since_s`` into the call."""
     for c in range(3):
@@ -141,7 +141,7 @@ def _voltages(s: np.void, t: float, since_s: float, e1: float) -> None:
         s["volt2"][c] = volt * volt * s["comb_rise"][c] if s["held"][c] == 0 else 0.0
 
 
-@njit(cache=True, error_model="numpy")
+@kernel
 def _step(p: np.void, s: np.void, h: float) -> None:
     """Integrate motion, modes and voltages over h s, without a look at stops."""
     n = 3 + p["mode_count"]
@@ -190,7 +190,7 @@ def _step(p: np.void, s: np.void, h: float) -> None:
     _end(p, s, h, n)
 
 
-@njit(cache=True, error_model="numpy")
+@kernel
 def _end(p: np.void, s: np.void, h: float, n: int) -> None:
     """From the stages to motion, modes and voltages at the step's end."""
     z, v, at, rate, u, slopes = s["z"], s["rate"], s["z_at"], s["rate_at"], s["change"], s["general_slopes"]
@@ -222,7 +222,7 @@ def _end(p: np.void, s: np.void, h: float, n: int) -> None:
     pass_time(s, h, e1)
 
 
-@njit(cache=True, error_model="numpy")
+@kernel
 def general_step(p: np.void, s: np.void, h: float) -> None:
     """Integrate motion, modes and voltages over h s, at most p["longest_s"]. If any stage met a stop, the step is done
     again in short ones."""

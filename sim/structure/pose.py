@@ -4,12 +4,12 @@ mechanism = table - sum_j table_shape_j r_j,    strokes seen = q(mechanism) + su
 point of interest = table + tilt_shift table"""
 
 import numpy as np
-from numba import njit
 
 from sim.motion.geometry import stroke_rates, strokes
+from sim.motion.kernel import kernel
 
 
-@njit(cache=True, error_model="numpy")
+@kernel
 def mechanism(p: np.void, s: np.void, out: np.ndarray) -> None:
     """Pose and velocity (6,) of the rigid mechanism."""
     for j in range(6):
@@ -20,7 +20,7 @@ def mechanism(p: np.void, s: np.void, out: np.ndarray) -> None:
             out[3 + j] -= p["mode_table"][k, j] * s["modes"][1, k]
 
 
-@njit(cache=True, error_model="numpy")
+@kernel
 def combs_seen(p: np.void, s: np.void, out_m: np.ndarray, out_m_per_s: np.ndarray) -> None:
     """Strokes and rates (3,) of the sense combs, of whichever modes the plant has."""
     if p["mode_count"] > 0:
@@ -40,7 +40,7 @@ def combs_seen(p: np.void, s: np.void, out_m: np.ndarray, out_m_per_s: np.ndarra
             out_m_per_s[i] += p["parasitic_comb"][i] * s["parasitic"][1]
 
 
-@njit(cache=True, error_model="numpy")
+@kernel
 def stand(p: np.void, s: np.void, out_m: np.ndarray) -> None:
     """Position (3,) of the point of interest from rest, m."""
     for j in range(3):

@@ -10,12 +10,12 @@ The lateral mode lies far above a hundred kilohertz, so the balance is kept at e
 method from y = 0 climbs to the smallest root, and where K - F' loses its sign before, there is none."""
 
 import numpy as np
-from numba import njit
 
 from sim.motion.geometry import strokes
+from sim.motion.kernel import kernel
 
 
-@njit(cache=True, error_model="numpy")
+@kernel
 def balance(p: np.void, s: np.void) -> int:
     """Set how far each chain's fingers bend, s["aside_m"] (3,), and what their force rises by, s["comb_rise"] (3,), for
     voltages and strokes now. Returns a chain that has no balance, or -1."""
@@ -38,7 +38,7 @@ def balance(p: np.void, s: np.void) -> int:
     return loose
 
 
-@njit(cache=True, error_model="numpy")
+@kernel
 def _aside(offset_m: float, push: float, gap_m: float, lateral_n_per_m: float) -> float:
     """Bending y >= 0, m, of fingers ``offset_m`` >= 0 aside; -1 where they snap."""
     y = 0.0

@@ -8,8 +8,8 @@ within a call. Lines are cubics through value and rate at both ends."""
 import math
 
 import numpy as np
-from numba import njit
 
+from sim.motion.kernel import kernel
 from sim.motion.layout import (
     AMPLIFIER_FLICKER_STREAM,
     AMPLIFIER_STREAM,
@@ -22,7 +22,7 @@ from sim.motion.noise import normal, total
 from sim.surroundings.tones import sum_tones, turn_tones
 
 
-@njit(cache=True, error_model="numpy")
+@kernel
 def _add_white(p_density: float, h: float, words: np.ndarray, spare: np.ndarray, out: np.ndarray, j: int) -> None:
     """Add a draw of white noise over h s to column j of coefficients (4, 3)."""
     size = p_density * math.sqrt(0.5 / h)
@@ -34,7 +34,7 @@ def _add_white(p_density: float, h: float, words: np.ndarray, spare: np.ndarray,
     out[2, j] += 6.0 * a2 / (h * h)
 
 
-@njit(cache=True, error_model="numpy")
+@kernel
 def _add_between(f0: float, r0: float, f1: float, r1: float, h: float, out: np.ndarray, j: int) -> None:
     """Add the cubic through value and rate at 0 and at h to column j."""
     out[0, j] += f0
@@ -43,7 +43,7 @@ def _add_between(f0: float, r0: float, f1: float, r1: float, h: float, out: np.n
     out[3, j] += (2.0 * (f0 - f1) / h + r0 + r1) / (h * h)
 
 
-@njit(cache=True, error_model="numpy")
+@kernel
 def relax(rates_per_s: np.ndarray, h: float, words: np.ndarray, spare: np.ndarray, out: np.ndarray) -> None:
     """Move relaxations (3, FLICKERS) of unit deviation on over h s."""
     for k in range(FLICKERS):
@@ -53,7 +53,7 @@ def relax(rates_per_s: np.ndarray, h: float, words: np.ndarray, spare: np.ndarra
             out[i, k] = out[i, k] * kept + fresh * normal(words, spare)
 
 
-@njit(cache=True, error_model="numpy")
+@kernel
 def surround(p: np.void, s: np.void, dt_us: int) -> None:
     """Draw and lay out what the coming call of ``dt_us`` will see, in s["shake_m_per_s2"] and s["ripple_v"] (4, 3)."""
     h = 1e-6 * dt_us
@@ -90,7 +90,7 @@ def surround(p: np.void, s: np.void, dt_us: int) -> None:
         relax(p["sense_flicker_per_s"], h, words, spare, s["sense_flicker"])
 
 
-@njit(cache=True, error_model="numpy")
+@kernel
 def _add_half(sums: np.ndarray, h: float, shake: np.ndarray, ripple: np.ndarray, j: int, at: float) -> None:
     """Add what the lines' value and rate at one end of the call, 0 or h, contribute to the cubic between the ends."""
     if at == 0.0:

@@ -4,10 +4,11 @@ into the record of parameters once a call."""
 import math
 
 import numpy as np
-from numba import njit
+
+from sim.motion.kernel import kernel
 
 
-@njit(cache=True, error_model="numpy")
+@kernel
 def grow_old(p: np.void, t_us: int) -> None:
     """Set stiffness and gains of ``p`` to those at t_us, from what was drawn. Damping stays what it was."""
     t = 1e-6 * t_us

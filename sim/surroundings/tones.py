@@ -3,10 +3,11 @@
 import math
 
 import numpy as np
-from numba import njit
+
+from sim.motion.kernel import kernel
 
 
-@njit(cache=True, error_model="numpy")
+@kernel
 def turn_tones(p: np.void, s: np.void, dt_us: int) -> None:
     """Turn all phasors on by dt_us."""
     turn, phase = s["tone_turn"], s["tone_phase"]
@@ -22,7 +23,7 @@ def turn_tones(p: np.void, s: np.void, dt_us: int) -> None:
             phase[k, j, 0], phase[k, j, 1] = a * c - b * q, b * c + a * q
 
 
-@njit(cache=True, error_model="numpy")
+@kernel
 def sum_tones(p: np.void, s: np.void) -> None:
     """s["tone_sum"] (2, 2, 3): base acceleration and ripple, each value and rate, by axis or channel."""
     out, phase = s["tone_sum"], s["tone_phase"]
@@ -37,7 +38,7 @@ def sum_tones(p: np.void, s: np.void) -> None:
         out[0, 0, j], out[0, 1, j], out[1, 0, j], out[1, 1, j] = shake, shake_rate, ripple, ripple_rate
 
 
-@njit(cache=True, error_model="numpy")
+@kernel
 def hum(p: np.void, s: np.void, channel: int) -> float:
     """What the lines show in a sense channel now, F."""
     total = 0.0

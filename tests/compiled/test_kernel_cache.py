@@ -193,6 +193,6 @@ def test_every_module_of_the_harness_has_the_cache_chosen_before_its_kernels() -
         first = ours.search(text)
         early = (
             first is not None
-            and first.start() < (re.search(r"^from sim\b|^import sim\b|@njit", text, re.M) or first).end()
+            and first.start() < (re.search(r"^from sim\b|^import sim\b|@njit|@kernel", text, re.M) or first).end()
         )
         assert early or packages & {path.parent, path.parent.parent}, path

@@ -37,7 +37,7 @@ HOUSE: Mapping[str, Room] = MappingProxyType({
     "pkxyz_ctrl.can": Room(("pkxyz_ctrl.compiled",), ("pydantic", "operator", "numpy", "numba", *VALUES)),
     "pkxyz_ctrl.safety": Room(("pkxyz_ctrl.compiled", "pkxyz_ctrl.can"), ("numpy", "numba", *VALUES)),
     "pkxyz_ctrl.config": Room(("pkxyz_ctrl.can", "pkxyz_ctrl.safety")),
-    "pkxyz_ctrl.core": Room(("pkxyz_ctrl.config",), NUMBERS),
+    "pkxyz_ctrl.core": Room(("pkxyz_ctrl.compiled", "pkxyz_ctrl.config"), NUMBERS),
     "pkxyz_ctrl.io": Room(("pkxyz_ctrl.can", "pkxyz_ctrl.config")),
     "pkxyz_ctrl.loop": Room(
         ("pkxyz_ctrl.can", "pkxyz_ctrl.safety", "pkxyz_ctrl.compiled", "pkxyz_ctrl.config", "pkxyz_ctrl.core")
@@ -70,7 +70,7 @@ HOUSE: Mapping[str, Room] = MappingProxyType({
     )),
     # the harness: what the controller meets
     "hil.bus": Room(("pkxyz_ctrl.can", "pkxyz_ctrl.compiled", "pkxyz_ctrl.io", "pkxyz_ctrl")),
-    "hil.node": Room(("pkxyz_ctrl.can", "pkxyz_ctrl.config", "pkxyz_ctrl")),
+    "hil.node": Room(("pkxyz_ctrl.can", "pkxyz_ctrl.compiled", "pkxyz_ctrl.config", "pkxyz_ctrl")),
     "hil.plant": Room(("sim.motion", "sim.structure", "sim", "pkxyz_ctrl.compiled", "pkxyz_ctrl.loop", "pkxyz_ctrl")),
     "hil.recording": Room(("pkxyz_ctrl.can", "pkxyz_ctrl.loop", "hil.bus")),
     "hil.faults": Room((

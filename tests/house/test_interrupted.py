@@ -43,7 +43,7 @@ def test_ctrl_c_while_it_starts_is_one_word(tmp_path, words, after_s):
     Python drops an interrupt that meets it in a finaliser or a callback of C: whoever presses once more is heard.
     """
     code, stdout, stderr = _interrupted(tmp_path, words, after_s)
-    if code == 0 and stderr == "":
+    if code == 0 and (stderr == "" or "Exception ignored in" in stderr):
         code, stdout, stderr = _interrupted(tmp_path, words, after_s)
     if words[0] == "replay" and code == 2:
         assert stderr.count("\n") == 1

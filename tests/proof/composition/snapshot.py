@@ -79,7 +79,7 @@ CONSTANT = {
     "_emergency_id", "_node_heartbeat_id", "_flags_sent", "period_us", "_heartbeat_period_us", "_node_timeout_us",
     "_node_period_us", "_drive_timeout_syncs", "node_id", "_protection", "_boot_us", "turnaround_us", "_length",
     "_protected", "_limit", "config", "_config", "_heartbeat", "can", "law", "row", "_consumers", "_plant",
-    "_settings",
+    "_settings", "_ours",
 }  # fmt: skip
 
 RECORDS = {"AmplifierDriver", "TransmitGate", "SenseInput"}
