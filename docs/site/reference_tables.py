@@ -40,7 +40,7 @@ EXPLORED = {
     "whole dialogue": "one, with all SDO steps of the start-up",
     "outputs": "one, with digital outputs",
     "signature": "one, with the node's signature",
-    "outputs, two losses": "two lost frames, with digital outputs",
+    "outputs, two": "two of any kind, without cuts, with digital outputs",
     "outputs and signature": "one, with both",
 }
 """The configurations that are explored, and what may go wrong in each."""

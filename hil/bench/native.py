@@ -6,8 +6,11 @@ import tempfile
 from pathlib import Path
 from typing import NamedTuple
 
+import numpy as np
+
 from hil.bench.rigs.figure import Figure
 from hil.bench.rigs.running import running
+from hil.bench.rigs.waking_send import waking_sends_us
 from hil.native.program import compiled
 from hil.recording.recording import Recording
 from hil.runs.at_rate import RanAtRate, run_into
@@ -54,7 +57,12 @@ def native() -> list[Figure]:
                     if beside is not None and (histogram := read_cyclictest(beside.communicate()[0])) is not None:
                         bare.append(histogram)
     python, by_native = _seen(ran["python"]), _seen(ran["native"])
-    return [*_answers(python, by_native), _missed(python, by_native), *_lateness(by_native, bare)]
+    return [
+        *_answers(python, by_native),
+        _over_send(by_native),
+        _missed(python, by_native),
+        *_lateness(by_native, bare),
+    ]
 
 
 def given_up(run: RunFolder) -> int:
@@ -70,6 +78,13 @@ def _answers(python: _Seen, by_native: _Seen) -> list[Figure]:
         ratio = of_native / max(1, of_python)
         figures.append(Figure(f"native.answer_{name}", ratio, "x", target, "at most", detail=detail))
     return figures
+
+
+def _over_send(by_native: _Seen) -> Figure:
+    """Beside what the kernel takes for one datagram that wakes the plant's process, which each answer sends."""
+    answer_us, send_us = percentile_us(by_native.answer_us, 0.5), float(np.median(waking_sends_us()))
+    detail = f"the native loop's answer in the middle over a bare send to a process that sleeps: {send_us:.1f} us"
+    return Figure("native.answer_over_send", answer_us / send_us, "x", detail=detail)
 
 
 def _missed(python: _Seen, by_native: _Seen) -> Figure:

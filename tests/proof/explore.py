@@ -43,7 +43,7 @@ IN_CI = tuple(
     if found["complete"] and not CONFIGURATIONS[name].by_hand
 )
 """What was explored to the fixed point once, and left its figures: ``--figures tests/proof/explored.json``. Others take
-longer than a change should have to wait: ``EXPLORED=three`` by hand.
+longer than a change should have to wait: ``explore.py "outputs, two"`` by hand.
 """
 
 

@@ -89,9 +89,7 @@ CONFIGURATIONS: Final = {
         Configuration("well", 0, kinds=frozenset()),
         Configuration("one", 1),
         Configuration("two", 2),
-        Configuration("three", 3, kinds=ANY, by_hand=True),
-        Configuration("three losses", 3, kinds=frozenset({"lose"})),
-        Configuration("a cut and a loss", 2, kinds=frozenset({"lose", "cut"})),
+        Configuration("three", 3, kinds=ANY),
         Configuration(
             "slow drive time-out", 1, drive_timeout_syncs=5, drive_timeout_ms=90, settle_ticks=6, agree_ticks=6
         ),
@@ -100,11 +98,8 @@ CONFIGURATIONS: Final = {
         Configuration("outputs", 1, levels=FEW, outputs=BITS),
         Configuration("signature, well", 0, kinds=frozenset(), levels=FEW, has_signature=True, whole_dialogue=True),
         Configuration("signature", 1, levels=FEW, has_signature=True, whole_dialogue=True),
-        Configuration(
-            "outputs and signature", 1, levels=FEW, outputs=BITS, has_signature=True, whole_dialogue=True, by_hand=True
-        ),
+        Configuration("outputs and signature", 1, levels=FEW, outputs=BITS, has_signature=True, whole_dialogue=True),
         Configuration("outputs, two", 2, kinds=ANY, levels=FEW, outputs=BITS, by_hand=True),
-        Configuration("outputs, two losses", 2, kinds=frozenset({"lose"}), levels=FEW, outputs=BITS, by_hand=True),
     )
 }
 """Every kind of fault; what it costs decides how many at a time. ``late`` covers
