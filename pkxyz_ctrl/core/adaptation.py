@@ -45,6 +45,10 @@ LEAST_LOSS = 0.1
 """By how much, in variances of the noise, innovations have to be worse with the base before something has changed."""
 _MOST_SPARED = 0.5  # of a comb's pull: one that has become stronger is told as at most twice as strong
 _PARAMETERS, _CAUSES = np.int32(PARAMETERS), np.int32(CAUSES)  # a processor of 32 bits counts these for less
+_FLOOR_N = 1e-100
+"""Added to each force of an error: at rest some are 0, U would fall below the normal numbers within a second and stay
+there, and a PC takes three times as long for a tick with those.
+"""
 AGES = 2
 """Intervals that are remembered: two periods of delay."""
 
@@ -152,7 +156,7 @@ def learn(
                 moved += u[s, p] * change[p]
             filtered[3 * s + i] += moved
         for p in range(_PARAMETERS):
-            x, v, d, f = u[0, p], u[1, p], u[2, p], force[p]
+            x, v, d, f = u[0, p], u[1, p], u[2, p], force[p] + _FLOOR_N
             u[0, p] = phi[0, 0] * x + phi[0, 1] * v + phi[0, 2] * d - gamma[0] * f
             u[1, p] = phi[1, 0] * x + phi[1, 1] * v + phi[1, 2] * d - gamma[1] * f
 

@@ -40,9 +40,10 @@ def lower(kernels: Kernels, target: Target) -> Lowered:
     machine = target.machine
     text = _prepared(kernels, target, machine)
     public = {entry.name for entry in entries_for(has_loop=target.has_loop)}
-    module = _optimised(text, machine, public)
+    module = _optimised(text, machine, public, is_small=not target.is_hosted)
     if not target.is_wide:
-        module = _optimised(_without_wide_divisions(_without_wide_conversions(str(module))), machine, public)
+        narrow = _without_wide_divisions(_without_wide_conversions(str(module)))
+        module = _optimised(narrow, machine, public, is_small=not target.is_hosted)
     _name_plainly(module, kernels)
     if not target.is_hosted:
         module = _with_memory_functions(module, target, machine)
@@ -130,16 +131,18 @@ def _handed(argument: Argument) -> tuple[list[str], str, list[str]]:
     return taken, before, handed
 
 
-def _optimised(text: str, machine: llvm.TargetMachine, public: set[str]) -> llvm.ModuleRef:
-    """The module with nothing left that no entry calls, and nothing vectorised: order of operations is the source's."""
+def _optimised(text: str, machine: llvm.TargetMachine, public: set[str], *, is_small: bool) -> llvm.ModuleRef:
+    """The module with nothing left that no entry calls, and nothing vectorised: order of operations is the source's.
+    ``is_small``: as small as speed where it counts allows.
+    """
     module = llvm.parse_assembly(text)
     module.verify()
     for function in module.functions:
         if not function.is_declaration:
             function.linkage = "external" if function.name in public else "internal"
-            if not _IN_A_HURRY.search(function.name) or _SELDOM.search(function.name):
+            if is_small and (not _IN_A_HURRY.search(function.name) or _SELDOM.search(function.name)):
                 function.add_function_attribute("optsize")
-            if _APART.search(function.name):
+            if is_small and _APART.search(function.name):
                 function.add_function_attribute("noinline")
     for variable in module.global_variables:
         if not variable.is_declaration:
