@@ -45,12 +45,8 @@ LEAST_LOSS = 0.1
 """By how much, in variances of the noise, innovations have to be worse with the base before something has changed."""
 _MOST_SPARED = 0.5  # of a comb's pull: one that has become stronger is told as at most twice as strong
 _PARAMETERS, _CAUSES = np.int32(PARAMETERS), np.int32(CAUSES)  # a processor of 32 bits counts these for less
-_FLOOR_N = 1e-100
-"""Added to each force of an error: at rest some are 0, U would fall below the normal numbers within a second and stay
-there, and a PC takes three times as long for a tick with those.
-"""
-AGES = 2
-"""Intervals that are remembered: two periods of delay."""
+_FLOOR_N = 1e-100  # in each force: else what is at rest falls below the normal numbers, and a PC slows down fivefold
+AGES = 2  # intervals that are remembered: two periods of delay
 
 ADAPTATION = np.dtype(
     [

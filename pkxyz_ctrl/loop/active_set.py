@@ -18,9 +18,8 @@ It begins anew at each problem: the answer depends on the problem alone.
 import math
 
 import numpy as np
+from numba import njit
 from numpy.typing import NDArray
-
-from pkxyz_ctrl.compiled.kernel import kernel
 
 Array = NDArray[np.float64]
 
@@ -50,7 +49,7 @@ def work(unknowns: int, limits: int) -> Work:
     return np.zeros(limits), np.zeros(limits), np.zeros(most), np.zeros(most), np.zeros((most, most)), held
 
 
-@kernel
+@njit(cache=True, error_model="numpy")
 def solve(between: Array, memory: Work, q: Array, lower: Array, upper: Array, rounds_max: int, v: Array) -> int:
     """Put the solution into v, of the length of q, and return how many rounds it took, one more than limits were taken
     in or let go; or ``TOO_LONG`` or ``IMPOSSIBLE``, v unchanged. ``lower`` and ``upper`` (m,), one not above the other.
@@ -92,7 +91,7 @@ def solve(between: Array, memory: Work, q: Array, lower: Array, upper: Array, ro
     return TOO_LONG
 
 
-@kernel
+@njit(cache=True, error_model="numpy")
 def _values_without_limits(between: Array, q: Array, value: Array) -> None:
     value[:] = 0.0
     n = len(q)
@@ -106,7 +105,7 @@ def _values_without_limits(between: Array, q: Array, value: Array) -> None:
             value[i] -= q[j] * between[j, i]
 
 
-@kernel
+@njit(cache=True, error_model="numpy")
 def _released(row: Array, inverse: Array, held: NDArray[np.int64], count: int, out: Array) -> None:
     """By which the multipliers of those held fall while that of the limit of this ``row`` of M grows."""
     for j in range(count):
@@ -123,7 +122,7 @@ def _released(row: Array, inverse: Array, held: NDArray[np.int64], count: int, o
             out[j] += p * a[j]
 
 
-@kernel
+@njit(cache=True, error_model="numpy")
 def _take_off(between: Array, held: NDArray[np.int64], shares: Array, count: int, out: Array) -> None:
     """Less the rows of M of those held times their shares; four at once, in the order of one after the other."""
     fours = count - count % 4
@@ -138,7 +137,7 @@ def _take_off(between: Array, held: NDArray[np.int64], shares: Array, count: int
             out[i] -= p * a[i]
 
 
-@kernel
+@njit(cache=True, error_model="numpy")
 def _passed_most(value: Array, lower: Array, upper: Array, by: Array) -> int:
     """The limit that A v (m,) passes by most; -1 if it keeps all. ``by`` (m,): by how much each is, afterwards."""
     for i in range(len(value)):
@@ -151,7 +150,7 @@ def _passed_most(value: Array, lower: Array, upper: Array, by: Array) -> int:
     return passed
 
 
-@kernel
+@njit(cache=True, error_model="numpy")
 def _first_released(multiplier: Array, release: Array, sign: float, count: int) -> tuple[int, float]:
     """Which of the held limits holds nothing back any more first, and after how far; -1 and infinity if none ever."""
     first, far = -1, math.inf
@@ -162,7 +161,7 @@ def _first_released(multiplier: Array, release: Array, sign: float, count: int) 
     return first, far
 
 
-@kernel
+@njit(cache=True, error_model="numpy")
 def _border(inverse: Array, release: Array, own: float, count: int) -> None:
     """The inverse of one row and column more."""
     for j in range(count):
@@ -173,7 +172,7 @@ def _border(inverse: Array, release: Array, own: float, count: int) -> None:
     inverse[count, count] = 1.0 / own
 
 
-@kernel
+@njit(cache=True, error_model="numpy")
 def _let_go(inverse: Array, k: int, last: int) -> None:
     """The inverse without row and column k, whose place the last one takes."""
     for i in range(last + 1):
