@@ -1,7 +1,6 @@
 """How what runs in a tick is compiled: kept between runs, IEEE 754 as it stands, and with no heap.
 
-Without numba's runtime nothing counts references to arrays, which takes a tenth of a tick;
-and a kernel that takes memory does not compile.
+Without numba's runtime nothing counts references to arrays; and a kernel that takes memory does not compile.
 """
 
 from numba import njit

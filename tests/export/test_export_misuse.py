@@ -23,7 +23,7 @@ from pkxyz_ctrl.loop.reference import REFERENCE
         (("--controller", "mpc"), "controller 'mpc' solves a problem in the middle of a tick"),
         (("--controller", "nope"), "nope"),
         (("--ticks", "10"), "ticks"),
-        (("--target", "cortex-m4"), "a period of 200 us is too short for cortex-m4, where the longest tick takes 3700"),
+        (("--target", "cortex-m4"), "a period of 200 us is too short for cortex-m4, where the longest tick takes 3750"),
         (("--controller", "robust_20k", "--bus", "local_20k", "--target", "host"), "bus 'local_20k' has no [can]"),
         (("--controller", "robust_20k", "--bus", "local_20k"), "give a bus of 93 us or more, or another target"),
     ],

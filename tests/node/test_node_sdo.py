@@ -5,7 +5,7 @@ import struct
 import canopen
 import pytest
 from canopen.objectdictionary import ODVariable, datatypes
-from node_rig import EDS, NODE_ID, Rig, master
+from node_rig import EDS, NODE_ID, Rig, master, operational
 
 TOGGLE, COMMAND, MEMORY = 0x05030000, 0x05040001, 0x05040005
 WRITE_ONLY, READ_ONLY, NO_OBJECT = 0x06010001, 0x06010002, 0x06020000
@@ -338,6 +338,14 @@ def test_inputs_can_be_read_before_the_start() -> None:
     t_us = rig.now_us
     assert node.sdo[0x6401][1].raw == t_us % 32768
     assert rig.plant.sampled_us == [t_us]
+
+
+def test_counter_and_crc_of_the_last_sense_frame_are_read_as_they_were_sent() -> None:
+    rig = operational()
+    rig.cycle((0, 0, 0))
+    sent = rig.of(0x28A)[-1]
+    assert [rig.read(0x2001, 1), rig.read(0x2001, 2)] == list(sent[6:8])
+    assert any(sent[6:8])
 
 
 def test_identity_can_be_made_another_and_survives_a_reset() -> None:
