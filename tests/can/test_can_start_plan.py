@@ -214,6 +214,12 @@ def test_another_signature_is_not_relied_on() -> None:
     assert [words[: len(SIGNATURE_LOST)] for words in plan.lost] == [SIGNATURE_LOST]
 
 
+def test_what_a_node_lacks_is_not_signed() -> None:
+    held = whole(**ALL) | {(0x1019, 0): None}
+    assert not [words for words in planned(held | {(0x2020, 1): signed(held)}, **ALL).lost if SIGNATURE_LOST in words]
+    assert [words for words in planned(held, **ALL).lost if SIGNATURE_LOST in words], "of all of it"
+
+
 def test_of_whatever_is_signed_each_byte_counts() -> None:
     for setting in table(DriverConfig()):
         if setting.part >= start_plan.COB_ID:

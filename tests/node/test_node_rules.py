@@ -339,5 +339,7 @@ def test_a_stopped_node_takes_heartbeats_and_leaves_nmt_to_itself() -> None:
     assert not rules.on_frame_stopped(node, memory, 0, 2, 1, T_US)
     assert rules.on_frame_stopped(node, memory, CONTROLLER, 1, 5, T_US)
     assert memory["consumer_us"] == T_US + 50_000
+    assert not rules.on_frame_stopped(node, memory, CONTROLLER, 1, 0, T_US + 1), "it has restarted: the node's own"
+    assert memory["consumer_us"] == T_US + 50_000
     memory["consumer_us"] = rules.NEVER_US  # it was missed, and has come again
     assert not rules.on_frame_stopped(node, memory, CONTROLLER, 1, 5, T_US)

@@ -42,24 +42,12 @@ MODULES = (
     "hil.node.rules",
 )
 TESTS = (
-    "tests/safety/test_safety_gate.py",
-    "tests/safety/test_safety_gate_traffic.py",
-    "tests/safety/test_safety_gate_reasons.py",
-    "tests/safety/test_safety_modes.py",
-    "tests/safety/test_safety_misfit.py",
-    "tests/safety/test_safety_monitors.py",
-    "tests/safety/test_safety_pinned.py",
+    *(f"tests/safety/test_safety_{part}.py" for part in ("misfit", "modes", "monitors", "pinned")),
+    *(f"tests/safety/test_safety_gate{part}.py" for part in ("", "_reasons", "_traffic")),
+    "tests/safety/test_output_frames.py",
     "tests/safety/test_process_frames.py",
     "tests/can",
-    "tests/node/test_node_emergency.py",
-    "tests/node/test_node_heartbeat.py",
-    "tests/node/test_node_nmt.py",
-    "tests/node/test_node_pdo.py",
-    "tests/node/test_node_release.py",
-    "tests/node/test_node_sdo.py",
-    "tests/node/test_node_sync.py",
-    "tests/node/test_node_conditions.py",
-    "tests/node/test_node_rules.py",
+    "tests/node",
     "tests/proof/test_mode_machine.py",
 )
 REASONS = Path(__file__).with_name("uncovered.json")

@@ -284,3 +284,11 @@ def test_only_a_reason_of_a_mode_names_a_kind_of_frame() -> None:
 
 def test_a_payload_of_full_negative_bytes_is_looked_at_like_any_other() -> None:
     assert "has a wrong CRC, 0xFF" in (reason(of(0x30A, bytes(7) + b"\xff")) or "")
+
+
+def test_words_of_a_latched_gate_by_one_that_did_not_see_what_latched_it() -> None:
+    """As beside a loop in another process, whose earlier words are not here."""
+    told = TransmitGate(CONFIG).blocked(
+        drive(5, 0, 0, 1), Mode.TRACKING, Reason.LATCHED, holding((0, 0, 0)).memory[0], T_US
+    )
+    assert told.endswith("blocked in TRACKING: the gate is latched")
