@@ -36,7 +36,7 @@ from pkxyz_ctrl.client.stage import AsyncStage, connect_async
 
 ROUNDS, SENDERS, NOT_READING, STRANGERS = 5, 8, 12, 40
 FREE = ("stop", "release")  # need no control, and do what they say
-MEMORY_MORE_MB, SOME_TICKS = 200.0, 20
+MEMORY_MORE_MB, SOME_TICKS = 200.0, 10  # of some 20 000 in a round
 REPORT = Path(__file__).with_suffix(".json")
 NAME = f"hostile-{os.getpid()}"
 BARE, ENDLESS = "--bare", 1 << 60
