@@ -1,6 +1,8 @@
 """Clocks at the machine's pace. Lateness belongs to the machine: what is asserted is what the clock itself decides."""
 
+import os
 import time
+from pathlib import Path
 
 import pytest
 from hypothesis import given, settings
@@ -178,9 +180,24 @@ def test_percentile_is_the_least_lateness_that_covers_its_share(values, share):
     assert sum(value <= found - 1 for value in values) < share * len(values)
 
 
+def _open_files() -> list[str]:
+    """Of this process, by name."""
+    here = Path("/proc/self/fd")
+    return [os.readlink(here / number) for number in os.listdir(here) if (here / number).is_symlink()]
+
+
+def test_no_core_sleeps_while_a_loop_is_real_time():
+    """Linux takes the wish back with the file: it must be open until then, and be opened once."""
+    try:
+        words = [go_real_time(), go_real_time()]
+        kept = [name for name in _open_files() if name.endswith("cpu_dma_latency")]
+        assert len(kept) == sum("cores awake" in line.partition("not permitted")[0] for line in words[:1])
+    finally:
+        leave_real_time()
+
+
 def test_real_time_says_in_one_line_what_it_got_and_leaves_no_trace():
     import gc
-    import os
 
     before = os.sched_getscheduler(0)
     try:
@@ -196,6 +213,9 @@ def test_real_time_says_in_one_line_what_it_got_and_leaves_no_trace():
     assert ("SCHED_FIFO" in have) == got_fifo
     assert ("SCHED_FIFO" in lack) == (not got_fifo)
     assert ("memory" in have) != ("memory" in lack)
+    assert ("cores awake" in have) == os.access("/dev/cpu_dma_latency", os.W_OK)
+    assert ("cores awake" in lack) != ("cores awake" in have)
+    assert not [name for name in _open_files() if name.endswith("cpu_dma_latency")]
     assert os.sched_getscheduler(0) == before == os.SCHED_OTHER
     assert gc.isenabled()
     assert gc.get_freeze_count() == 0
@@ -203,7 +223,6 @@ def test_real_time_says_in_one_line_what_it_got_and_leaves_no_trace():
 
 def test_without_permission_each_thing_that_lacks_is_named():
     """In a process without privileges, with no allowance for locked memory and priorities."""
-    import os
     import subprocess
     import sys
 
@@ -218,4 +237,5 @@ def test_without_permission_each_thing_that_lacks_is_named():
     assert done.returncode == 0, done.stderr
     assert "not permitted: SCHED_FIFO (needs CAP_SYS_NICE" in done.stdout
     assert "locked memory (" in done.stdout
+    assert "cores awake (" in done.stdout
     assert len(done.stdout.splitlines()) == 1
