@@ -79,7 +79,8 @@ def real_time() -> Finding:
     if "not permitted" not in words:
         return Finding("real-time rights", "good", words)
     remedy = (
-        r"printf '%s - rtprio 95\n%s - memlock unlimited\n' $USER $USER | sudo tee /etc/security/limits.d/pkxyz.conf"
+        r"printf '%s - rtprio 95\n%s - memlock unlimited\n' $USER $USER | sudo tee /etc/security/limits.d/pkxyz.conf; "
+        r"""echo "KERNEL==\"cpu_dma_latency\", OWNER=\"$USER\"" | sudo tee /etc/udev/rules.d/99-pkxyz.rules"""
     )
     return Finding("real-time rights", "could be better", words, f"{remedy}  # and log in again")
 

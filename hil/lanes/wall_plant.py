@@ -23,7 +23,8 @@ from pkxyz_ctrl.can import cob_id
 from pkxyz_ctrl.can.codec import Counts
 from pkxyz_ctrl.config.bus import CanConfig
 from pkxyz_ctrl.io.can_port import CanPort
-from pkxyz_ctrl.io.clocks import WallClock
+from pkxyz_ctrl.io.clocks import SPIN_US, WallClock
+from pkxyz_ctrl.io.realtime import cores
 from pkxyz_ctrl.loop.row import TRUTH_FIELDS
 from sim.plant import Plant
 
@@ -71,7 +72,8 @@ class WallPlant:
         self.wall = WallClock()
         self.clock = Lockstep()
         self.plant = PlantOnBus(setup.new_plant()) if truth is None else WitnessedPlant(setup.new_plant(), truth)
-        self._port = CanPort(bus, self.wall)
+        spin_us = SPIN_US if cores() > 1 else 0  # or who sends voltages would have to wake us
+        self._port = CanPort(bus, self.wall, spin_us)
         self.node = wired_node(can_config, self.clock, self._port.send, self.plant, switch=self.plant.switch)
         self._time = AmplifierTime(setup.bus.period_us, can_config.standstill_max_us)
         self._on_change = on_change

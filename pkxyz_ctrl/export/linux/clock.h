@@ -16,6 +16,14 @@ void clock_wait_until(int64_t t_us);
 void clock_stand_at(int64_t t_us);
 int64_t clock_stood_us(void); /* in all */
 
+/* When does the kernel do what it does a hundred or a thousand times a second? It takes some 20 us of a virtual core, and
+   a loop whose period divides that time meets it every time at the same place: at 5 kHz in every fiftieth tick. Takes
+   some of these times to find out. */
+void clock_find_kernel(void);
+
+/* The first instant from t_us on for which that is late_us, of period_us, past it; t_us where they do not go together. */
+int64_t clock_beside_kernel(int64_t t_us, int64_t period_us, int64_t late_us);
+
 /* One more of time_us in a histogram by whole us, whose last entry has all beyond. */
 static inline void clock_count(int64_t *histogram, int64_t size, int64_t time_us)
 {

@@ -34,6 +34,13 @@ void controller_warm_up(void)
     }
 }
 
+void controller_rehearse(const pkxyz_reference *rows, int32_t count)
+{
+    int64_t told;
+    warm = *memory;
+    pkxyz_period(config, &warm, rows, count, 0, &told);
+}
+
 int controller_mode(void)
 {
     return memory->cycle->mode;

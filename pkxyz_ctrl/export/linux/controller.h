@@ -24,6 +24,8 @@ void controller_start(int64_t t_us);
 int controller_come_up(const frame *came, int64_t t_us);
 
 void controller_sync(int64_t t_us);
+void controller_rehearse(const pkxyz_reference *rows, int32_t count); /* while the sample is on its way: the caches then hold
+                                                                         what the answer to it takes */
 int controller_take(const frame *came, int64_t t_us); /* 1 once this period's sense values are in */
 void controller_compute(const pkxyz_reference *rows, int32_t count, int32_t overrun);
 void controller_finish(int64_t t_us, int64_t heartbeat_until_us);

@@ -14,6 +14,7 @@
 #include "ticks.h"
 
 enum { POLL_US = 1000, LANDED_TICKS = 2, LOOK_US = 20000, LAST_FRAMES_US = 20000, STANDS_US = 100 };
+enum { KERNEL_EIGHTHS = 5 }; /* of a period: what it does then delays neither an answer nor what comes next */
 enum { UNPOLLED_MOST_US = 20000 }; /* of a start-up in which frame after frame comes, none of them the one awaited */
 
 /* Until somebody else is on the bus, where that is known: a plant that was begun in the same moment takes a while. */
@@ -87,6 +88,7 @@ static void exchange(const pkxyz_shared_settings *settings, const pkxyz_referenc
                      int32_t overrun)
 {
     controller_sync(t_us);
+    controller_rehearse(rows, rows_count);
     await(settings, t_us + settings->sense_deadline_us);
     if (settings->is_operated) {
         orders_await();
@@ -107,7 +109,7 @@ static int run(pkxyz_shared *shared)
     const pkxyz_reference *rows = &still;
     const int64_t period_us = settings->period_us, ticks = settings->ticks + settings->landing_ticks + LANDED_TICKS;
     int32_t rows_count = 1;
-    int64_t t_us = clock_now_us() + period_us;
+    int64_t t_us = clock_beside_kernel(clock_now_us() + period_us, period_us, period_us * KERNEL_EIGHTHS / 8);
     for (int64_t tick = 0; tick < ticks; tick++, t_us += period_us) {
         if (!settings->is_operated && !path_at(memory->cycle->reference_tick, &rows, &rows_count))
             ending_ask(PKXYZ_OUTCOME_PATH_LATE);
@@ -142,6 +144,7 @@ int loop(pkxyz_shared *shared)
     int outcome = ending_asked();
     if (outcome != 0)
         return outcome;
+    clock_find_kernel();
     go_real_time(settings->priority, (char *)state->real_time, sizeof state->real_time);
     controller_warm_up();
     state->phase = PKXYZ_PHASE_STARTING;

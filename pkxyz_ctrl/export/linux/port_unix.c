@@ -26,9 +26,11 @@ typedef struct {
     uint8_t bytes[LONGEST];
 } datagram;
 
-/* Another participant, and what waits for room in its queue. */
+/* Another participant, and what waits for room in its queue. Connected, a send does without a walk along its path, which
+   takes as long as all the rest of it. */
 typedef struct {
     struct sockaddr_un address;
+    int descriptor; /* -1: not connected */
     int first, waiting;
     datagram queue[WAITING_MOST];
     int is_there; /* a mark while the folder is listed */
@@ -65,6 +67,7 @@ static void list_folder(void)
                 continue;
             if (known == others_count) {
                 others[known].address = address;
+                others[known].descriptor = -1;
                 others[known].waiting = others[known].first = 0;
                 others_count++;
             }
@@ -75,8 +78,16 @@ static void list_folder(void)
         close(opened);
 }
 
+static void disconnect(participant *other)
+{
+    if (other->descriptor >= 0)
+        close(other->descriptor);
+    other->descriptor = -1;
+}
+
 static void forget(int number)
 {
+    disconnect(&others[number]);
     waiting_in_all -= others[number].waiting;
     others_count--;
     if (number != others_count)
@@ -89,7 +100,8 @@ static void look(void)
     struct stat found;
     struct timespec now;
     if (stat(folder, &found) != 0) {
-        others_count = waiting_in_all = 0;
+        while (others_count)
+            forget(others_count - 1);
         return;
     }
     const int64_t changed_ns = (int64_t)found.st_mtim.tv_sec * 1000000000 + found.st_mtim.tv_nsec;
@@ -179,12 +191,31 @@ static int unpack(const uint8_t *bytes, long size, frame *taken)
     return 1;
 }
 
-/* Sends to one other: 0; EAGAIN if its queue is full; ENOENT if it is gone, which is as good as sent; or an errno. */
-static int reach(const participant *other, const datagram *sent)
+static int is_connected(participant *other)
 {
     const struct sockaddr *address = (const struct sockaddr *)&other->address;
-    if (sendto(descriptor, sent->bytes, sent->length, 0, address, sizeof other->address) >= 0)
+    if (other->descriptor < 0) {
+        other->descriptor = socket(AF_UNIX, SOCK_DGRAM | SOCK_NONBLOCK | SOCK_CLOEXEC, 0);
+        if (other->descriptor >= 0 && connect(other->descriptor, address, sizeof other->address) != 0) {
+            const int refusal = errno;
+            disconnect(other);
+            errno = refusal;
+        }
+    }
+    return other->descriptor >= 0;
+}
+
+/* Sends to one other: 0; EAGAIN if its queue is full; ENOENT if it is gone, which is as good as sent; or an errno. */
+static int reach(participant *other, const datagram *sent)
+{
+    const int was_connected = other->descriptor >= 0;
+    if (is_connected(other) && send(other->descriptor, sent->bytes, sent->length, MSG_NOSIGNAL) >= 0)
         return 0;
+    if (was_connected && errno != EAGAIN) { /* another may be there by now under the same name */
+        disconnect(other);
+        if (is_connected(other) && send(other->descriptor, sent->bytes, sent->length, MSG_NOSIGNAL) >= 0)
+            return 0;
+    }
     switch (errno) {
     case EAGAIN:
         return EAGAIN;
@@ -304,6 +335,8 @@ static void close_bus(void)
         nanosleep(&moment, 0);
         hand_over();
     }
+    while (others_count)
+        forget(others_count - 1);
     close(descriptor);
     remove_socket(mine.sun_path);
     folder_close(folder, is_named);
