@@ -29,8 +29,8 @@ _OF_LATENESS = (
 class _Seen(NamedTuple):
     """Of one loop, all turns together."""
 
-    answer_us: list[int]
-    """by whole us from a sense frame read to the drive frame handed over"""
+    answer_us: list[list[int]]
+    """by whole us from a sense frame read to the drive frame handed over, by turn"""
     given_up: list[int]
     """ticks that the loop itself was too late for, by turn"""
     lateness_us: list[int]
@@ -64,11 +64,17 @@ def given_up(run: RunFolder) -> int:
 
 
 def _answers(python: _Seen, by_native: _Seen) -> list[Figure]:
+    """By the turn in the middle, as ``_missed``."""
     figures = []
     for share, name, target in ((0.5, "p50", 0.1), (0.999, "p99_9", 0.2)):
-        of_python, of_native = (percentile_us(seen.answer_us, share) for seen in (python, by_native))
-        detail = f"from a sense frame read to the drive frame handed over: {of_native} us, Python's loop {of_python}"
-        ratio = of_native / max(1, of_python)
+        of_python, of_native = (
+            [percentile_us(turn, share) for turn in seen.answer_us] for seen in (python, by_native)
+        )  # fmt: skip
+        detail = (
+            f"from a sense frame read to the drive frame handed over, us in {TURNS} turns: {_listed(of_native)}; "
+            f"Python's loop {_listed(of_python)}"
+        )
+        ratio = median(of_native) / max(1.0, median(of_python))
         figures.append(Figure(f"native.answer_{name}", ratio, "x", target, "at most", detail=detail))
     return figures
 
@@ -97,8 +103,8 @@ def _lateness(by_native: _Seen, bare: list[list[int]]) -> list[Figure]:
 
 
 def _seen(ran: list[tuple[RanAtRate, int]]) -> _Seen:
-    answers, lateness = _added([end.answer_us for end, _ in ran]), _added([end.lateness_us for end, _ in ran])
-    return _Seen(answers, [count for _, count in ran], lateness)
+    lateness = _added([end.lateness_us for end, _ in ran])
+    return _Seen([end.answer_us for end, _ in ran], [count for _, count in ran], lateness)
 
 
 def _added(histograms: list[list[int]]) -> list[int]:
