@@ -15,10 +15,12 @@ from pkxyz_ctrl.trajectory import Hold
 
 STROKES_M = np.full(3, 12.5e-6)
 HOLD_S = 1.0
+_HOLDS = 40
+"""Seeds: of one second the deviation is known to 3 %, of so many to 0.5 %."""
 
 
 def held_nm(controller: str, *, quiet: bool = False, shaken_m_per_s2: float = 0.0, quality: float | None = None) -> Any:
-    """(2, 3) in nm, of the true position in a hold of 1 s at mid-workspace: rms about the set-point, and deviation."""
+    """(2, 3) in nm, of the true position in holds of 1 s at mid-workspace: rms about the set-point, and deviation."""
     setup, _ = setup_of([Hold(kind="hold", duration_s=HOLD_S)], controller, "nominal", MIDDLE_M)
     config, plant = setup.controller, setup.plant
     if quiet and config.youla is not None:
@@ -28,8 +30,11 @@ def held_nm(controller: str, *, quiet: bool = False, shaken_m_per_s2: float = 0.
     if quality is not None:
         changed["damping"] = plant.damping.model_copy(update={"on": True, "quality_factor": quality})
     run = dataclasses.replace(setup, controller=config, plant=plant.model_copy(update=changed))
-    held = error_m(rows_of_setup(run))[-round((HOLD_S - 0.05) / run.bus.period_s) :]
-    return np.stack([np.sqrt(np.mean(held**2, axis=0)), held.std(axis=0)]) * 1e9
+    last, squares = round((HOLD_S - 0.05) / run.bus.period_s), np.zeros((2, 3))
+    for seed in range(1, _HOLDS + 1):
+        held = error_m(rows_of_setup(dataclasses.replace(run, seed=seed)))[-last:]
+        squares += np.stack([np.mean(held**2, axis=0), held.var(axis=0)])
+    return np.sqrt(squares / _HOLDS) * 1e9
 
 
 def shortest_step_s(way_m: float, band_m: float) -> float:
