@@ -91,7 +91,7 @@ class WireFaults:
                 if fault.at_us > 0:
                     self._node.power_on()
             case "wrong_configuration":
-                guest = self._plug_in(fault)
+                guest = self._plug_in(fault, lambda sent, t_us: self._clock.call_at(t_us, lambda: self._unplug(fault)))
                 guest.send(self._frame(0x600 + self._driver.node_id, _download(fault)))
             case "forged":
                 self._forgers[id(fault)] = Forger(
@@ -116,9 +116,7 @@ class WireFaults:
         forger = self._forgers.pop(id(fault), None)
         if forger is not None:
             forger.leave()
-        guest = self._guests.pop(id(fault), None)
-        if guest is not None:
-            guest.detach()
+        self._unplug(fault)
 
     def _install_identity(self, product_code: object) -> None:
         self._node.od.install(*_IDENTITY, product_code)  # type: ignore[arg-type]
@@ -134,6 +132,11 @@ class WireFaults:
         guest = self._wire.attach(f"guest {self._faults.index(fault)}", lambda frame, t_us: None, on_sent=on_sent)
         self._guests[id(fault)] = guest
         return guest
+
+    def _unplug(self, fault: Fault) -> None:
+        guest = self._guests.pop(id(fault), None)
+        if guest is not None:
+            guest.detach()
 
     def _babble(self, fault: Fault) -> None:
         frame = self._frame(round(fault["identifier"]), bytes(8))

@@ -87,13 +87,22 @@ class RecordingWriter:
         """
         if self._closed:
             return
+        self.leave()
+        if not self._failed:
+            recover(self.path, whole=whole)
+
+    def leave(self) -> None:
+        """Write what is buffered and leave the journal as it is: it opens, and says that it is not whole.
+
+        Raises ``RecordingError``.
+        """
+        if self._closed:
+            return
         self._closed = True
         try:
             self.flush()
         finally:
             self._journal.close()
-        if not self._failed:
-            recover(self.path, whole=whole)
 
     def __enter__(self) -> Self:
         return self
