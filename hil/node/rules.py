@@ -38,6 +38,9 @@ NODE = np.dtype(
         ("limit", "i4"),  # largest count
         ("step_max", "i4"),
         ("sync_overflow", "i4"),  # SYNCs count from 1 to this; 0: they don't
+        ("signature", "i4"),  # as it is now
+        ("signature_id", "i4"),
+        ("signature_every", "i4"),  # SYNCs
         ("turnaround_us", "i8"),
         ("drive_timeout_us", "i8"),
         ("beat_period_us", "i8"),
@@ -68,6 +71,7 @@ NODE_MEMORY = np.dtype(
         ("digital_pending", "i4"),  # ... and those that wait for the SYNC; -1: none
         ("served_key", "i4"),  # of the last object that was read; -1: none
         ("signature_left", "i4"),  # SYNCs until the signature is due; 0: never
+        ("signature_waits", "i4"),  # 1: it is due, and has not gone yet
     ],
     align=True,
 )
@@ -126,14 +130,12 @@ def on_drive(config: np.void, memory: np.void, length: int, word: int, t_us: int
 @kernel
 def on_sync(config: np.void, memory: np.void, length: int, word: int, t_us: int) -> bool:
     """A SYNC: what is pending becomes the output, and a sample is due. False, and nothing is done, for one that is out
-    of step, finds nothing pending, asks for the signature or would make too large a step.
+    of step, finds nothing pending or would make too large a step.
     """
     overflow, counter = config["sync_overflow"], word & 0xFF
     if length != (1 if overflow else 0) or counter != memory["sync_expected"]:
         return False
     if memory["is_pending"] == 0 or t_us >= memory["good_us"] or memory["due_us"] != NEVER_US:
-        return False
-    if memory["signature_left"] == 1:
         return False
     pending, output, step = memory["pending"], memory["output"], config["step_max"]
     if pending[0] != 0 or pending[1] != 0 or pending[2] != 0:
@@ -146,6 +148,8 @@ def on_sync(config: np.void, memory: np.void, length: int, word: int, t_us: int)
     memory["is_pending"] = 0
     if memory["signature_left"] > 0:
         memory["signature_left"] -= 1
+        if memory["signature_left"] == 0:
+            memory["signature_left"], memory["signature_waits"] = config["signature_every"], 1
     if memory["digital_pending"] >= 0:
         memory["digital"], memory["digital_pending"] = memory["digital_pending"], -1
     memory["drive_deadline_us"] = t_us + config["drive_timeout_us"]

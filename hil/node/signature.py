@@ -16,6 +16,9 @@ _OTHERS = (
     *((index, comb) for index in (0x6443, 0x6444) for comb in (1, 2, 3)),
 )  # fmt: skip
 
+SIGNED = frozenset({index for index, _ in _OTHERS} | {index + add for index in _PDOS for add in (0, _MAPPING_OFFSET)})
+"""Indices of the objects that are signed, or parts of them."""
+
 
 def signature(od: ObjectDictionary) -> int:
     """CRC-16-CCITT from 0xFFFF over index, sub-index and value of each object, little endian, in their order: of a
@@ -36,32 +39,33 @@ class SignatureTransmitter:
 
     def __init__(self, od: ObjectDictionary, parameters: PdoParameters, send: Callable[[int, bytes], None]) -> None:
         self._od, self._parameters, self._send = od, parameters, send
-        self._is_due = False
+        self.is_waiting = False
+        """whether it is due, and has not gone yet"""
         self.every = 0
         self.left = 0
         """SYNCs until the one at which it is due; 0: it is not sent"""
 
     @property
-    def is_waiting(self) -> bool:
-        """Whether it is due, and has not gone yet."""
-        return self._is_due
+    def cob_id(self) -> int:
+        """Of the frame that carries it."""
+        return self._parameters.cob_id
 
     def start(self) -> None:
         """The node has become operational."""
         parameters = self._parameters
         is_usual = parameters.in_use and parameters.layout().fields == (SIGNATURE,)
         self.every = parameters.transmission_type if is_usual and 1 <= parameters.transmission_type <= 240 else 0
-        self.left, self._is_due = self.every, False
+        self.left, self.is_waiting = self.every, False
 
     def on_sync(self) -> None:
         """One of the SYNCs that are counted."""
         if self.every:
             self.left -= 1
             if self.left == 0:
-                self.left, self._is_due = self.every, True
+                self.left, self.is_waiting = self.every, True
 
     def ride(self, has_heartbeat: bool) -> None:
         """A sense PDO has just been queued, with a heartbeat behind it or without."""
-        if self._is_due and not has_heartbeat:
-            self._is_due = False
+        if self.is_waiting and not has_heartbeat:
+            self.is_waiting = False
             self._send(self._parameters.cob_id, struct.pack("<H", signature(self._od)))

@@ -233,13 +233,18 @@ def look(lane: np.void, stage: Stage, now_us: int) -> None:
 
 @kernel
 def _answer(node: np.void, memory: np.void, wire: np.void, now_us: int) -> bool:
-    """The node's sense PDO, and its heartbeat behind it if the next one would be too late."""
+    """The node's sense PDO, and behind it its heartbeat if the next one would be too late, else the signature if it
+    waits.
+    """
     word, flags = rules.answer(node, memory), node["flags"]
     if not wire_rules.send(wire, AMPLIFIER, node["sense_id"], flags, rules.LENGTH, word, now_us):
         return False
-    if not rules.rides(node, memory, now_us):
+    if rules.rides(node, memory, now_us):
+        return bool(wire_rules.send(wire, AMPLIFIER, node["heartbeat_id"], flags, 1, rules.OPERATIONAL, now_us))
+    if memory["signature_waits"] == 0:
         return True
-    return bool(wire_rules.send(wire, AMPLIFIER, node["heartbeat_id"], flags, 1, rules.OPERATIONAL, now_us))
+    memory["signature_waits"] = 0
+    return bool(wire_rules.send(wire, AMPLIFIER, node["signature_id"], flags, 2, node["signature"], now_us))
 
 
 @kernel

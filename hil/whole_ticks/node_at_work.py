@@ -7,6 +7,7 @@ from hil.node.object_dictionary import Value
 from hil.node.objects import LOOKED_UP
 from hil.node.rules import NEVER_US, NODE, NODE_MEMORY, OBJECTS_MOST, UNKNOWN, crc_start
 from hil.node.sdo_server import SdoServer
+from hil.node.signature import SIGNED, signature
 
 _WATCHED_MOST = 1
 _SHORT, _SHORT_REPLY = 0xE2, 0x42  # of a reply's command: a value of four bytes at most
@@ -24,6 +25,8 @@ class NodeAtWork:
         self.record["request_id"], self.record["reply_id"] = 0x600 + node.node_id, 0x580 + node.node_id
         self.record["heartbeat_id"], self.record["flags"] = 0x700 + node.node_id, node._flags
         self._settings: tuple[int, ...] = ()  # those that ``record`` holds
+        self._signed = [e for e in node.od if e.index in SIGNED]
+        self._signed_values: list[Value | None] = []  # those of which ``record`` holds the signature
 
     def take(self) -> bool:
         """Read the node. False for one that does anything else than its daily work."""
@@ -37,12 +40,12 @@ class NodeAtWork:
             or not drive.is_usual
             or not sense.is_usual
             or not node.digital.is_usual
-            or node.signature.is_waiting
             or len(watched) > _WATCHED_MOST
             or node.emergency.is_waiting
         ):
             return False
         self._take_settings()
+        self._take_signature()
         errors = [e.quiet_from_us for e in (node._sync_errors, node._drive_errors) if e.present]
         m["good_us"] = min(errors, default=NEVER_US)
         m["drive_deadline_us"], m["beat_us"] = _time(node._drive_deadline.due_us), _time(node._heartbeat.alarm.due_us)
@@ -53,7 +56,8 @@ class NodeAtWork:
         m["drive_counter"], m["drive_crc"] = drive.counter, drive.crc
         m["sync_expected"] = node._sync_expected[0] if node._sync_expected else 0
         m["count"], m["sense_counter"], m["sense_crc"] = sense.counts, sense.counter, sense.crc
-        m["digital"], m["signature_left"] = node.digital.bits, node.signature.left
+        m["digital"] = node.digital.bits
+        m["signature_left"], m["signature_waits"] = node.signature.left, node.signature.is_waiting
         m["digital_pending"] = -1 if node.digital.pending is None else node.digital.pending
         return True
 
@@ -66,6 +70,7 @@ class NodeAtWork:
             next(iter(node.digital.receivers), -1), *(watched[-1] if watched else (-1, 0)),
             node._drive._limit, node._step_max, node.od[0x1019, 0],
             node._sense.turnaround_us, node._drive_timeout_us, node._heartbeat.beat_period_us,
+            node.signature.cob_id, node.signature.every,
         )  # fmt: skip
         if settings == self._settings:
             return
@@ -75,8 +80,16 @@ class NodeAtWork:
             c["output_id"], c["consumer_id"], c["consumer_time_us"],
             c["limit"], c["step_max"], c["sync_overflow"],
             c["turnaround_us"], c["drive_timeout_us"], c["beat_period_us"],
+            c["signature_id"], c["signature_every"],
         ) = settings  # fmt: skip
         c["drive_crc_start"], c["sense_crc_start"] = crc_start(int(c["drive_id"])), crc_start(int(c["sense_id"]))
+
+    def _take_signature(self) -> None:
+        """To sign takes longer than to see that nothing has changed."""
+        values: list[Value | None] = [entry.value for entry in self._signed]
+        if values != self._signed_values:
+            self._signed_values = values
+            self.record["signature"] = signature(self.node.od)
 
     def put(self) -> None:
         """What has become of the node's state; `take` had said yes."""
@@ -97,7 +110,8 @@ class NodeAtWork:
         a, b, c = m["count"].tolist()
         sense.counts = sense._sent = a, b, c
         sense.counter, sense.crc = int(m["sense_counter"]), int(m["sense_crc"])
-        digital, node.signature.left = int(m["digital_pending"]), int(m["signature_left"])
+        digital = int(m["digital_pending"])
+        node.signature.left, node.signature.is_waiting = int(m["signature_left"]), bool(m["signature_waits"])
         node.digital.bits = node.od[0x6200, 1] = int(m["digital"])
         node.digital.pending = None if digital < 0 else digital
 

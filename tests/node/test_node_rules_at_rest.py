@@ -142,9 +142,10 @@ def test_a_frame_with_digital_outputs_waits_for_the_sync(length: int, taken: boo
     assert (work.memory["digital"][0], work.memory["digital_pending"][0]) == (bits if taken else 3, -1)
 
 
-@pytest.mark.parametrize(("left", "taken", "after"), [(0, True, 0), (1, False, 1), (2, True, 1), (9, True, 8)])
-def test_the_sync_at_which_the_signature_is_due_is_the_nodes_own(left: int, taken: bool, after: int) -> None:
+@pytest.mark.parametrize(("left", "after", "waits"), [(0, 0, 0), (1, 240, 1), (2, 1, 0), (9, 8, 0)])
+def test_a_sync_counts_towards_the_signature_and_with_the_last_it_is_due(left: int, after: int, waits: int) -> None:
     """0: none is ever due."""
-    work = at_work(signature_left=left)
-    assert synced(work) == taken
-    assert work.memory["signature_left"][0] == after
+    work = at_work(signature_left=left, signature_waits=0)
+    work.record["signature_every"] = 240
+    assert synced(work)
+    assert (work.memory["signature_left"][0], work.memory["signature_waits"][0]) == (after, waits)
