@@ -238,13 +238,13 @@ def _far_jump() -> list[Figure]:
 
 def _mpc_ticks(repeats: int = 15) -> list[Figure]:
     """Ticks that solve a problem, and the solver beside OSQP: the least of several runs, as others only lengthen it."""
-    every, solved, posed, cycle = mpc_ticks_us(repeats)
+    every, solved, posed = mpc_ticks_us(repeats)
     detail = (
-        f"the {len(posed)} ticks of a far jump that solve a problem, each whole, Python included, the least of "
+        f"the {len(posed.works)} ticks of a far jump that solve a problem, each whole, Python included, the least of "
         f"{repeats} runs with the same bits: median {np.percentile(solved, 50):.0f} us, longest {solved.max():.0f} us; "
         f"all ticks: median {np.percentile(every, 50):.1f} us, p99 {np.percentile(every, 99):.0f} us"
     )
-    own, other = solver_us(cycle, posed, repeats), osqp_us(cycle, posed, repeats)
+    own, other = solver_us(posed, repeats), osqp_us(posed, repeats)
     beside = (
         f"OSQP's time for these problems to {TOLERANCE:g}, started from the one before, over ours for the exact "
         f"solution: medians {np.median(other):.0f} and {np.median(own):.1f} us, "

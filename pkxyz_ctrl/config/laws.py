@@ -103,7 +103,7 @@ class Mpc(FrozenModel):
     horizon: Annotated[int, Field(ge=10, le=20)] = 12
     """periods that are planned"""
     iterations_max: Annotated[int, Field(ge=1)] = 100
-    """rounds of the solver in one tick, one for each limit met or left; more, and the regulator answers, clipped"""
+    """rounds of the solver in one tick; where it needs more the regulator answers, clipped"""
     stroke_min_m: float
     """beyond which no plan goes, unless the reference does"""
     stroke_max_m: float

@@ -16,16 +16,19 @@ and of strokes become limits of v about those that the last plan leads to; from 
 """
 
 import math
+from typing import Final
 
 import numpy as np
-from numba import njit
 from numpy.typing import NDArray
 
+from pkxyz_ctrl.compiled.kernel import kernel
 from pkxyz_ctrl.core import feedback, kinematics
-from pkxyz_ctrl.core.elasticity import energy_gradient
-from pkxyz_ctrl.core.linear3 import inverse3, multiply3, multiply3_transposed
+from pkxyz_ctrl.core.elasticity import gradient_and_pulls
+from pkxyz_ctrl.core.linear3 import inverse3, multiply3_transposed
 
 Array = NDArray[np.float64]
+
+HORIZON_MOST: Final = 20
 
 PREDICTIVE = np.dtype(
     [
@@ -42,34 +45,97 @@ PREDICTIVE = np.dtype(
     align=True,
 )
 
+SCRATCH = np.dtype(
+    [
+        ("end", "f8", (6,)),
+        ("off", "f8", (3,)),
+        ("middle", "f8", (3,)),
+        ("force", "f8", (3,)),
+        ("pulls", "f8", (3, 3)),
+        ("inverse", "f8", (3, 3)),
+        ("seen", "f8", (6,)),
+        ("later", "f8", (6,)),
+    ],
+    align=True,
+)
+
+PLAN = np.dtype(
+    [
+        ("planned_n", "f8", (HORIZON_MOST, 3)),  # nu of the last plan: all that is kept from tick to tick
+        ("rows", "f8", (HORIZON_MOST + 2, 9)),  # of the reference, from the start of the first interval on
+        ("middle", "f8", (HORIZON_MOST, 9)),  # ... and in mid-interval
+        ("moving_n", "f8", (HORIZON_MOST, 3)),  # C r' + m r'' - d there
+        ("stroke_min_m", "f8", (HORIZON_MOST, 3)),  # limits at the ends of the intervals
+        ("stroke_max_m", "f8", (HORIZON_MOST, 3)),
+        ("error", "f8", (6,)),  # e at the start of the first interval
+        ("jump_m", "f8", (HORIZON_MOST, 3)),  # c
+        ("free_n", "f8", (HORIZON_MOST, 3)),  # nu of the plan without limits, and ...
+        ("free", "f8", (HORIZON_MOST + 1, 6)),  # ... the e to which it leads
+        ("along", "f8", (HORIZON_MOST + 1, 6)),  # e to which the last plan leads
+        ("comb_n", "f8", (HORIZON_MOST, 3)),  # comb forces F that a plan takes, and ...
+        ("stroke_m", "f8", (HORIZON_MOST, 3)),  # ... strokes at the ends of its intervals
+        ("about_n", "f8", (HORIZON_MOST, 3)),  # comb forces less v
+        ("first_n", "f8", (3,)),  # feed-forward at the platform in the first interval
+        ("first_pulls", "f8", (3, 3)),
+        ("scratch", SCRATCH),
+    ],
+    align=True,
+)
+"""What a plan is made of in a tick; of what is by intervals the first of the horizon."""
+
 NO_PLAN, FREE, LIMITED = 0, 1, 2
 """What there is: nothing; the plan without limits, which keeps them all and so is the solution; a problem to solve."""
 
-_JUMP_M = 2e-9  # smooth references miss their own polynomial by 0.1 nm where the jerk switches
+FORCE_UNIT_N: Final = 1e-4
+"""Unit of the problem's variables, and of strokes in it: numbers that a solver likes."""
+STROKE_UNIT_M: Final = 1e-6
+_JUMP_M: Final = 2e-9  # smooth references miss their own polynomial by 0.1 nm where the jerk switches
 
 
-@njit(cache=True, error_model="numpy")
-def deviation(law: np.void, memory: np.void, rows: Array, error: Array) -> None:
-    """e (6,) at the start of the first interval, as the state feedback sees it."""
-    gains, row, target, force = law["feedback"], np.empty(9), np.empty(9), np.empty(3)
-    feedback.ahead(gains, rows[0], rows[1], row)
-    energy_gradient(law["geometry"], law["elasticity"], row[0:3], force)
-    feedback.add_motion(gains, row, force)
-    last = force.copy()
-    if memory["feedforward_known"] != 0:
-        last[:] = memory["feedforward_n"]
-    feedback.sampled_target(gains, rows[0], force, last, target)
+@kernel
+def look_ahead(law: np.void, memory: np.void, plan: np.void) -> None:
+    """From the reference's rows, what its motion takes in mid-interval, and limits of strokes, those of the reference
+    where it is beyond them. ``law``, ``memory``: the tick's, here and below.
+    """
+    rows, middle, moving, end = plan["rows"], plan["middle"], plan["moving_n"], plan["scratch"]["force"]
+    gains, disturbance, least, most = (
+        law["feedback"],
+        memory["estimate"]["ahead"],
+        plan["stroke_min_m"],
+        plan["stroke_max_m"],
+    )
+    low, high = law["predictive"]["stroke_min_m"], law["predictive"]["stroke_max_m"]
+    for k in range(law["predictive"]["horizon"]):
+        feedback.ahead(gains, rows[k], rows[k + 1], middle[k])
+        for i in range(3):
+            moving[k, i] = -disturbance[6 + i]
+        feedback.add_motion(gains, middle[k], moving[k])
+        kinematics.strokes(law["geometry"], rows[k + 1, 0:3], end)
+        for i in range(3):
+            least[k, i], most[k, i] = min(low, end[i]), max(high, end[i])
+
+
+@kernel
+def deviation(law: np.void, memory: np.void, plan: np.void) -> None:
+    """e at the start of the first interval, as the state feedback sees it; and the feed-forward in that interval."""
+    scratch, rows, force, error = memory["scratch"], plan["rows"], plan["first_n"], plan["error"]
+    target, last = scratch["row"], scratch["w_n"]
+    gradient_and_pulls(law["geometry"], law["elasticity"], plan["middle"][0, 0:3], force, plan["first_pulls"])
+    feedback.add_motion(law["feedback"], plan["middle"][0], force)
+    for i in range(3):
+        last[i] = memory["feedforward_n"][i] if memory["feedforward_known"] != 0 else force[i]
+    feedback.sampled_target(law["feedback"], rows[0], force, last, target)
     ahead, origin = memory["estimate"]["ahead"], law["estimator"]["operating_point_m"]
     for i in range(3):
         error[i] = origin[i] + ahead[i] - target[i]
         error[3 + i] = ahead[3 + i] - target[3 + i]
 
 
-@njit(cache=True, error_model="numpy")
-def jumps(period_s: float, rows: Array, jump_m: Array) -> bool:
+@kernel
+def jumps(period_s: float, rows: Array, horizon: int, jump_m: Array) -> bool:
     """c (n,3): where a row (n+1, 9) of the reference is not what the row before leads to; returns if anywhere."""
     found = False
-    for k in range(len(rows) - 1):
+    for k in range(horizon):
         for i in range(3):
             v, a = rows[k, 3 + i], (2.0 * rows[k, 6 + i] + rows[k + 1, 6 + i]) / 3.0
             miss = rows[k, i] + period_s * (v + 0.5 * period_s * a) - rows[k + 1, i]
@@ -78,46 +144,52 @@ def jumps(period_s: float, rows: Array, jump_m: Array) -> bool:
     return found
 
 
-@njit(cache=True, error_model="numpy")
-def free_plan(law: np.void, error: Array, jump_m: Array, jumps: bool, e: Array, nu_n: Array) -> None:
+@kernel
+def free_plan(law: np.void, error: Array, jump_m: Array, jumps: bool, e: Array, nu_n: Array, scratch: np.void) -> None:
     """The plan nu (n,3) that knows no limits, and where it leads from the deviation ``error`` (6,): e (n+1, 6).
 
     nu_k = -K e_k - B (P c_k + h_k+1), where h carries later jumps back: h_k = (Phi - Gamma K)^T (P c_k + h_k+1).
     """
-    numbers, gains, after, seen = law["predictive"], law["feedback"], np.zeros(6), np.empty(6)
-    nu_n[:] = 0.0
-    if jumps:
-        for k in range(len(nu_n) - 1, -1, -1):
-            for i in range(6):
-                seen[i] = after[i]
-                for j in range(3):
-                    seen[i] += numbers["cost_to_go"][i, j] * jump_m[k, j]
-            for i in range(3):
-                for j in range(6):
-                    nu_n[k, i] -= numbers["answer"][i, j] * seen[j]
-            for i in range(6):
-                after[i] = 0.0
-                for j in range(6):
-                    after[i] += numbers["closed"][j, i] * seen[j]
-    e[0] = error
-    for k in range(len(nu_n)):
+    numbers, gains, after, seen = law["predictive"], law["feedback"], scratch["later"], scratch["seen"]
+    position_gain, velocity_gain = gains["position_gain_n_per_m"], gains["velocity_gain_n_s_per_m"]
+    for i in range(6):
+        e[0, i], after[i] = error[i], 0.0
+    for k in range(numbers["horizon"]):
         for i in range(3):
+            nu_n[k, i] = 0.0
+    for k in range(numbers["horizon"] - 1 if jumps else -1, -1, -1):
+        for i in range(6):
+            seen[i] = after[i]
             for j in range(3):
-                nu_n[k, i] -= gains["position_gain_n_per_m"][i, j] * e[k, j]
-                nu_n[k, i] -= gains["velocity_gain_n_s_per_m"][i, j] * e[k, 3 + j]
-        _step(law["estimator"], e[k], nu_n[k], jump_m[k], e[k + 1])
+                seen[i] += numbers["cost_to_go"][i, j] * jump_m[k, j]
+        for i in range(3):
+            for j in range(6):
+                nu_n[k, i] -= numbers["answer"][i, j] * seen[j]
+        for i in range(6):
+            after[i] = 0.0
+            for j in range(6):
+                after[i] += numbers["closed"][j, i] * seen[j]
+    for k in range(numbers["horizon"]):
+        for i in range(3):
+            total = nu_n[k, i]
+            for j in range(3):
+                total -= position_gain[i, j] * e[k, j] + velocity_gain[i, j] * e[k, 3 + j]
+            nu_n[k, i] = total
+        step(law["estimator"], e[k], nu_n[k], jump_m[k], e[k + 1])
 
 
-@njit(cache=True, error_model="numpy")
+@kernel
 def predict(law: np.void, error: Array, jump_m: Array, nu_n: Array, e: Array) -> None:
     """Where a plan nu (n,3) leads from the deviation ``error`` (6,): e (n+1, 6)."""
-    e[0] = error
-    for k in range(len(nu_n)):
-        _step(law["estimator"], e[k], nu_n[k], jump_m[k], e[k + 1])
+    for i in range(6):
+        e[0, i] = error[i]
+    for k in range(law["predictive"]["horizon"]):
+        step(law["estimator"], e[k], nu_n[k], jump_m[k], e[k + 1])
 
 
-@njit(cache=True, error_model="numpy")
-def _step(estimator: np.void, e: Array, nu_n: Array, jump_m: Array, out: Array) -> None:
+@kernel
+def step(estimator: np.void, e: Array, nu_n: Array, jump_m: Array, out: Array) -> None:
+    """e (6,) at the end of an interval, with the jump (3,) there."""
     phi, gamma = estimator["transition"], estimator["input"]
     for i in range(6):
         total = jump_m[i] if i < 3 else 0.0
@@ -128,159 +200,108 @@ def _step(estimator: np.void, e: Array, nu_n: Array, jump_m: Array, out: Array) 
         out[i] = total
 
 
-@njit(cache=True, error_model="numpy")
-def slope(law: np.void, pulls0: Array, e: Array, out: Array) -> None:
-    """Half the derivative (3n,) of the cost by v at v = 0, from where that leads: e
-    (n+1, 6). Backwards, as adjoints go.
+@kernel
+def comb_forces(law: np.void, plan: np.void, k: int, begin: Array, end: Array, nu_n: Array) -> bool:
+    """F that gives nu (3,) in interval ``k``, from deviation ``begin`` (6,) at its start to ``end`` (6,), which has the
+    jump behind it. False where the links do not reach.
     """
-    numbers, phi, gamma = law["predictive"], law["estimator"]["transition"], law["estimator"]["input"]
-    adjoint, before, by_nu = np.empty(6), np.empty(6), np.empty(3)
-    n = len(e) - 1
-    for i in range(6):
-        adjoint[i] = 0.0
-        for j in range(6):
-            adjoint[i] += numbers["cost_to_go"][i, j] * e[n, j]
-    for k in range(n - 1, -1, -1):
-        for i in range(3):
-            by_nu[i] = 0.0
-            for j in range(6):
-                by_nu[i] += gamma[j, i] * adjoint[j]
-        multiply3(pulls0, by_nu, out[3 * k : 3 * k + 3])
-        for i in range(6):
-            before[i] = (numbers["position_weight"] if i < 3 else numbers["velocity_weight"]) * e[k, i]
-            for j in range(6):
-                before[i] += phi[j, i] * adjoint[j]
-        adjoint[:] = before
-
-
-Scratch = tuple[Array, Array, Array, Array, Array, Array, Array]
-
-
-@njit(cache=True, error_model="numpy")
-def scratch() -> Scratch:
-    """Memory for ``comb_forces``, which would take longer to get it anew than to work in it."""
-    return np.empty(9), np.empty(6), np.empty(3), np.empty(3), np.empty(3), np.empty((3, 3)), np.empty((3, 3))
-
-
-@njit(cache=True, error_model="numpy")
-def comb_forces(
-    law: np.void, now: Array, after: Array, e: Array, nu_n: Array, disturbance_n: Array, comb_n: Array, memory: Scratch
-) -> bool:
-    """F (3,) that gives nu (3,) in the interval between two rows (9,) of the reference, from deviation e (6,) at its
-    start. False where the links do not reach.
-    """
-    gains, filter_ = law["feedback"], law["estimator"]
-    row, end, off, middle, force, pulls, inverse = memory
-    feedback.ahead(gains, now, after, row)
-    off[:] = 0.0
-    _step(filter_, e, nu_n, off, end)
+    filter_, scratch, row, jump, moving = (
+        law["estimator"],
+        plan["scratch"],
+        plan["middle"],
+        plan["jump_m"],
+        plan["moving_n"],
+    )
+    off, middle, force, stiffness = scratch["off"], scratch["middle"], scratch["force"], filter_["stiffness_n_per_m"]
+    quarter_s = 0.25 * filter_["half_period_s"]
     for i in range(3):
-        off[i] = 0.5 * (e[i] + end[i]) + 0.25 * filter_["half_period_s"] * (e[3 + i] - end[3 + i])
-        middle[i] = row[i] + off[i]
+        off[i] = 0.5 * (begin[i] + end[i] - jump[k, i]) + quarter_s * (begin[3 + i] - end[3 + i])
+        middle[i] = row[k, i] + off[i]
     if kinematics.in_domain(law["geometry"], middle) != 0:
         return False
-    energy_gradient(law["geometry"], law["elasticity"], middle, force)
-    feedback.add_motion(gains, row, force)
+    gradient_and_pulls(law["geometry"], law["elasticity"], middle, force, scratch["pulls"])
     for i in range(3):
-        force[i] += nu_n[i] - disturbance_n[i]
-        for k in range(3):
-            force[i] -= filter_["stiffness_n_per_m"][i, k] * off[k]
-    kinematics.pulls(law["geometry"], middle, pulls)
-    inverse3(pulls, inverse)
-    multiply3_transposed(inverse, force, comb_n)
+        held = stiffness[i, 0] * off[0] + stiffness[i, 1] * off[1] + stiffness[i, 2] * off[2]
+        force[i] += moving[k, i] + nu_n[i] - held
+    inverse3(scratch["pulls"], scratch["inverse"])
+    multiply3_transposed(scratch["inverse"], force, plan["comb_n"][k])
     return True
 
 
-@njit(cache=True, error_model="numpy")
-def forces_and_strokes(
-    law: np.void, rows: Array, e: Array, nu_n: Array, disturbance_n: Array, comb_n: Array, stroke_m: Array,
-    memory: Scratch,
-) -> bool:  # fmt: skip
-    """Comb forces (n,3) that a plan nu (n,3) takes along rows (n+1, 9), with its e (n+1, 6), and strokes (n,3) at the
-    ends of the intervals. False where the links do not reach.
+@kernel
+def _interval(law: np.void, plan: np.void, k: int, e: Array, nu_n: Array) -> bool:
+    """Comb forces in interval ``k`` of a plan nu (n,3) that leads to e (n+1, 6), and strokes at its end. False where
+    the links do not reach.
     """
-    for k in range(len(nu_n)):
-        if not _interval(law, rows, e, nu_n, disturbance_n, k, comb_n[k], stroke_m[k], memory):
-            return False
-    return True
-
-
-@njit(cache=True, error_model="numpy")
-def keeps_limits(
-    law: np.void, rows: Array, e: Array, nu_n: Array, disturbance_n: Array, count: Array, lower_m: Array,
-    upper_m: Array, comb_n: Array, stroke_m: Array, memory: Scratch,
-) -> bool:  # fmt: skip
-    """Whether forces and strokes of a plan, as above, keep voltage and slew after the last counts (3,) and limits (n,3)
-    of strokes. It ends at the first interval that does not.
-    """
-    drive, volt = law["drive"], np.empty(3)
-    gain, most = drive["force_gain_n_per_v2"], drive["volt_per_count"] * drive["count_max"]
-    step = drive["volt_per_count"] * drive["count_slew_max"]
-    for i in range(3):
-        volt[i] = drive["volt_per_count"] * count[i]
-    for k in range(len(nu_n)):
-        if not _interval(law, rows, e, nu_n, disturbance_n, k, comb_n[k], stroke_m[k], memory):
-            return False
-        for i in range(3):
-            if not 0.0 <= comb_n[k, i] <= gain[i] * most * most:
-                return False
-            before, volt[i] = volt[i], math.sqrt(comb_n[k, i] / gain[i])
-            if abs(volt[i] - before) > step or not lower_m[k, i] <= stroke_m[k, i] <= upper_m[k, i]:
-                return False
-    return True
-
-
-@njit(cache=True, error_model="numpy")
-def _interval(
-    law: np.void, rows: Array, e: Array, nu_n: Array, disturbance_n: Array, k: int, comb_n: Array, stroke_m: Array,
-    memory: Scratch,
-) -> bool:  # fmt: skip
-    """Comb forces (3,) in interval k, and strokes (3,) at its end. False where the links do not reach."""
-    if not comb_forces(law, rows[k], rows[k + 1], e[k], nu_n[k], disturbance_n, comb_n, memory):
+    if not comb_forces(law, plan, k, e[k], e[k + 1], nu_n[k]):
         return False
-    end = memory[2]
+    end, rows = plan["scratch"]["middle"], plan["rows"]
     for i in range(3):
         end[i] = rows[k + 1, i] + e[k + 1, i]
     if kinematics.in_domain(law["geometry"], end) != 0:
         return False
-    kinematics.strokes(law["geometry"], end, stroke_m)
+    kinematics.strokes(law["geometry"], end, plan["stroke_m"][k])
     return True
 
 
-@njit(cache=True, error_model="numpy")
-def stroke_limits(law: np.void, rows: Array, lower_m: Array, upper_m: Array) -> None:
-    """Limits (n, 3) of those strokes, where a reference that is beyond them has its own."""
-    asked = np.empty(3)
-    low, high = law["predictive"]["stroke_min_m"], law["predictive"]["stroke_max_m"]
-    for m in range(len(lower_m)):
-        kinematics.strokes(law["geometry"], rows[m + 1, 0:3], asked)
+@kernel
+def forces_and_strokes(law: np.void, plan: np.void, e: Array, nu_n: Array) -> bool:
+    """Comb forces that a plan nu (n,3) takes, with its e (n+1, 6), and strokes. False where the links do not reach."""
+    reached, k = True, 0
+    while reached and k < law["predictive"]["horizon"]:
+        reached, k = _interval(law, plan, k, e, nu_n), k + 1
+    return reached
+
+
+@kernel
+def keeps_limits(law: np.void, plan: np.void, e: Array, nu_n: Array, count: Array) -> bool:
+    """Whether forces and strokes of a plan, as above, keep voltage and slew after the last counts (3,) and limits of
+    strokes. It ends at the first interval that does not.
+    """
+    drive, volt, comb, stroke = law["drive"], plan["scratch"]["off"], plan["comb_n"], plan["stroke_m"]
+    gain, most = drive["force_gain_n_per_v2"], drive["volt_per_count"] * drive["count_max"]
+    slew, last = drive["volt_per_count"] * drive["count_slew_max"], plan["scratch"]["seen"]
+    for i in range(3):
+        last[i] = drive["volt_per_count"] * count[i]
+    for k in range(law["predictive"]["horizon"]):
+        if not _interval(law, plan, k, e, nu_n):
+            return False
         for i in range(3):
-            lower_m[m, i] = min(low, asked[i])
-            upper_m[m, i] = max(high, asked[i])
+            if not 0.0 <= comb[k, i] <= gain[i] * most * most:
+                return False
+            volt[i] = math.sqrt(comb[k, i] / gain[i])
+            if abs(volt[i] - last[i]) > slew:
+                return False
+            last[i] = volt[i]
+            if not plan["stroke_min_m"][k, i] <= stroke[k, i] <= plan["stroke_max_m"][k, i]:
+                return False
+    return True
 
 
-@njit(cache=True, error_model="numpy")
-def comb_bounds(drive: np.void, count: Array, about_n: Array, lower: Array, upper: Array) -> None:
-    """Bounds (3n,) of v from what the voltages can be after 1, 2, ... periods of slewing from the last counts (3,);
-    ``about_n`` (n,3): comb forces less v, as a plan has them.
+@kernel
+def comb_bounds(drive: np.void, horizon: int, count: Array, about_n: Array, lower: Array, upper: Array) -> None:
+    """Bounds (3n,) of v, in its unit, from what the voltages can be after 1, 2, ... periods of slewing from the last
+    counts (3,); ``about_n`` (n,3): comb forces less v, as a plan has them.
     """
     gain, scale = drive["force_gain_n_per_v2"], drive["volt_per_count"]
-    for k in range(len(about_n)):
+    for k in range(horizon):
         slew = (k + 1) * drive["count_slew_max"]
         for i in range(3):
             low, high = scale * max(0, count[i] - slew), scale * min(drive["count_max"], count[i] + slew)
-            lower[3 * k + i] = gain[i] * low * low - about_n[k, i]
-            upper[3 * k + i] = gain[i] * high * high - about_n[k, i]
+            lower[3 * k + i] = (gain[i] * low * low - about_n[k, i]) / FORCE_UNIT_N
+            upper[3 * k + i] = (gain[i] * high * high - about_n[k, i]) / FORCE_UNIT_N
 
 
-@njit(cache=True, error_model="numpy")
-def slew_bounds(drive: np.void, about_n: Array, comb_n: Array, lower: Array, upper: Array) -> None:
-    """Bounds (3n-3,) of v_k - v_(k-1) from the slew limit, about comb forces (n,3) that were planned."""
-    gain = drive["force_gain_n_per_v2"]
+@kernel
+def slew_bounds(drive: np.void, horizon: int, about_n: Array, comb_n: Array, lower: Array, upper: Array) -> None:
+    """Bounds of v_k - v_(k-1), in the same unit, behind those, from the slew limit about comb forces (n,3) that were
+    planned.
+    """
+    gain, first = drive["force_gain_n_per_v2"], 3 * horizon
     step_v = drive["volt_per_count"] * drive["count_slew_max"]
-    for k in range(1, len(about_n)):
+    for k in range(1, horizon):
         for i in range(3):
             volt = math.sqrt(max(comb_n[k - 1, i], 0.0) / gain[i])
-            change = about_n[k, i] - about_n[k - 1, i]
-            lower[3 * k - 3 + i] = -gain[i] * step_v * max(2.0 * volt - step_v, step_v) - change
-            upper[3 * k - 3 + i] = gain[i] * step_v * (2.0 * volt + step_v) - change
+            change, at = about_n[k, i] - about_n[k - 1, i], first + 3 * k - 3 + i
+            lower[at] = (-gain[i] * step_v * max(2.0 * volt - step_v, step_v) - change) / FORCE_UNIT_N
+            upper[at] = (gain[i] * step_v * (2.0 * volt + step_v) - change) / FORCE_UNIT_N

@@ -5,152 +5,349 @@
 The dual method of Goldfarb and Idnani ("A numerically stable dual method for solving strictly convex quadratic
 programs", Mathematical Programming 27, 1983): from the minimum without limits it takes in one limit after another, the
 one passed by most, and lets go of those that hold nothing back any more. Each step raises the dual's value, so no set
-of limits comes twice, and it ends.
+of limits comes twice, and it ends. It may as well begin with limits of which it is guessed that they hold: those of the
+guess that hold nothing back are let go first.
 
 H and A never change, so all of it happens between the limits: with multipliers y, positive at an upper limit,
-A v = -A H^-1 q - M y, where M = A H^-1 A^T. The first rows of A are the unknowns themselves, one row each; an unknown
-further on, without a slope and limits of its own, has none. So A v begins with the solution, the first columns of M are
-A H^-1, and M is all that has to be known.
-
-It begins anew at each problem: the answer depends on the problem alone.
+A v = f - M y, where f is A v at the minimum without limits, and M = A H^-1 A^T. The first rows of A are the unknowns
+themselves, one row each; an unknown further on, without a slope and limits of its own, has none. So A v begins with the
+solution, and M is all that has to be known.
 """
 
 import math
+from typing import Final
 
 import numpy as np
-from numba import njit
 from numpy.typing import NDArray
 
+from pkxyz_ctrl.compiled.kernel import kernel
+
 Array = NDArray[np.float64]
+Records = NDArray[np.void]
 
 TOO_LONG, IMPOSSIBLE = -1, -2
 """What ``solve`` says where it has no solution: more rounds than allowed, or limits that exclude each other."""
 
-_PASSED = 1e-9  # by less than that a limit is kept, in its own unit
-_OTHERS = 1e-10  # of M's diagonal: less is left of a limit that the ones held determine
+LIMITS_MOST: Final = 184
+HELD_MOST: Final = 64
+"""Limits that there may be, and that may be held at a time: one more than unknowns."""
+_TOGETHER: Final = 4  # numbers that a processor works on at once: rows begin at multiples of so many
+
+PROGRAM = np.dtype(
+    [
+        ("limits", "i8"),  # m
+        ("row", "i8"),  # from one row of M to the next
+        ("held_most", "i8"),
+        ("held_row", "i8"),  # from one row of its factor to the next
+        ("sweeps", "i8"),  # in which many limits change at once
+        ("between", "f8", (LIMITS_MOST * LIMITS_MOST,)),  # M by rows; last, as few limits need little of it
+    ],
+    align=True,
+)
+
+WORK = np.dtype(
+    [
+        ("free", "f8", (LIMITS_MOST,)),  # f
+        ("lower", "f8", (LIMITS_MOST,)),
+        ("upper", "f8", (LIMITS_MOST,)),
+        ("value", "f8", (LIMITS_MOST,)),  # A v
+        ("multiplier", "f8", (HELD_MOST,)),  # y of the limits that are held
+        ("release", "f8", (HELD_MOST,)),  # by which these fall while the next multiplier grows
+        ("side", "f8", (HELD_MOST,)),  # 1.0: held at its upper limit, -1.0: at its lower one
+        ("share", "f8", (HELD_MOST,)),  # 1 / D; 0 for a limit that those before it determine
+        ("column", "f8", (HELD_MOST,)),  # of D L^T, for one limit more
+        ("held", "i8", (HELD_MOST,)),  # which they are
+        ("count", "i8"),  # how many
+        ("factor", "f8", (HELD_MOST * HELD_MOST,)),  # D L^T by rows, L D L^T = M between them; last, likewise
+    ],
+    align=True,
+)
+
+_SWEEPS: Final = 6
+_PASSED: Final = 1e-9  # by less than that a limit is kept, in its own unit
+_OTHERS: Final = 1e-10  # of M's diagonal: less is left of a limit that the ones held determine
 
 
-Work = tuple[Array, Array, Array, Array, Array, NDArray[np.int64]]
-"""Memory of ``solve`` for n unknowns and m limits: A v (m,); by which it falls (m,) while the next multiplier grows and
-the limits that are held stay where they are; their multipliers (n + 1,), and by which those fall meanwhile; the inverse
-of M between them (n + 1, n + 1); which they are. Nothing in it is kept from one problem to the next."""
-
-
-def between(hessian: Array, rows: Array) -> Array:
-    """M (m, m) for H (n, n), symmetric and positive definite, and A (m, n)."""
+def program(hessian: Array, rows: Array) -> Records:
+    """(1,) of ``PROGRAM`` for H (n, n), symmetric and positive definite, and A (m, n)."""
+    (limits, unknowns), made = rows.shape, np.zeros(1, PROGRAM)
     product = rows @ np.linalg.solve(hessian, rows.T)
-    return np.ascontiguousarray((product + product.T) / 2.0)
+    row = made["row"][0] = _padded(limits)
+    made["limits"], made["held_most"], made["held_row"] = limits, unknowns + 1, _padded(unknowns + 1)
+    made["sweeps"] = _SWEEPS
+    matrix = made["between"][0, : limits * row].reshape(limits, row)
+    matrix[:, :limits] = (product + product.T) / 2.0
+    return made
 
 
-def work(unknowns: int, limits: int) -> Work:
-    """Memory for such problems."""
-    most = unknowns + 1
-    held = np.zeros(most, np.int64)
-    return np.zeros(limits), np.zeros(limits), np.zeros(most), np.zeros(most), np.zeros((most, most)), held
+def _padded(count: int) -> int:
+    return -(-count // _TOGETHER) * _TOGETHER
 
 
-@njit(cache=True, error_model="numpy")
-def solve(between: Array, memory: Work, q: Array, lower: Array, upper: Array, rounds_max: int, v: Array) -> int:
-    """Put the solution into v, of the length of q, and return how many rounds it took, one more than limits were taken
-    in or let go; or ``TOO_LONG`` or ``IMPOSSIBLE``, v unchanged. ``lower`` and ``upper`` (m,), one not above the other.
+@kernel
+def solve(program: np.void, work: np.void, rounds_max: int) -> int:
+    """From ``free`` and limits in ``work``, lower not above upper, make ``value``, which begins with the solution.
+    Returns how many rounds it took, or ``TOO_LONG`` or ``IMPOSSIBLE``.
+
+    Begins with the ``count`` limits ``held`` at their ``side`` and leaves those of the solution there; none without.
     """
-    value, slope, multiplier, release, inverse, held = memory
-    limits, count, new, sign = len(value), 0, -1, 1.0
-    _values_without_limits(between, q, value)
-    for rounds in range(1, rounds_max + 1):
+    rounds = 0
+    _put_in_order(work)
+    while rounds < min(program["sweeps"], rounds_max):
+        rounds += 1
+        _hold(program, work)
+        _values(program, work)
+        if not _exchange(program, work):
+            return rounds
+    _hold(program, work)
+    while rounds < rounds_max and _let_go_wrong(work):
+        rounds += 1
+        _hold(program, work)
+    answer: int = _one_by_one(program, work, rounds, rounds_max)
+    if answer < 0:
+        work["count"] = 0
+    return answer
+
+
+@kernel
+def _one_by_one(program: np.void, work: np.void, rounds: int, rounds_max: int) -> int:
+    """Take in and let go single limits, from some that all hold something back. Each is a round."""
+    value, lower, upper, multiplier, held = (
+        work["value"],
+        work["lower"],
+        work["upper"],
+        work["multiplier"],
+        work["held"],
+    )
+    between, new, sign, passed = program["between"], -1, 1.0, 0.0
+    while rounds < rounds_max:
+        rounds += 1
+        count = work["count"]
         if new < 0:
-            new = _passed_most(value, lower, upper, slope)
+            _values(program, work)
+            new = _passed_most(value, lower, upper, program["limits"])
             if new < 0:
-                v[:] = value[: len(v)]
                 return rounds
             sign = 1.0 if value[new] > upper[new] else -1.0
+            passed = value[new] - upper[new] if sign > 0.0 else lower[new] - value[new]
             multiplier[count] = 0.0
-        _released(between[new], inverse, held, count, release)
-        first, far = _first_released(multiplier, release, sign, count)
-        for i in range(limits):
-            slope[i] = between[new, i]
-        _take_off(between, held, release, count, slope)
-        if slope[new] > _OTHERS * between[new, new] and count < len(held):
-            by = value[new] - upper[new] if sign > 0.0 else lower[new] - value[new]
-            if by <= far * slope[new]:
-                first, far = -1, by / slope[new]
+        left = _released(program, work, new)
+        first, far = _first_released(multiplier, work["release"], sign, count)
+        if left > _OTHERS * between[new * program["row"] + new] and count < program["held_most"]:
+            if passed <= far * left:
+                first, far = -1, passed / left
         elif first < 0:
             return IMPOSSIBLE
-        for i in range(limits):
-            value[i] -= sign * far * slope[i]
+        passed -= far * left
         for k in range(count):
-            multiplier[k] -= sign * far * release[k]
+            multiplier[k] -= sign * far * work["release"][k]
         multiplier[count] += sign * far
         if first < 0:
-            _border(inverse, release, slope[new], count)
-            held[count], new, count = new, -1, count + 1
+            _border(work, program["held_row"], left)
+            held[count], work["side"][count], new, work["count"] = new, sign, -1, count + 1
         else:
-            count -= 1
-            _let_go(inverse, first, count)
-            held[first], multiplier[first], multiplier[count] = held[count], multiplier[count], multiplier[count + 1]
+            for k in range(first, count):
+                multiplier[k], held[k], work["side"][k] = multiplier[k + 1], held[k + 1], work["side"][k + 1]
+            work["count"] = count - 1
+            _factorise(program, work)
     return TOO_LONG
 
 
-@njit(cache=True, error_model="numpy")
-def _values_without_limits(between: Array, q: Array, value: Array) -> None:
-    value[:] = 0.0
-    n = len(q)
-    for j in range(0, n - n % 4, 4):
-        a, b, c, d = between[j], between[j + 1], between[j + 2], between[j + 3]
-        p, r, s, t = q[j], q[j + 1], q[j + 2], q[j + 3]
-        for i in range(len(value)):
-            value[i] = value[i] - p * a[i] - r * b[i] - s * c[i] - t * d[i]
-    for j in range(n - n % 4, n):
-        for i in range(len(value)):
-            value[i] -= q[j] * between[j, i]
+@kernel
+def _hold(program: np.void, work: np.void) -> None:
+    """Multipliers with which the held limits are just met."""
+    held, side, beyond = work["held"], work["side"], work["multiplier"]
+    _factorise(program, work)
+    for k in range(work["count"]):
+        limit = held[k]
+        beyond[k] = work["free"][limit] - (work["upper"][limit] if side[k] > 0.0 else work["lower"][limit])
+    _forwards(work, program["held_row"], beyond)
+    _backwards(work, program["held_row"], beyond)
 
 
-@njit(cache=True, error_model="numpy")
-def _released(row: Array, inverse: Array, held: NDArray[np.int64], count: int, out: Array) -> None:
-    """By which the multipliers of those held fall while that of the limit of this ``row`` of M grows."""
-    for j in range(count):
-        out[j] = 0.0
-    fours = count - count % 4
-    for k in range(0, fours, 4):
-        a, b, c, d = inverse[k], inverse[k + 1], inverse[k + 2], inverse[k + 3]
-        p, r, s, t = row[held[k]], row[held[k + 1]], row[held[k + 2]], row[held[k + 3]]
-        for j in range(count):
-            out[j] = out[j] + p * a[j] + r * b[j] + s * c[j] + t * d[j]
-    for k in range(fours, count):
-        a, p = inverse[k], row[held[k]]
-        for j in range(count):
-            out[j] += p * a[j]
+@kernel
+def _let_go_wrong(work: np.void) -> bool:
+    """Hold no limit any more whose multiplier has the wrong sign; returns whether there was one."""
+    held, side, multiplier, count = work["held"], work["side"], work["multiplier"], 0
+    before = work["count"]
+    for k in range(before):
+        if side[k] * multiplier[k] > 0.0:
+            held[count], side[count] = held[k], side[k]
+            count += 1
+    work["count"] = count
+    return bool(count < before)
 
 
-@njit(cache=True, error_model="numpy")
-def _take_off(between: Array, held: NDArray[np.int64], shares: Array, count: int, out: Array) -> None:
-    """Less the rows of M of those held times their shares; four at once, in the order of one after the other."""
-    fours = count - count % 4
-    for k in range(0, fours, 4):
-        a, b, c, d = between[held[k]], between[held[k + 1]], between[held[k + 2]], between[held[k + 3]]
-        p, r, s, t = shares[k], shares[k + 1], shares[k + 2], shares[k + 3]
-        for i in range(len(out)):
-            out[i] = out[i] - p * a[i] - r * b[i] - s * c[i] - t * d[i]
-    for k in range(fours, count):
-        a, p = between[held[k]], shares[k]
-        for i in range(len(out)):
-            out[i] -= p * a[i]
-
-
-@njit(cache=True, error_model="numpy")
-def _passed_most(value: Array, lower: Array, upper: Array, by: Array) -> int:
-    """The limit that A v (m,) passes by most; -1 if it keeps all. ``by`` (m,): by how much each is, afterwards."""
-    for i in range(len(value)):
+@kernel
+def _exchange(program: np.void, work: np.void) -> bool:
+    """Let go of those that hold nothing back and take in all that are passed, in order; returns whether there was any.
+    Where limits determine each other, it is the last ones that are left out.
+    """
+    value, lower, upper, held, side = work["value"], work["lower"], work["upper"], work["held"], work["side"]
+    changes, kept, count = _let_go_wrong(work), work["count"], 0
+    old = HELD_MOST - kept
+    for k in range(kept - 1, -1, -1):
+        held[old + k], side[old + k] = held[k], side[k]
+    for i in range(program["limits"]):
         above, below = value[i] - upper[i], lower[i] - value[i]
-        by[i] = above if above > below else below
+        if old < HELD_MOST and held[old] == i:
+            held[count], side[count] = i, side[old]
+            count, old = count + 1, old + 1
+        elif (above if above > below else below) > _PASSED and count + HELD_MOST - old < program["held_most"]:
+            held[count], side[count], changes = i, 1.0 if above > below else -1.0, True
+            count += 1
+    work["count"] = count
+    return changes
+
+
+@kernel
+def _put_in_order(work: np.void) -> None:
+    """The limits that are guessed to hold, each once."""
+    held, side, count = work["held"], work["side"], 0
+    for k in range(work["count"]):
+        limit, at_side, at = held[k], side[k], count
+        while at > 0 and held[at - 1] > limit:
+            at -= 1
+        if at > 0 and held[at - 1] == limit:
+            continue
+        for j in range(count, at, -1):
+            held[j], side[j] = held[j - 1], side[j - 1]
+        held[at], side[at] = limit, at_side
+        count += 1
+    work["count"] = count
+
+
+@kernel
+def _values(program: np.void, work: np.void) -> None:
+    """A v = f - M y."""
+    between, held, share, row = program["between"], work["held"], work["multiplier"], program["row"]
+    free, value, count = work["free"], work["value"], work["count"]
+    for i in range(row):
+        value[i] = free[i]
+    fours = count & ~3
+    for k in range(0, fours, 4):
+        a, b, c, d = held[k] * row, held[k + 1] * row, held[k + 2] * row, held[k + 3] * row
+        _take_four(between, a, b, c, d, share[k], share[k + 1], share[k + 2], share[k + 3], row, value)
+    for k in range(fours, count):
+        _take(between, held[k] * row, share[k], row, value)
+
+
+@kernel
+def _factorise(program: np.void, work: np.void) -> None:
+    """D L^T of the limits held. A limit that those before it determine is left out, and gets no multiplier."""
+    between, factor, share, held, row = (
+        program["between"], work["factor"], work["share"], work["held"], program["held_row"],
+    )  # fmt: skip
+    count = work["count"]
+    for j in range(count):
+        of_limit, out, length = held[j] * program["row"], factor[j * row + j : j * row + count], count - j
+        for i in range(length):
+            out[i] = between[of_limit + held[j + i]]
+        own, fours = out[0], j & ~3
+        for k in range(0, fours, 4):
+            a, b, c, d = k * row + j, (k + 1) * row + j, (k + 2) * row + j, (k + 3) * row + j
+            p, r, s, t = (
+                factor[a] * share[k],
+                factor[b] * share[k + 1],
+                factor[c] * share[k + 2],
+                factor[d] * share[k + 3],
+            )
+            _take_four(factor, a, b, c, d, p, r, s, t, length, out)
+        for k in range(fours, j):
+            _take(factor, k * row + j, factor[k * row + j] * share[k], length, out)
+        share[j] = 1.0 / out[0] if out[0] > _OTHERS * own else 0.0
+
+
+@kernel
+def _forwards(work: np.void, row: int, z: Array) -> None:
+    """L z' = z in its place."""
+    count, share = work["count"], work["share"]
+    for k in range(count - 1):
+        _take(work["factor"], k * row + k + 1, z[k] * share[k], count - k - 1, z[k + 1 : count])
+
+
+@kernel
+def _backwards(work: np.void, row: int, z: Array) -> None:
+    """D L^T y = z in its place, in four sums."""
+    count, share, factor = work["count"], work["share"], work["factor"]
+    for k in range(count - 1, -1, -1):
+        a, b, c, d, begin = z[k], 0.0, 0.0, 0.0, k + 1 + (count - k - 1 & 3)
+        for i in range(k + 1, begin):
+            a -= factor[k * row + i] * z[i]
+        for i in range(begin, count, 4):
+            at = k * row + i
+            a -= factor[at] * z[i]
+            b -= factor[at + 1] * z[i + 1]
+            c -= factor[at + 2] * z[i + 2]
+            d -= factor[at + 3] * z[i + 3]
+        z[k] = ((a + b) + (c + d)) * share[k]
+
+
+@kernel
+def _take(matrix: Array, at: int, share: float, count: int, out: Array) -> None:
+    """Take a share of so many numbers of a matrix, from ``at`` on, off ``out``."""
+    row = matrix[at : at + count]  # numba looks at each index whether it is negative, but in a plain loop
+    for i in range(count):
+        out[i] -= share * row[i]
+
+
+@kernel
+def _take_four(
+    matrix: Array, a: int, b: int, c: int, d: int, p: float, r: float, s: float, t: float, count: int, out: Array
+) -> None:
+    """The same from four places at once, in the order of one after the other."""
+    first, second, third, fourth = (
+        matrix[a : a + count],
+        matrix[b : b + count],
+        matrix[c : c + count],
+        matrix[d : d + count],
+    )
+    for i in range(count):
+        out[i] = out[i] - p * first[i] - r * second[i] - s * third[i] - t * fourth[i]
+
+
+@kernel
+def _released(program: np.void, work: np.void, new: int) -> float:
+    """Write by which the multipliers of those held fall while that of limit ``new`` grows, and its ``column``. Returns
+    what is left of its own entry of M: by which it falls.
+    """
+    held, release, column, share, between = (
+        work["held"], work["release"], work["column"], work["share"], program["between"],
+    )  # fmt: skip
+    at, count = new * program["row"], work["count"]
+    own = between[at + new]
+    for k in range(count):
+        release[k] = between[at + held[k]]
+    _forwards(work, program["held_row"], release)
+    for k in range(count):
+        column[k] = release[k]
+        own -= release[k] * release[k] * share[k]
+    _backwards(work, program["held_row"], release)
+    return own
+
+
+@kernel
+def _border(work: np.void, row: int, own: float) -> None:
+    """The factor of one limit more, whose ``column`` is known."""
+    factor, count = work["factor"], work["count"]
+    for k in range(count):
+        factor[k * row + count] = work["column"][k]
+    factor[count * row + count], work["share"][count] = own, 1.0 / own
+
+
+@kernel
+def _passed_most(value: Array, lower: Array, upper: Array, limits: int) -> int:
+    """The limit that A v (m,) passes by most; -1 if it keeps all."""
     passed, most = -1, _PASSED
-    for i in range(len(by)):
-        if by[i] > most:
-            passed, most = i, by[i]
+    for i in range(limits):
+        above, below = value[i] - upper[i], lower[i] - value[i]
+        by = above if above > below else below
+        if by > most:
+            passed, most = i, by
     return passed
 
 
-@njit(cache=True, error_model="numpy")
+@kernel
 def _first_released(multiplier: Array, release: Array, sign: float, count: int) -> tuple[int, float]:
     """Which of the held limits holds nothing back any more first, and after how far; -1 and infinity if none ever."""
     first, far = -1, math.inf
@@ -159,27 +356,3 @@ def _first_released(multiplier: Array, release: Array, sign: float, count: int) 
         if falls * multiplier[k] > 0.0 and multiplier[k] / falls < far:
             first, far = k, multiplier[k] / falls
     return first, far
-
-
-@njit(cache=True, error_model="numpy")
-def _border(inverse: Array, release: Array, own: float, count: int) -> None:
-    """The inverse of one row and column more."""
-    for j in range(count):
-        part = release[j] / own
-        for k in range(count):
-            inverse[j, k] += part * release[k]
-        inverse[j, count] = inverse[count, j] = -part
-    inverse[count, count] = 1.0 / own
-
-
-@njit(cache=True, error_model="numpy")
-def _let_go(inverse: Array, k: int, last: int) -> None:
-    """The inverse without row and column k, whose place the last one takes."""
-    for i in range(last + 1):
-        inverse[k, i], inverse[last, i] = inverse[last, i], inverse[k, i]
-    for i in range(last + 1):
-        inverse[i, k], inverse[i, last] = inverse[i, last], inverse[i, k]
-    for i in range(last):
-        part = inverse[i, last] / inverse[last, last]
-        for j in range(last):
-            inverse[i, j] -= part * inverse[last, j]
