@@ -1,4 +1,4 @@
-"""``python -m pkxyz_ctrl.export.emit FILE``: write the kernels' unoptimised LLVM IR, below a line with their symbols.
+"""``python -m pkxyz_ctrl.export.emit FILE [planned]``: write the kernels' unoptimised LLVM IR, below a line with their symbols.
 
 ``kernels`` runs it, in the environment that it needs.
 """
@@ -15,10 +15,10 @@ from numba import from_dtype, types
 from pkxyz_ctrl.export.entries import FIELD, RECORD, Argument, Entry, entries_for
 
 
-def main(out: Path) -> None:
+def main(out: Path, *, is_planned: bool) -> None:
     """Compile every entry and write one module."""
     module, symbols = None, {}
-    for entry in entries_for(has_loop=True):
+    for entry in entries_for(has_loop=True, is_planned=is_planned):
         overload = _compiled(entry)
         symbols[entry.name] = overload.fndesc.llvm_func_name
         part = llvm.parse_assembly(overload.library.get_llvm_str())
@@ -37,14 +37,15 @@ def _compiled(entry: Entry) -> Any:
 
 
 def _type_of(argument: Argument) -> Any:
-    if argument.dtype is None:
+    dtype = argument.taken
+    if dtype is None:
         return types.int64
     if argument.kind == RECORD:
-        return from_dtype(argument.dtype)
+        return from_dtype(dtype)
     if argument.kind == FIELD:
-        return from_dtype(np.dtype((argument.dtype, (1,))))
-    return types.Array(from_dtype(argument.dtype), 1, "C")
+        return from_dtype(np.dtype((dtype, (1,))))
+    return types.Array(from_dtype(dtype), 1, "C")
 
 
 if __name__ == "__main__":
-    main(Path(sys.argv[1]))
+    main(Path(sys.argv[1]), is_planned="planned" in sys.argv[2:])

@@ -4,6 +4,7 @@ from typing import Any, Final, NamedTuple
 
 import numpy as np
 
+from pkxyz_ctrl.export import planned
 from pkxyz_ctrl.loop import cycle as cycling
 from pkxyz_ctrl.loop import exchange, law_change
 from pkxyz_ctrl.loop.reference import REFERENCE
@@ -15,13 +16,21 @@ itself. A cycle that takes fields is the very one that ``period`` calls, so that
 
 
 class Argument(NamedTuple):
-    """Records, by a pointer to the first and, if there may be many, their number; or a number, ``c_type`` in C."""
+    """Records, by a pointer to the first and, if there may be many, their number; or a number, ``c_type`` in C.
+    ``whole``: what the kernel takes where that is more than C knows of.
+    """
 
     name: str
     dtype: np.dtype[np.void] | None = None
     is_const: bool = False
     kind: int = ONE
     c_type: str = "int64_t"
+    whole: np.dtype[np.void] | None = None
+
+    @property
+    def taken(self) -> np.dtype[np.void] | None:
+        """The record that the kernel takes."""
+        return self.dtype if self.whole is None else self.whole
 
 
 class Entry(NamedTuple):
@@ -128,6 +137,22 @@ OF_LOOP = (
 """What the native loop calls besides; no board has it."""
 
 
-def entries_for(*, has_loop: bool) -> tuple[Entry, ...]:
-    """Those that a target has, with the native loop or without."""
+_PLANNED = {
+    "pkxyz_period": (planned.period, {"config": planned.PLANNED_EXCHANGE, "memory": planned.PLANNED_EXCHANGE_MEMORY}),
+    "pkxyz_cycle": (planned.cycle, {"law": planned.PLANNED_LAW, "memory": planned.PLANNED_MEMORY}),
+}
+
+
+def entries_for(*, has_loop: bool, is_planned: bool = False) -> tuple[Entry, ...]:
+    """Those that a target has, with the native loop or without, or for a law that plans."""
+    if is_planned:
+        return tuple(_planned(entry) for entry in ENTRIES)
     return ENTRIES + OF_LOOP if has_loop else ENTRIES
+
+
+def _planned(entry: Entry) -> Entry:
+    if entry.name not in _PLANNED:
+        return entry
+    kernel, whole = _PLANNED[entry.name]
+    arguments = tuple(argument._replace(whole=whole.get(argument.name)) for argument in entry.arguments)
+    return entry._replace(kernel=kernel, arguments=arguments)

@@ -19,12 +19,12 @@ from pkxyz_ctrl.core.demand import PREDICTIVE
 from pkxyz_ctrl.export.elf import loaded_bytes
 from pkxyz_ctrl.export.kernels import ExportError, kernels
 from pkxyz_ctrl.export.lowering import Lowered, lower
+from pkxyz_ctrl.export.planned import is_planned, memory_of, whole
 from pkxyz_ctrl.export.selftest import EVERY, SelfTest, self_test
 from pkxyz_ctrl.export.stored import Stored, stored_in_exchange
 from pkxyz_ctrl.export.structs import header, loop_header, struct_name
 from pkxyz_ctrl.export.targets import TARGETS, Target
 from pkxyz_ctrl.export.words import CANONICAL_NAN, FNV_OFFSET, FNV_PRIME, c_words, double_words, words_of
-from pkxyz_ctrl.loop.exchange import EXCHANGE_MEMORY
 from pkxyz_ctrl.loop.row import ROW
 
 Records = NDArray[np.void]
@@ -117,7 +117,7 @@ def write(out: Path, target_name: str, exported: Exported) -> dict[str, Any]:
         rows = REFERENCE_MAX_BYTES // exported.reference.itemsize
         require_room(exported.reference, f"give --ticks {rows} or less, and stream the rest")
     test = self_test(exported.config, exported.reference, exported.calls)
-    lowered = lower(kernels(), target)
+    lowered = lower(kernels(is_planned=is_planned(exported.law)), target)
     files = _files(target_name, target, exported, test, lowered)
     manifest = _manifest(target_name, target, exported, test, lowered, files)
     files["manifest.json"] = (json.dumps(manifest, indent=2) + "\n").encode()
@@ -151,7 +151,7 @@ def _files(name: str, target: Target, exported: Exported, test: SelfTest, lowere
         files |= {f"loop/{path.name}": path.read_bytes() for path in sorted(LOOP_SOURCES.iterdir())}
     files |= dict(exported.beside)
     texts = sources(exported, has_loop=target.has_loop)
-    texts |= {"pkxyz.s": lowered.assembly, "selftest.c": _self_test_c(test)}
+    texts |= {"pkxyz.s": lowered.assembly, "selftest.c": _self_test_c(test, memory_of(whole(exported.config)).dtype)}
     return files | {file: text.encode() for file, text in texts.items()} | {"pkxyz.o": lowered.code}
 
 
@@ -170,7 +170,7 @@ def _filled(file: str, values: dict[str, str]) -> bytes:
 
 def _config_c(exported: Exported) -> str:
     """What this law has of the settings, and room for what it has of the memory."""
-    return constant("pkxyz_config_words", exported.config, count=exported.stored.settings // 8) + (
+    return constant("pkxyz_config_words", whole(exported.config), count=exported.stored.settings // 8) + (
         "\n/* room for what this law needs of pkxyz_exchange_memory */\n"
         "uint64_t pkxyz_memory_words[PKXYZ_MEMORY_BYTES / 8];\n"
     )
@@ -186,8 +186,8 @@ def constant(name: str, records: Records, *, count: int | None = None) -> str:
     )
 
 
-def _self_test_c(test: SelfTest) -> str:
-    records = {"row": ROW, "memory": EXCHANGE_MEMORY}
+def _self_test_c(test: SelfTest, memory: np.dtype[np.void]) -> str:
+    records = {"row": ROW, "memory": memory}
     flags = "".join(
         f"const uint8_t pkxyz_{name}_is_double[{len(double_words(dtype))}] = "
         f"{{{','.join(str(int(is_double)) for is_double in double_words(dtype))}}};\n"

@@ -24,17 +24,21 @@ class ExportError(ValueError):
 
 
 class Kernels(NamedTuple):
-    """``ir``: one module with all of them. ``symbols``: names of the entries' functions in it."""
+    """``ir``: one module with all of them. ``symbols``: names of the entries' functions in it. ``is_planned``: those of
+    a law that plans.
+    """
 
     ir: str
     symbols: dict[str, str]
+    is_planned: bool = False
 
 
-def kernels() -> Kernels:
-    """Those of ``entries.ENTRIES``, from the folder of compiled kernels if they lie there. Takes a minute if not."""
-    text = kept("export.ll", ("entries.py", "emit.py"), lambda: _emitted().encode()).decode()
+def kernels(*, is_planned: bool = False) -> Kernels:
+    """Those of ``entries.entries_for``, from the folder of compiled kernels if they lie there. Takes a minute if not."""
+    name, words = ("export_planned.ll", ("planned",)) if is_planned else ("export.ll", ())
+    text = kept(name, ("entries.py", "emit.py", "planned.py"), lambda: _emitted(words).encode()).decode()
     first, _, ir = text.partition("\n")
-    return Kernels(ir, json.loads(first))
+    return Kernels(ir, json.loads(first), is_planned)
 
 
 def kept(name: str, sources: Sequence[str], make: Callable[[], bytes]) -> bytes:
@@ -63,7 +67,7 @@ def _place(name: str, sources: Sequence[str]) -> Path | None:
     return Path(folder) / f"{stem}-{digest.hexdigest()[:16]}.{suffix}"
 
 
-def _emitted() -> str:
+def _emitted(more: tuple[str, ...]) -> str:
     with tempfile.TemporaryDirectory(prefix="pkxyz-export-") as folder:
         out = Path(folder) / "kernels.ll"
         env = {
@@ -75,7 +79,7 @@ def _emitted() -> str:
             "NUMBA_DISABLE_JIT": "0",
             "PYTHONPATH": os.pathsep.join(path for path in sys.path if path),
         }
-        words = [sys.executable, "-W", "ignore", "-m", "pkxyz_ctrl.export.emit", str(out)]
+        words = [sys.executable, "-W", "ignore", "-m", "pkxyz_ctrl.export.emit", str(out), *more]
         done = subprocess.run(words, env=env, check=False, capture_output=True, text=True)
         if done.returncode != 0:
             last = (done.stderr.strip().splitlines() or ["it said nothing"])[-1]

@@ -1,6 +1,7 @@
 """From the kernels' LLVM IR to an object for a target: wrappers dropped, a plain C entry each, LLVM's own passes."""
 
 import re
+from collections.abc import Sequence
 from typing import NamedTuple
 
 import llvmlite.binding as llvm
@@ -16,7 +17,7 @@ _LIBRARY = re.compile(r"(__aeabi_)?mem(set|clr|cpy|move)[48]?")
 # of mangled names: where a tick's time goes, all else is to be small; of that what stands apart, not to be made small
 # with its callers, nor to have its stack held while others work; and what of it is seldom called, or so long that its
 # loops had better stay loops
-_IN_A_HURRY = re.compile(r"10pkxyz_ctrl4core")
+_IN_A_HURRY = re.compile(r"10pkxyz_ctrl4(core|loop10active_set)")
 _APART = re.compile(
     r"10adaptation(5learn|8_compare|5begin)B|10linear_law(7advance|12add_feedback)B|5youla12add_feedbackB"
     r"|9estimator11predict_farB|9feed_hold3rowB|5cycle7observeB"
@@ -38,8 +39,9 @@ class Lowered(NamedTuple):
 def lower(kernels: Kernels, target: Target) -> Lowered:
     """Compile for a target. Raises ``ExportError`` if a kernel needs what no bare machine has: a heap, an exception."""
     machine = target.machine
-    text = _prepared(kernels, target, machine)
-    public = {entry.name for entry in entries_for(has_loop=target.has_loop)}
+    entries = entries_for(has_loop=target.has_loop, is_planned=kernels.is_planned)
+    text = _prepared(kernels, target, machine, entries)
+    public = {entry.name for entry in entries}
     module = _optimised(text, machine, public, is_small=not target.is_hosted)
     if not target.is_wide:
         narrow = _without_wide_divisions(_without_wide_conversions(str(module)))
@@ -64,7 +66,7 @@ def _may_be_owed(name: str, target: Target) -> bool:
     return not target.has_double and _SOFT_DOUBLE.fullmatch(name) is not None
 
 
-def _prepared(kernels: Kernels, target: Target, machine: llvm.TargetMachine) -> str:
+def _prepared(kernels: Kernels, target: Target, machine: llvm.TargetMachine, entries: Sequence[Entry]) -> str:
     text = kernels.ir
     for line, value in (("triple", target.llvm_triple), ("datalayout", machine.target_data)):
         text = re.sub(rf'^target {line} = ".*"$', f'target {line} = "{value}"', text, count=1, flags=re.MULTILINE)
@@ -76,12 +78,7 @@ def _prepared(kernels: Kernels, target: Target, machine: llvm.TargetMachine) -> 
     text = re.sub(r"@(sqrt|llvm\.sqrt\.f64)\(", f"@{root}(", text)
     if own_root:
         text = re.sub(r"^declare .*@pkxyz\.sqrt\(.*$", "", text, flags=re.MULTILINE)
-    return (
-        text
-        + runtime.FLOOR
-        + own_root
-        + "".join(_c_entry(entry, kernels) for entry in entries_for(has_loop=target.has_loop))
-    )
+    return text + runtime.FLOOR + own_root + "".join(_c_entry(entry, kernels) for entry in entries)
 
 
 def _replaced(text: str, name: str, definition: str) -> str:
@@ -116,7 +113,8 @@ def _handed(argument: Argument) -> tuple[list[str], str, list[str]]:
     bytes of an item, data, shape, strides.
     """
     name = argument.name
-    if argument.dtype is None:
+    dtype = argument.taken
+    if dtype is None:
         if argument.c_type == "int64_t":
             return [f"i64 %{name}"], "", [f"i64 %{name}"]
         return [f"i32 %{name}"], f"  %{name}_n = sext i32 %{name} to i64\n", [f"i64 %{name}_n"]
@@ -126,7 +124,7 @@ def _handed(argument: Argument) -> tuple[list[str], str, list[str]]:
     if argument.kind == MANY:
         taken.append(f"i32 %{name}_count")
         before, count = f"  %{name}_n = sext i32 %{name}_count to i64\n", f"%{name}_n"
-    size = argument.dtype.itemsize
+    size = dtype.itemsize
     handed = ["ptr null", "ptr null", f"i64 {count}", f"i64 {size}", f"ptr %{name}", f"i64 {count}", f"i64 {size}"]
     return taken, before, handed
 

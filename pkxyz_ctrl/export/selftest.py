@@ -7,11 +7,13 @@ from numpy.typing import NDArray
 
 from pkxyz_ctrl.can.process_pdo import encode
 from pkxyz_ctrl.compiled.direct_call import direct
+from pkxyz_ctrl.export import planned
 from pkxyz_ctrl.export.calls import CALL, Call
+from pkxyz_ctrl.export.planned import begins, is_planned, memory_of, whole
 from pkxyz_ctrl.export.stored import stored_in_exchange
 from pkxyz_ctrl.export.words import FNV_OFFSET, canonical, digest
 from pkxyz_ctrl.loop import exchange
-from pkxyz_ctrl.loop.exchange import EXCHANGE_MEMORY
+from pkxyz_ctrl.loop.exchange import EXCHANGE, EXCHANGE_MEMORY
 from pkxyz_ctrl.safety.modes import Mode
 
 Records = NDArray[np.void]
@@ -60,15 +62,18 @@ class Board:
     """What ``main.c`` does with a call, over memories of its own."""
 
     def __init__(self, config: Records, reference: Records) -> None:
-        self.memory = np.zeros(1, EXCHANGE_MEMORY)
-        self._config, self._reference = config, reference
+        self._whole = whole(config)
+        self._whole_memory = memory_of(self._whole)
+        self._config, self._reference = begins(self._whole, EXCHANGE), reference
+        self.memory = begins(self._whole_memory, EXCHANGE_MEMORY)
         self._driver, self._cycle = self.memory["driver"][0], self.memory["cycle"][0]
-        self._held = stored_in_exchange(config["law"][0]).memory
+        self._held = stored_in_exchange(self._config["law"][0]).memory
         exchange.switch_on(self.memory)
-        c, m = config, self.memory
+        c, m = self._config, self.memory
         self._begin, self._finish = direct(exchange.begin, c, m, 0), direct(exchange.finish, c, m, 0, 0)
         self._on_frame = direct(exchange.on_frame, c, m, *[0] * 5)
-        self._period = direct(exchange.period, c, m, reference, 0)
+        period = planned.period if is_planned(self._config["law"][0]) else exchange.period
+        self._period = direct(period, self._whole, self._whole_memory, reference, 0)
 
     def play(self, call: np.void) -> NDArray[np.uint64]:
         """Words that come of one of ``CALL``: what was told; frames, or the row of a period."""
@@ -91,7 +96,7 @@ class Board:
         elif kind == Call.BEGIN:
             told = self._begin(config, memory, t_us)
         elif kind == Call.PERIOD:
-            told = self._period(config, memory, self._reference, data)
+            told = self._period(self._whole, self._whole_memory, self._reference, data)
         elif kind == Call.FINISH:
             told = self._finish(config, memory, t_us, data)
         elif kind == Call.COME_UP:
@@ -122,7 +127,7 @@ class Board:
 
     def held(self) -> NDArray[np.uint64]:
         """Words of what a board holds of the memory. Raises ``AssertionError`` if this law used more."""
-        words = canonical(self.memory)
+        words = canonical(self._whole_memory)
         assert not words[self._held // 8 :].any()
         return words[: self._held // 8]
 

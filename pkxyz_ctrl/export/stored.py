@@ -9,8 +9,12 @@ from pkxyz_ctrl.core import tick
 from pkxyz_ctrl.core.demand import LINEAR, PREDICTIVE
 from pkxyz_ctrl.core.linear_law import LINEAR_LAW
 from pkxyz_ctrl.core.youla import YOULA_STATE
+from pkxyz_ctrl.export.planned import PLANNED_LAW, PLANNED_MEMORY
+from pkxyz_ctrl.loop import active_set
 from pkxyz_ctrl.loop import cycle as cycling
 from pkxyz_ctrl.loop.exchange import EXCHANGE, EXCHANGE_MEMORY
+from pkxyz_ctrl.loop.predictive_cycle import PLANNER
+from pkxyz_ctrl.loop.predictive_problem import PROBLEM
 
 Records = NDArray[np.void]
 
@@ -25,14 +29,14 @@ class Stored(NamedTuple):
 
 
 def stored(law: Records) -> Stored:
-    """Of ``cycle.LAW`` and ``cycle.MEMORY``, for a ``law`` (1,)."""
+    """Of ``cycle.LAW`` and ``cycle.MEMORY``, for a ``law`` (1,); or of ``PLANNED_LAW`` and ``PLANNED_MEMORY``."""
     numbers = law[0]["tick"]
     rows = int(numbers["linear"]["order"]) if numbers["kind"] == LINEAR else 0
     linear_at = _at(cycling.LAW, "tick") + _at(tick.LAW, "linear")
     row_bytes = LINEAR_LAW["a"].itemsize // LINEAR_LAW["a"].shape[0]
     settings = linear_at + _at(LINEAR_LAW, "a") + rows * row_bytes if rows else linear_at
     if numbers["kind"] == PREDICTIVE:
-        settings = cycling.LAW.itemsize
+        return _stored_planned(int(numbers["predictive"]["horizon"]))
     last = _at(cycling.MEMORY, "tick")
     if numbers["adaptation"]["on"] != 0:
         memory = cycling.MEMORY.itemsize
@@ -41,6 +45,15 @@ def stored(law: Records) -> Stored:
     else:
         memory = last + _at(tick.MEMORY, "youla") + _at(YOULA_STATE, "innovation_m")
     return Stored(_whole(settings), _whole(memory))
+
+
+def _stored_planned(horizon: int) -> Stored:
+    """All of the records of every law, and behind them what such a horizon needs of problem and planner."""
+    program, work = active_set.used_bytes(9 * horizon - 3, 3 * horizon + 1)
+    return Stored(
+        _whole(_at(PLANNED_LAW, "problem") + _at(PROBLEM, "program") + program),
+        _whole(_at(PLANNED_MEMORY, "planner") + _at(PLANNER, "work") + work),
+    )
 
 
 def stored_in_exchange(law: Records) -> Stored:

@@ -80,6 +80,14 @@ def program(hessian: Array, rows: Array) -> Records:
     return made
 
 
+def used_bytes(limits: int, unknowns: int) -> tuple[int, int]:
+    """Of ``PROGRAM`` and of ``WORK``, for m limits and n unknowns, from their beginnings."""
+    held = unknowns + 1
+    numbers = limits * _padded(limits), held * _padded(held)
+    behind = (LIMITS_MOST * LIMITS_MOST - numbers[0], HELD_MOST * HELD_MOST - numbers[1])
+    return PROGRAM.itemsize - 8 * behind[0], WORK.itemsize - 8 * behind[1]
+
+
 def _padded(count: int) -> int:
     return -(-count // _TOGETHER) * _TOGETHER
 

@@ -9,6 +9,7 @@ from numpy.typing import NDArray
 from pkxyz_ctrl.compiled.direct_call import direct
 from pkxyz_ctrl.core.demand import PREDICTIVE
 from pkxyz_ctrl.loop import cycle as cycling
+from pkxyz_ctrl.loop.predictive_cycle import PredictiveCycle
 
 Records = NDArray[np.void]
 Array = NDArray[np.float64]
@@ -22,11 +23,5 @@ def period_of(law: Records, reference: Records) -> Period:
     A new one for each controller: that of the predictive law remembers its last plan.
     """
     if law["tick"]["kind"][0] == PREDICTIVE:
-        return _planning(law)
+        return PredictiveCycle(law)
     return direct(cycling.cycle, law, cycling.new_memory(), reference)
-
-
-def _planning(law: Records) -> Any:
-    from pkxyz_ctrl.loop.predictive_cycle import PredictiveCycle  # brings scipy
-
-    return PredictiveCycle(law)
