@@ -16,6 +16,7 @@ from pkxyz_ctrl.export.calls import CALL
 from pkxyz_ctrl.export.folder import Exported, require_exportable, require_room
 from pkxyz_ctrl.export.kernels import ExportError, kept, kernels
 from pkxyz_ctrl.export.lowering import lower
+from pkxyz_ctrl.export.planned import is_planned
 from pkxyz_ctrl.export.targets import TARGETS
 
 Records = NDArray[np.void]
@@ -24,7 +25,7 @@ TARGET = "cortex-m7"
 EMULATOR, COMPILER = "qemu-system-arm", "arm-none-eabi-gcc"
 _REMEDY = "apt-get install qemu-system-arm gcc-arm-none-eabi"
 _FIRMWARE = Path(exporting.__file__).parent / "firmware"
-_MADE_OF = ("entries.py", "emit.py", "lowering.py", "runtime.py", "targets.py")
+_MADE_OF = ("entries.py", "emit.py", "planned.py", "lowering.py", "runtime.py", "targets.py")
 _FLAGS = ("-std=c11", "-O2", "-Wall", "-Wextra", "-fno-strict-aliasing", "-ffp-contract=off")
 
 
@@ -42,9 +43,10 @@ def require_programs() -> None:
         program(name)
 
 
-def object_code() -> bytes:
-    """The controller for the board, made or kept."""
-    return kept(f"{TARGET}.o", _MADE_OF, lambda: lower(kernels(), TARGETS[TARGET]).code)
+def object_code(*, is_planned: bool = False) -> bytes:
+    """The controller for the board, made or kept; that of a law that plans is another."""
+    name = f"{TARGET}_planned.o" if is_planned else f"{TARGET}.o"
+    return kept(name, _MADE_OF, lambda: lower(kernels(is_planned=is_planned), TARGETS[TARGET]).code)
 
 
 def built(config: Records, reference: Records, outputs: Records, can: CanConfig, controller: str, place: Path) -> Path:
@@ -56,7 +58,7 @@ def built(config: Records, reference: Records, outputs: Records, can: CanConfig,
     try:
         require_exportable(exported.law, controller, TARGET)
         require_room(reference, "give a shorter scenario (duration_s)")
-        code = object_code()
+        code = object_code(is_planned=is_planned(exported.law))
     except ExportError as error:
         raise ConfigError(str(error)) from None
     texts = exporting.sources(exported) | {"bus.h": _bus_h(can)}

@@ -55,7 +55,7 @@ class ToldController(Controller):
         """A call was made: what it told, and the bytes that it left. Raises ``StartUpError`` where that failed."""
         call, t_us = Call(int(head["call"])), int(head["t_us"])
         self._told[call] = int(head["told"])
-        self._held[:] = memory
+        self._held[:] = memory[: len(self._held)]  # a planner's own stands behind
         match call:
             case Call.START:
                 self.start(t_us)

@@ -1,4 +1,5 @@
-"""``python -m pkxyz_ctrl.export.emit FILE [planned]``: write the kernels' unoptimised LLVM IR, below a line with their symbols.
+"""``python -m pkxyz_ctrl.export.emit FILE [planned]``: write the kernels' unoptimised LLVM IR, below a line
+with their symbols.
 
 ``kernels`` runs it, in the environment that it needs.
 """

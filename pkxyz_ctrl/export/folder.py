@@ -15,7 +15,6 @@ import numpy as np
 from numpy.typing import NDArray
 
 from pkxyz_ctrl.compiled.kernel_cache import digest_of_kernels
-from pkxyz_ctrl.core.demand import PREDICTIVE
 from pkxyz_ctrl.export.elf import loaded_bytes
 from pkxyz_ctrl.export.kernels import ExportError, kernels
 from pkxyz_ctrl.export.lowering import Lowered, lower
@@ -88,17 +87,29 @@ def target_of(name: str) -> Target:
 
 def require_exportable(law: Records, name: str, target: str) -> None:
     """Raises ``ExportError`` for a law that does not go whole, or not in time."""
-    period_us, most_us = int(law["period_us"][0]), target_of(target).tick_most_us
+    period_us, most_us = int(law["period_us"][0]), tick_most_us(law, target_of(target))
     if period_us * BUSY_MOST < most_us:
+        fewer = "fewer rounds of its solver (mpc.iterations_max), " if is_planned(law) else ""
         raise ExportError(
             f"a period of {period_us} us is too short for {target}, where the longest tick takes {most_us} us; give a "
-            f"bus of {math.ceil(most_us / BUSY_MOST)} us or more, or another target"
+            f"bus of {math.ceil(most_us / BUSY_MOST)} us or more, {fewer}or another target"
         )
-    if law["tick"]["kind"][0] == PREDICTIVE:
+    if is_planned(law) and target_of(target).has_loop:
         raise ExportError(
-            f"controller {name!r} solves a problem in the middle of a tick, and the solver does not go with it yet; "
-            "choose another one (--controller robust)"
+            f"controller {name!r} solves a problem in the middle of a tick, and the loop at rate in C has no place for "
+            "what it remembers; choose another one (--controller robust)"
         )
+
+
+def tick_most_us(law: Records, target: Target) -> int:
+    """What the longest tick of a law takes on a target; 0 where that is short. A plan's grows with its solver's rounds,
+    which are bounded, and each with the cube of the limits that may be held.
+    """
+    if not is_planned(law):
+        return target.tick_most_us
+    numbers = law["tick"]["predictive"][0]
+    larger = (int(numbers["horizon"]) / 10) ** 3
+    return target.tick_most_us + math.ceil(target.round_most_us * (1 + int(numbers["iterations_max"])) * larger)
 
 
 def require_room(reference: Records, instead: str) -> None:

@@ -34,7 +34,7 @@ class Kernels(NamedTuple):
 
 
 def kernels(*, is_planned: bool = False) -> Kernels:
-    """Those of ``entries.entries_for``, from the folder of compiled kernels if they lie there. Takes a minute if not."""
+    """Those of ``entries_for``, from the folder of compiled kernels if they lie there. Takes a minute if not."""
     name, words = ("export_planned.ll", ("planned",)) if is_planned else ("export.ll", ())
     text = kept(name, ("entries.py", "emit.py", "planned.py"), lambda: _emitted(words).encode()).decode()
     first, _, ir = text.partition("\n")

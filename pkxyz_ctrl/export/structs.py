@@ -275,7 +275,7 @@ PKXYZ_ASSERT(sizeof(double) == 8);
 
 _LAW = """
 #define PKXYZ_PERIOD_US {period_us} /* between two calls of pkxyz_begin */
-#define PKXYZ_CONFIG_BYTES {settings} /* of pkxyz_exchange; what this law lacks stands last and is never looked at, what it has besides behind all */
+#define PKXYZ_CONFIG_BYTES {settings} /* of pkxyz_exchange, without what this law lacks; what it has besides behind */
 #define PKXYZ_MEMORY_BYTES {memory} /* of pkxyz_exchange_memory, likewise */
 """
 

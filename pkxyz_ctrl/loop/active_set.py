@@ -188,29 +188,32 @@ def _let_go_wrong(work: np.void) -> bool:
 
 @kernel
 def _exchange(program: np.void, work: np.void) -> bool:
-    """Let go of those that hold nothing back and take in all that are passed, in order; returns whether there was any.
-    Where limits determine each other, it is the last ones that are left out.
+    """Let go of those that hold nothing back and take in all that are passed; returns whether there was any. The new
+    ones come first, and of either the first rows: where limits determine each other, the last is left out.
     """
     value, lower, upper, held, side = work["value"], work["lower"], work["upper"], work["held"], work["side"]
-    changes, kept, count = _let_go_wrong(work), work["count"], 0
-    old = HELD_MOST - kept
+    changes, count = _let_go_wrong(work), 0
+    _put_in_order(work)
+    kept = work["count"]
+    old = away = HELD_MOST - kept
     for k in range(kept - 1, -1, -1):
-        held[old + k], side[old + k] = held[k], side[k]
+        held[away + k], side[away + k] = held[k], side[k]
     for i in range(program["limits"]):
         above, below = value[i] - upper[i], lower[i] - value[i]
         if old < HELD_MOST and held[old] == i:
-            held[count], side[count] = i, side[old]
-            count, old = count + 1, old + 1
-        elif (above if above > below else below) > _PASSED and count + HELD_MOST - old < program["held_most"]:
-            held[count], side[count], changes = i, 1.0 if above > below else -1.0, True
+            old += 1
+        elif (above if above > below else below) > _PASSED and count + kept < program["held_most"]:
+            held[count], side[count] = i, 1.0 if above > below else -1.0
             count += 1
-    work["count"] = count
-    return changes
+    for k in range(kept):
+        held[count + k], side[count + k] = held[away + k], side[away + k]
+    work["count"] = count + kept
+    return bool(changes or count > 0)
 
 
 @kernel
 def _put_in_order(work: np.void) -> None:
-    """The limits that are guessed to hold, each once."""
+    """The limits that are held by their rows, each once."""
     held, side, count = work["held"], work["side"], 0
     for k in range(work["count"]):
         limit, at_side, at = held[k], side[k], count
@@ -235,9 +238,9 @@ def _values(program: np.void, work: np.void) -> None:
     fours = count & ~3
     for k in range(0, fours, 4):
         a, b, c, d = held[k] * row, held[k + 1] * row, held[k + 2] * row, held[k + 3] * row
-        _take_four(between, a, b, c, d, share[k], share[k + 1], share[k + 2], share[k + 3], row, value)
+        _take_four(between, a, b, c, d, share[k], share[k + 1], share[k + 2], share[k + 3], row, value, 0)
     for k in range(fours, count):
-        _take(between, held[k] * row, share[k], row, value)
+        _take(between, held[k] * row, share[k], row, value, 0)
 
 
 @kernel
@@ -248,10 +251,10 @@ def _factorise(program: np.void, work: np.void) -> None:
     )  # fmt: skip
     count = work["count"]
     for j in range(count):
-        of_limit, out, length = held[j] * program["row"], factor[j * row + j : j * row + count], count - j
+        of_limit, at, length = np.uint64(held[j] * program["row"]), j * row + j, count - j
         for i in range(length):
-            out[i] = between[of_limit + held[j + i]]
-        own, fours = out[0], j & ~3
+            factor[np.uint64(at + i)] = between[of_limit + np.uint64(held[j + i])]
+        own, fours = factor[at], j & ~3
         for k in range(0, fours, 4):
             a, b, c, d = k * row + j, (k + 1) * row + j, (k + 2) * row + j, (k + 3) * row + j
             p, r, s, t = (
@@ -260,10 +263,11 @@ def _factorise(program: np.void, work: np.void) -> None:
                 factor[c] * share[k + 2],
                 factor[d] * share[k + 3],
             )
-            _take_four(factor, a, b, c, d, p, r, s, t, length, out)
+            _take_four(factor, a, b, c, d, p, r, s, t, length, factor, at)
         for k in range(fours, j):
-            _take(factor, k * row + j, factor[k * row + j] * share[k], length, out)
-        share[j] = 1.0 / out[0] if out[0] > _OTHERS * own else 0.0
+            _take(factor, k * row + j, factor[k * row + j] * share[k], length, factor, at)
+        left = factor[at]
+        share[j] = 1.0 / left if left > _OTHERS * own else 0.0
 
 
 @kernel
@@ -271,7 +275,7 @@ def _forwards(work: np.void, row: int, z: Array) -> None:
     """L z' = z in its place."""
     count, share = work["count"], work["share"]
     for k in range(count - 1):
-        _take(work["factor"], k * row + k + 1, z[k] * share[k], count - k - 1, z[k + 1 : count])
+        _take(work["factor"], k * row + k + 1, z[k] * share[k], count - k - 1, z, k + 1)
 
 
 @kernel
@@ -279,39 +283,38 @@ def _backwards(work: np.void, row: int, z: Array) -> None:
     """D L^T y = z in its place, in four sums."""
     count, share, factor = work["count"], work["share"], work["factor"]
     for k in range(count - 1, -1, -1):
-        a, b, c, d, begin = z[k], 0.0, 0.0, 0.0, k + 1 + (count - k - 1 & 3)
-        for i in range(k + 1, begin):
-            a -= factor[k * row + i] * z[i]
-        for i in range(begin, count, 4):
-            at = k * row + i
-            a -= factor[at] * z[i]
-            b -= factor[at + 1] * z[i + 1]
-            c -= factor[at + 2] * z[i + 2]
-            d -= factor[at + 3] * z[i + 3]
+        a, b, c, d, at, end = z[k], 0.0, 0.0, 0.0, np.uint64(k * row), np.uint64(count)
+        i, one = np.uint64(k + 1), np.uint64(1)
+        while (end - i) & np.uint64(3):
+            a -= factor[at + i] * z[i]
+            i += one
+        while i < end:
+            a -= factor[at + i] * z[i]
+            b -= factor[at + i + one] * z[i + one]
+            c -= factor[at + i + np.uint64(2)] * z[i + np.uint64(2)]
+            d -= factor[at + i + np.uint64(3)] * z[i + np.uint64(3)]
+            i += np.uint64(4)
         z[k] = ((a + b) + (c + d)) * share[k]
 
 
 @kernel
-def _take(matrix: Array, at: int, share: float, count: int, out: Array) -> None:
-    """Take a share of so many numbers of a matrix, from ``at`` on, off ``out``."""
-    row = matrix[at : at + count]  # numba looks at each index whether it is negative, but in a plain loop
-    for i in range(count):
-        out[i] -= share * row[i]
+def _take(matrix: Array, at: int, share: float, count: int, out: Array, to: int) -> None:
+    """Take a share of so many numbers of a matrix, from ``at`` on, off those of ``out`` from ``to`` on."""
+    first, begin = np.uint64(at), np.uint64(to)  # numba looks at each signed index whether it is negative
+    for i in range(np.uint64(count)):
+        out[begin + i] -= share * matrix[first + i]
 
 
 @kernel
 def _take_four(
-    matrix: Array, a: int, b: int, c: int, d: int, p: float, r: float, s: float, t: float, count: int, out: Array
-) -> None:
+    matrix: Array, a: int, b: int, c: int, d: int, p: float, r: float, s: float, t: float, count: int, out: Array,
+    to: int,
+) -> None:  # fmt: skip
     """The same from four places at once, in the order of one after the other."""
-    first, second, third, fourth = (
-        matrix[a : a + count],
-        matrix[b : b + count],
-        matrix[c : c + count],
-        matrix[d : d + count],
-    )
-    for i in range(count):
-        out[i] = out[i] - p * first[i] - r * second[i] - s * third[i] - t * fourth[i]
+    first, second, third, fourth, begin = np.uint64(a), np.uint64(b), np.uint64(c), np.uint64(d), np.uint64(to)
+    for i in range(np.uint64(count)):
+        left = out[begin + i] - p * matrix[first + i] - r * matrix[second + i]
+        out[begin + i] = left - s * matrix[third + i] - t * matrix[fourth + i]
 
 
 @kernel

@@ -36,6 +36,7 @@ PLANNER = np.dtype(
 """What a planner remembers, and works with."""
 
 _REHEARSED: Final = 6
+_REHEARSAL_ROUNDS: Final = 3
 
 
 class PredictiveCycle:
@@ -131,7 +132,8 @@ def _solve(law: np.void, planner: np.void, problem: np.void, count: Array, rehea
     if rehearses:
         for k in range(0, _REHEARSED * 3, 3):
             free[k] = upper[k] + 1.0
-    rounds: int = active_set.solve(problem["program"], work, law["predictive"]["iterations_max"])
+    rounds_max = _REHEARSAL_ROUNDS if rehearses else law["predictive"]["iterations_max"]
+    rounds: int = active_set.solve(problem["program"], work, rounds_max)
     return rounds
 
 
@@ -166,12 +168,13 @@ def _pose(made: np.void, problem: np.void, n: int, work: np.void) -> None:
 
 @kernel
 def hold_a_period_on(work: np.void, n: int) -> None:
-    """What held the last plan is taken to hold this one, each limit an interval sooner; what was a slew within the plan
-    may be one after the last counts.
+    """What held the last plan is taken to hold this one, each limit an interval sooner; what was the first slew within
+    the plan is one after the last counts.
     """
     held, side, count = work["held"], work["side"], 0
+    slews, strokes = 3 * n, 6 * n - 3
     for k in range(work["count"]):
-        limit, slews, strokes = held[k], 3 * n, 6 * n - 3
+        limit = held[k]
         if slews <= limit < slews + 3:
             limit -= slews
         elif 3 <= limit < slews or slews + 3 <= limit < strokes or strokes + 3 <= limit:

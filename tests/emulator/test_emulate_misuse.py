@@ -34,7 +34,7 @@ def test_a_missing_program_is_named_with_what_brings_it(tmp_path, capsys, monkey
     [
         (("nowhere",), "nowhere"),
         (("--controller", "nope"), "nope"),
-        (("--controller", "mpc"), "controller 'mpc' solves a problem in the middle of a tick"),
+        (("--controller", "mpc"), "is too short for cortex-m7, where the longest tick takes 5034 us"),
         (("--controller", "robust_20k", "--bus", "local_20k"), "bus 'local_20k' has no [can]"),
         (("--bus", "unix_2k"), "leads to other processes or devices"),
         (("--fault", "sense.9:stuck@1"), "no target is called 'sense.9'"),
@@ -47,7 +47,7 @@ def test_what_does_not_go_is_said_in_a_line(tmp_path, capsys, monkeypatch, progr
 
 def test_a_firmware_that_does_not_link(tmp_path, capsys, monkeypatch, programs):
     """A compiler that fails says so before anything is written; what lies in the folder stays as it is."""
-    monkeypatch.setattr("hil.emulator.image.object_code", lambda: b"")
+    monkeypatch.setattr("hil.emulator.image.object_code", lambda **_: b"")
     assert "could not link the firmware" in refused(capsys, monkeypatch, "emulate", "--out", tmp_path / "out")
     assert not (tmp_path / "out").exists()
 

@@ -20,7 +20,8 @@ from pkxyz_ctrl.loop.reference import REFERENCE
     [
         (("--target", "z80"), "--target: 'z80' is none; choose host, linux, cortex-m7"),
         (("nowhere",), "nowhere"),
-        (("--controller", "mpc"), "controller 'mpc' solves a problem in the middle of a tick"),
+        (("--controller", "mpc"), "the longest tick takes 5034 us; give a bus of 6293 us or more, fewer rounds of its"),
+        (("--controller", "mpc", "--target", "linux"), "controller 'mpc' solves a problem in the middle of a tick"),
         (("--controller", "nope"), "nope"),
         (("--ticks", "10"), "ticks"),
         (("--target", "cortex-m4"), "a period of 200 us is too short for cortex-m4, where the longest tick takes 3750"),
@@ -44,6 +45,21 @@ def test_the_shortest_period_that_it_asks_for_goes(target):
     law["period_us"] -= 1
     with pytest.raises(ExportError, match="is too short"):
         require_exportable(law, "of_a_test", target)
+
+
+@pytest.mark.parametrize("horizon", [10, 20])
+def test_fewer_rounds_of_a_solver_take_less(horizon):
+    """It may take all the rounds that it is allowed, whatever it took so far."""
+    law = load_scenario("raster", controller="mpc").setup().law.copy()
+    law["period_us"], law["tick"]["predictive"]["horizon"] = 2_000, horizon
+    for rounds, goes in ((8, horizon == 10), (9, False)):
+        law["tick"]["predictive"]["iterations_max"] = rounds
+        if goes:
+            require_exportable(law, "of_a_test", "cortex-m7")
+        else:
+            with pytest.raises(ExportError, match=r"mpc\.iterations_max"):
+                require_exportable(law, "of_a_test", "cortex-m7")
+    require_exportable(law, "of_a_test", "host")
 
 
 def test_nothing_of_the_users_is_overwritten(tmp_path, capsys, monkeypatch):
