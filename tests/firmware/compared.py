@@ -16,6 +16,7 @@ from segments import Segment
 
 from hil.runs.scenario import load_scenario
 from pkxyz_ctrl.can.process_pdo import pdo_record
+from pkxyz_ctrl.export.planned import begins
 from pkxyz_ctrl.export.stored import stored, stored_in_exchange
 from pkxyz_ctrl.export.words import canonical
 from pkxyz_ctrl.loop import cycle as cycling
@@ -34,6 +35,13 @@ class Law(NamedTuple):
     name: str
     segments: list[Segment]
     memory: Records
+
+
+def new_memory(dtype: np.dtype[np.void]) -> Records:
+    """Memory (1,) of ``cycle.MEMORY`` or of ``PLANNED_MEMORY``, as every law begins."""
+    memory = np.zeros(1, dtype)
+    begins(memory, cycling.MEMORY)["mode"] = Mode.IDLE
+    return memory
 
 
 def shared(code: Path, folder: Path) -> ctypes.CDLL:
@@ -77,9 +85,9 @@ def frames_compared(library: ctypes.CDLL) -> list[str]:
 
 def first_difference(law: Law, library: ctypes.CDLL) -> str:
     """Where a library parts from Python; empty if nowhere. It holds no more than a board does."""
-    held, ticks = stored(law.segments[0].law), 0
+    held, ticks = stored(begins(law.segments[0].law, cycling.LAW)), 0
     settings, memory = Guarded(held.settings), Guarded(held.memory)
-    memory.fill(cycling.new_memory(Mode.IDLE))
+    memory.fill(new_memory(law.memory.dtype))
     for segment in law.segments:
         settings.fill(segment.law)
         rows, path = np.zeros_like(segment.rows), segment.reference
@@ -91,7 +99,7 @@ def first_difference(law: Law, library: ctypes.CDLL) -> str:
         if not same.all():
             return f"{law.name}: row of tick {ticks + int(same.argmin())}"
         ticks += len(rows)
-    same = np.array_equal(canonical(memory.records(cycling.MEMORY)), canonical(law.memory))
+    same = np.array_equal(canonical(memory.records(law.memory.dtype)), canonical(law.memory))
     return "" if same else f"{law.name}: memory at the end"
 
 

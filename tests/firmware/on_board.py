@@ -17,6 +17,8 @@ from numpy.typing import NDArray
 
 from pkxyz_ctrl.export.elf import loaded_bytes, symbols
 from pkxyz_ctrl.export.entries import ENTRIES
+from pkxyz_ctrl.export.planned import begins
+from pkxyz_ctrl.export.stored import stored
 from pkxyz_ctrl.export.targets import TARGETS
 from pkxyz_ctrl.export.words import canonical
 from pkxyz_ctrl.loop import cycle as cycling
@@ -36,7 +38,7 @@ CODE_MOST, HELD_MOST, STACK_MOST = 56_000, 20 << 10, 2 << 10
 """Bytes of code, of law and memory together, and of stack on a Cortex-M7."""
 
 
-def compared_on_board(laws: list[Law], exchanges: list[Exchange], board: Path) -> list[str]:
+def compared_on_board(laws: list[Law], exchanges: list[Exchange], board: Path, code_most: int = CODE_MOST) -> list[str]:
     """The same on the emulated Cortex-M7, by a hash of each row; and how many instructions each tick took."""
     tools, why_not = board_tools()
     if tools is None:
@@ -44,14 +46,15 @@ def compared_on_board(laws: list[Law], exchanges: list[Exchange], board: Path) -
             f"\n*** SKIPPED: test-firmware on the board, nothing was tried on a Cortex-M7: {why_not}\n", file=sys.stderr
         )
         return []
-    failures = built(board, tools)
+    failures = built(board, tools, code_most)
     if failures:
         return failures
     with (board / "segments").open("wb") as file:
         for law in laws:
             for n, segment in enumerate(law.segments):
                 head = np.array([len(segment.reference), len(segment.inputs), n == 0, Mode.IDLE], np.int32)
-                file.writelines(array.tobytes() for array in (head, segment.law, segment.reference, segment.inputs))
+                sized = segment.law.tobytes()[: sizes_on_board(law)[0]]
+                file.writelines((head.tobytes(), sized, segment.reference.tobytes(), segment.inputs.tobytes()))
     begin_s = time.monotonic()
     done = tools.run("qemu-system-arm", *QEMU, "-icount", "shift=0", "-kernel", "board.elf", cwd=board)
     if done.returncode != 0:
@@ -60,6 +63,12 @@ def compared_on_board(laws: list[Law], exchanges: list[Exchange], board: Path) -
         f"Cortex-M7: {sum(len(s.rows) for law in laws for s in law.segments)} ticks, {time.monotonic() - begin_s:.0f} s"
     )
     return [*board_differences(laws, (board / "results").read_bytes()), *exchanges_on_board(exchanges, board, tools)]
+
+
+def sizes_on_board(law: Law) -> tuple[int, int]:
+    """Bytes of law and memory there: the records of every law, and of what a planner has besides what it needs."""
+    held = stored(begins(law.segments[0].law, cycling.LAW))
+    return max(held.settings, cycling.LAW.itemsize), max(held.memory, cycling.MEMORY.itemsize)
 
 
 QEMU = ("-M", "mps2-an500", "-nographic", "-monitor", "none", "-serial", "null", "-semihosting-config",
@@ -78,8 +87,10 @@ def board_differences(laws: list[Law], results: bytes) -> Iterator[str]:
         for segment in law.segments:
             size = len(segment.rows) * RESULT.itemsize
             got = np.frombuffer(results[at : at + size], RESULT)
-            memory = np.frombuffer(results[at + size : at + size + cycling.MEMORY.itemsize], cycling.MEMORY)
-            at += size + cycling.MEMORY.itemsize
+            length = sizes_on_board(law)[1]
+            memory = np.zeros(1, law.memory.dtype)
+            memory.view(np.uint8)[:length] = np.frombuffer(results[at + size : at + size + length], np.uint8)
+            at += size + length
             same = (got["hash"] == hashes(canonical(segment.rows).reshape(len(segment.rows), -1))) & (
                 got["status"] == 0
             )
@@ -145,7 +156,7 @@ def board_tools() -> tuple[Tools | None, str]:
     return Tools(root / "usr" / "bin", {**os.environ, "LD_LIBRARY_PATH": libraries}), ""
 
 
-def built(board: Path, tools: Tools) -> list[str]:
+def built(board: Path, tools: Tools, code_most: int) -> list[str]:
     """Link ``board.c`` with the exported object, run the folder's own self-test, and look at what was linked."""
     for name in ("board.c", "periods.c", "converse.c", "host_files.h"):
         shutil.copy(HERE / name, board)
@@ -169,8 +180,8 @@ def built(board: Path, tools: Tools) -> list[str]:
     code = (board / "pkxyz.o").read_bytes()
     size = loaded_bytes(code)
     print(f"Cortex-M7: {size} bytes of code, {len(symbols(code))} symbols; stack {bound} bytes, by {' > '.join(way)}")
-    if size > CODE_MOST or bound > STACK_MOST:
-        failures.append(f"code or stack beyond {CODE_MOST} and {STACK_MOST} bytes")
+    if size > code_most or bound > STACK_MOST:
+        failures.append(f"code or stack beyond {code_most} and {STACK_MOST} bytes")
     failures += whole_periods(board, tools)
     return failures + [f"board.elf: {line}" for line in fused_instructions(listing)]
 
@@ -182,5 +193,5 @@ def whole_periods(board: Path, tools: Tools) -> list[str]:
         return [f"periods.elf ended with {done.returncode}: {done.stderr[-200:]}"]
     taken = np.fromfile(board / "counts", np.uint32) * INSTRUCTIONS_A_COUNT
     middle, high, most = np.percentile(taken, [50, 99.9, 100])
-    print(f"{'whole periods, youla':28} {middle:8.0f} {high:8.0f} {most:8.0f}   {most / MHZ:.1f} us")
+    print(f"{'whole periods':28} {middle:8.0f} {high:8.0f} {most:8.0f}   {most / MHZ:.1f} us")
     return []

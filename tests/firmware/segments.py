@@ -15,7 +15,9 @@ from numpy.typing import NDArray
 
 from pkxyz_ctrl.compiled.direct_call import direct
 from pkxyz_ctrl.core import kinematics
+from pkxyz_ctrl.export import planned
 from pkxyz_ctrl.loop import cycle as cycling
+from pkxyz_ctrl.loop.predictive_problem import Problem
 from pkxyz_ctrl.loop.reference import reference_rows
 from pkxyz_ctrl.loop.row import ROW
 from pkxyz_ctrl.safety.modes import Event, Mode
@@ -33,7 +35,9 @@ _NODE_FOUND, _NODE_READY = int(Event.NODE_FOUND), int(Event.NODE_READY)
 
 
 class Segment(NamedTuple):
-    """``law`` (1,), ``reference`` (n,) and ``inputs`` (m,) as the cycle takes them; ``rows`` (m,) that came of it."""
+    """``law`` (1,), of ``PLANNED_LAW`` where it plans, ``reference`` (n,) and ``inputs`` (m,) as the cycle takes them;
+    ``rows`` (m,) that came of it.
+    """
 
     law: Records
     reference: Records
@@ -82,11 +86,13 @@ class Trouble(NamedTuple):
 
 
 def segments(
-    law: Records, trajectory: Trajectory, period_us: int, count: int, seed: int, memory: Records | None = None
+    law: Records, trajectory: Trajectory, period_us: int, count: int, seed: int, memory: Records
 ) -> Iterator[Segment]:
-    """``count`` of them for one law, from switching on, in ``memory`` (1,); the first without trouble."""
-    random = np.random.default_rng(seed)
-    memory = cycling.new_memory(Mode.IDLE) if memory is None else memory
+    """``count`` of them for one law, in ``memory`` (1,), of ``PLANNED_MEMORY`` where it plans; the first without
+    trouble.
+    """
+    random, whole = np.random.default_rng(seed), memory
+    memory, problem = planned.begins(whole, cycling.MEMORY), Problem(law).record() if planned.is_planned(law) else None
     for n in range(count):
         first = int(memory["reference_tick"][0])
         path = reference_rows(trajectory.sample(first, TICKS + PREVIEW, period_us), first)
@@ -97,22 +103,28 @@ def segments(
         for kind in chosen:
             KINDS[kind](trouble, random)
         recovers = n % 5 != 4  # in some, nobody helps
-        yield _run(memory, trouble, random, recovers=recovers)
+        taken = trouble.law
+        if problem is not None:
+            taken = np.zeros(1, planned.PLANNED_LAW)
+            taken["own"], taken["problem"] = trouble.law, problem
+        yield _run(memory, whole, taken, trouble, random, recovers=recovers)
 
 
-def _run(memory: Records, trouble: Trouble, random: np.random.Generator, *, recovers: bool) -> Segment:
+def _run(
+    memory: Records, whole: Records, taken: Records, trouble: Trouble, random: np.random.Generator, *, recovers: bool
+) -> Segment:
     law, reference, inputs, counts, offset = trouble
     rows, noise = np.zeros(TICKS, ROW), random.normal(0.0, 8.0, (TICKS, 3)) + offset
-    cycle = direct(cycling.cycle, law, memory, reference)
+    cycle = direct(cycling.cycle if taken is law else planned.cycle, taken, whole, reference)
     shown = direct(show, law, memory, noise[0], counts[0], 1)
     seen, row = memory["input"], memory["row"]
     for k in range(TICKS):
         seen[0] = inputs[k]
         shown(law, memory, noise[k], counts[k], int(recovers))
         inputs[k] = seen[0]
-        cycle(law, memory, reference)
+        cycle(taken, whole, reference)
         rows[k] = row[0]
-    return Segment(law, reference, inputs, rows)
+    return Segment(taken, reference, inputs, rows)
 
 
 def _stretch(random: np.random.Generator, longest: int) -> slice:

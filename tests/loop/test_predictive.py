@@ -24,7 +24,7 @@ from pkxyz_ctrl.core.predictive import FORCE_UNIT_N, STROKE_UNIT_M
 from pkxyz_ctrl.design.law import design_law
 from pkxyz_ctrl.design.model.loop_plant import held_force_softening
 from pkxyz_ctrl.loop import cycle as cycling
-from pkxyz_ctrl.loop import predictive_cycle, predictive_problem
+from pkxyz_ctrl.loop import active_set, predictive_cycle, predictive_problem
 from pkxyz_ctrl.loop.predictive_cycle import PredictiveCycle
 from pkxyz_ctrl.loop.predictive_problem import Problem
 from pkxyz_ctrl.loop.reference import REFERENCE, reference_rows
@@ -217,6 +217,18 @@ def test_rehearsals_change_no_bit(monkeypatch):
     monkeypatch.setattr(predictive_problem, "REHEARSAL_TICKS", 3)
     often, _ = rows_of(far_jump(mpc()), "fast")
     assert first_difference(often, jumped("mpc")[0]) is None
+
+
+def test_limits_of_the_last_plan_are_taken_an_interval_sooner():
+    """Bounds, slews and strokes each among themselves; the first slew becomes a bound, what has passed is forgotten."""
+    n, work = 10, np.zeros(1, active_set.WORK)
+    was = {2: -1.0, 3: 1.0, 29: 1.0, 30: -1.0, 34: 1.0, 56: -1.0, 57: 1.0, 61: -1.0, 86: 1.0}
+    work["held"][0, : len(was)], work["side"][0, : len(was)], work["count"] = list(was), list(was.values()), len(was)
+    predictive_cycle.hold_a_period_on(work[0], n)
+    count = int(work["count"][0])
+    now = dict(zip(work["held"][0, :count].tolist(), work["side"][0, :count].tolist(), strict=True))
+    assert now == {0: -1.0, 26: 1.0, 31: 1.0, 53: -1.0, 58: -1.0, 83: 1.0}
+    assert count == 7  # 3 and 30 have become the same one, which the solver takes once
 
 
 def test_where_the_links_do_not_reach_there_is_no_plan():
