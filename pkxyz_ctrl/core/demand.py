@@ -5,7 +5,7 @@ from numpy.typing import NDArray
 
 from pkxyz_ctrl.compiled.kernel import kernel
 from pkxyz_ctrl.core import adaptation, feedback, linear_law, set_point_model, youla
-from pkxyz_ctrl.core.elasticity import energy_gradient, gradient_and_pulls
+from pkxyz_ctrl.core.elasticity import gradient_and_pulls
 from pkxyz_ctrl.core.linear3 import inverse3
 
 Array = NDArray[np.float64]
@@ -119,13 +119,6 @@ def _follow_plan(law: np.void, memory: np.void, share: float) -> None:
         feedback.add_feedback(law["feedback"], origin, ahead, row, share, planned)
     for i in range(3):
         model["feedback_n"][i] = planned[i]
-
-
-@kernel
-def feedforward(law: np.void, row: Array, out: Array) -> None:
-    """Force (3,) at the platform that moves the stage along a reference row (9,): grad V + C v + m a."""
-    energy_gradient(law["geometry"], law["elasticity"], row[0:3], out)
-    feedback.add_motion(law["feedback"], row, out)
 
 
 @kernel

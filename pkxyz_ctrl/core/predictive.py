@@ -16,7 +16,6 @@ and of strokes become limits of v about those that the last plan leads to; from 
 """
 
 import math
-from typing import Final
 
 import numpy as np
 from numpy.typing import NDArray
@@ -28,7 +27,7 @@ from pkxyz_ctrl.core.linear3 import inverse3, multiply3_transposed
 
 Array = NDArray[np.float64]
 
-HORIZON_MOST: Final = 20
+HORIZON_MOST = 20
 
 PREDICTIVE = np.dtype(
     [
@@ -86,10 +85,10 @@ PLAN = np.dtype(
 NO_PLAN, FREE, LIMITED = 0, 1, 2
 """What there is: nothing; the plan without limits, which keeps them all and so is the solution; a problem to solve."""
 
-FORCE_UNIT_N: Final = 1e-4
+FORCE_UNIT_N = 1e-4
 """Unit of the problem's variables, and of strokes in it: numbers that a solver likes."""
-STROKE_UNIT_M: Final = 1e-6
-_JUMP_M: Final = 2e-9  # smooth references miss their own polynomial by 0.1 nm where the jerk switches
+STROKE_UNIT_M = 1e-6
+_JUMP_M = 2e-9  # smooth references miss their own polynomial by 0.1 nm where the jerk switches
 
 
 @kernel

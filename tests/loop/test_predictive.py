@@ -23,8 +23,8 @@ from pkxyz_ctrl.core import predictive
 from pkxyz_ctrl.core.predictive import FORCE_UNIT_N, STROKE_UNIT_M
 from pkxyz_ctrl.design.law import design_law
 from pkxyz_ctrl.design.model.loop_plant import held_force_softening
-from pkxyz_ctrl.loop import cycle as cycling
 from pkxyz_ctrl.loop import active_set, predictive_cycle, predictive_problem
+from pkxyz_ctrl.loop import cycle as cycling
 from pkxyz_ctrl.loop.predictive_cycle import PredictiveCycle
 from pkxyz_ctrl.loop.predictive_problem import Problem
 from pkxyz_ctrl.loop.reference import REFERENCE, reference_rows
