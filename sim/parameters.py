@@ -9,8 +9,8 @@ from sim.motion import layout
 from sim.motion.geometry import strokes
 from sim.motion.layout import PARAMS, STATE
 from sim.motion.mechanics import acceleration, stiffness
-from sim.motion.noise import stream
 from sim.motion.parasitic import rest
+from sim.motion.streams import start_streams
 from sim.structure.build import build_flexible_modes, build_misalignment, build_tilt
 from sim.structure.pose import combs_seen
 from sim.structure.side import balance
@@ -35,12 +35,14 @@ def build_parameters(
     params = np.zeros(1, PARAMS)
     p = params[0]
     _mechanism(p, config, device)
+    stiff = rest_stiffness(p, np.zeros(3))
+    _damping(p, config, device, stiff)
     _drive_combs(p, config, device)
     _amplifier(p, config, drive_v_per_count)
-    _transient_response(p)
-    _modes_and_forces(p, config)
+    _transient_response(p, stiff)
+    _modes_and_forces(p, config, stiff)
     _sense_chain(p, config, device, period_us, sense_f_per_count, sense_zero_f)
-    build_flexible_modes(p, config.flexible_modes, rest_stiffness(p, np.zeros(3)))
+    build_flexible_modes(p, config.flexible_modes, stiff)
     build_tilt(p, config.table_tilt)
     build_surroundings(p, config)
     p["general_on"] = any(
@@ -77,8 +79,6 @@ def _mechanism(p: np.void, config: PlantConfig, device: Device) -> None:
     p["link_hinge_nm"] = 4 * f.out_of_plane_chains * link * (1 + np.mean(link_error))
     p["mass_kg"] = device.dynamics.mass_kg * (1 + (config.mass_error.relative if config.mass_error.on else 0.0))
     p["per_kg"], p["per_crank"], p["per_link2"] = 1 / p["mass_kg"], 1 / p["crank_m"], 1 / p["link_m"] ** 2
-    p["damping_per_s"] = _damping(p, config, device)
-    p["damping2_per_s2"] = 0.25 * p["damping_per_s"] @ p["damping_per_s"]
     p["weight_n"] = _weight(config, float(p["mass_kg"]))
     stops = config.stops
     far_m = 1.0  # no stop
@@ -93,13 +93,14 @@ def rest_stiffness(p: np.void, position_m: np.ndarray) -> np.ndarray:
     return np.array([[xx, xy, xz], [xy, yy, yz], [xz, yz, zz]])
 
 
-def _damping(p: np.void, config: PlantConfig, device: Device) -> np.ndarray:
+def _damping(p: np.void, config: PlantConfig, device: Device, rest_n_per_m: np.ndarray) -> None:
     """Modal damping D = C / m: every mode of the rest pose gets w / Q."""
     if not config.damping.on:
-        return np.zeros((3, 3))
+        return
     quality = config.damping.quality_factor or device.dynamics.quality_factor
-    w2, modes = np.linalg.eigh(rest_stiffness(p, np.zeros(3)) / p["mass_kg"])
-    return np.asarray((modes * np.sqrt(w2) / quality) @ modes.T)
+    w2, modes = np.linalg.eigh(rest_n_per_m / p["mass_kg"])
+    p["damping_per_s"] = (modes * np.sqrt(w2) / quality) @ modes.T
+    p["damping2_per_s2"] = 0.25 * p["damping_per_s"] @ p["damping_per_s"]
 
 
 def _weight(config: PlantConfig, mass_kg: float) -> np.ndarray:
@@ -158,13 +159,13 @@ def _amplifier(p: np.void, config: PlantConfig, v_per_count: float) -> None:
     p["dac_step"] = config.dac.step_counts if config.dac.on else 1
 
 
-def _transient_response(p: np.void) -> None:
+def _transient_response(p: np.void, rest_n_per_m: np.ndarray) -> None:
     """R, where xi = R A exp(-k t) solves xi'' + D xi' + K xi / m = A exp(-k t) to leading orders in 1 / k, and what R A
     stands before in -(xi'' + D xi'); for k = 1 / tau and twice that. K is that of the rest pose: of R, a part in 2000
     hangs on it.
     """
     unit, d = np.eye(3), p["damping_per_s"]
-    stiff = rest_stiffness(p, np.zeros(3)) / p["mass_kg"]
+    stiff = rest_n_per_m / p["mass_kg"]
     for n in (1, 2):
         tau = p["amplifier_s"] / n
         response = tau**2 * (unit + tau * d - tau**2 * stiff)
@@ -173,12 +174,12 @@ def _transient_response(p: np.void) -> None:
             p[f"response_{n}"] = (d / tau - unit / tau**2) @ response
 
 
-def _modes_and_forces(p: np.void, config: PlantConfig) -> None:
+def _modes_and_forces(p: np.void, config: PlantConfig, rest_n_per_m: np.ndarray) -> None:
     mode = config.parasitic
     p["parasitic_on"] = mode.on
     w = 2 * math.pi * mode.frequency_hz
     p["parasitic_rad_per_s"], p["parasitic_damping_per_s"] = w, w / mode.quality_factor
-    p["parasitic_per_kg"] = mode.compliance_share * w**2 / rest_stiffness(p, np.zeros(3))[0, 0]
+    p["parasitic_per_kg"] = mode.compliance_share * w**2 / rest_n_per_m[0, 0]
     p["parasitic_comb"], p["parasitic_table"] = mode.comb_shape, mode.table_shape
     p["drift_on"] = config.drift.on
     p["drift_n"], p["drift_s"] = config.drift.force_n, config.drift.time_constant_s
@@ -242,8 +243,7 @@ def state_at_rest(params: np.ndarray, config: PlantConfig, seed: int) -> np.ndar
         **{layout.SENSE_STREAM + i: config.sense_noise.seed_offset for i in range(3)},
         **{layout.SENSE_DRIFT_STREAM + i: config.sense_drift.seed_offset for i in range(3)},
     }
-    for source, offset in offsets.items():
-        s["random"][source] = stream(seed, source, offset)
+    start_streams(s["random"], seed, offsets)
     start_surroundings(p, s, config, seed)
     return state
 
@@ -251,6 +251,8 @@ def state_at_rest(params: np.ndarray, config: PlantConfig, seed: int) -> np.ndar
 def bend(p: np.void, s: np.void, volt2: np.ndarray) -> None:
     """Static flexible modes under squared voltages (3,) and the constant force, from a mechanism at rest in
     s["motion"], which becomes the table's."""
+    if not p["mode_count"]:
+        return
     strokes(p, s["motion"], s["strokes_m"])
     force_n = p["force_gain_n_per_v2"] * (1 + p["fringe_per_m"] * s["strokes_m"]) * volt2
     for k in range(p["mode_count"]):  # the mechanism's own forces carry the constant one

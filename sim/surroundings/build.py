@@ -8,7 +8,8 @@ from sim.config.plant_file import PlantConfig
 from sim.config.surroundings import Flicker, FloorVibration, Mains
 from sim.motion import layout
 from sim.motion.layout import FLICKERS
-from sim.motion.noise import next_u64, normal, stream
+from sim.motion.noise import next_u64, normal
+from sim.motion.streams import start_streams
 from sim.surroundings.tones import sum_tones
 
 TONES_A_BAND = 3
@@ -107,15 +108,15 @@ def start_surroundings(p: np.void, s: np.void, config: PlantConfig, seed: int) -
         layout.FLOOR_STREAM: config.floor_vibration.seed_offset,
         layout.MAINS_STREAM: config.mains.seed_offset,
     }
-    for source, offset in offsets.items():
-        s["random"][source] = stream(seed, source, offset)
+    start_streams(s["random"], seed, offsets)
     lines, tones = len(_mains(config.mains)), int(p["tone_count"])
     for k in range(tones):
         source = layout.MAINS_STREAM if k >= tones - lines else layout.FLOOR_STREAM
         for j in range(3):
             turn = 2 * math.pi * float(next_u64(s["random"][source])) / 2.0**64
             s["tone_phase"][k, j] = math.cos(turn), math.sin(turn)
-    sum_tones(p, s)
+    if tones:
+        sum_tones(p, s)
     for source, memory, on in (
         (layout.AMPLIFIER_FLICKER_STREAM, s["amplifier_flicker"], p["amplifier_noise_on"]),
         (layout.SENSE_FLICKER_STREAM, s["sense_flicker"], p["sense_flicker_on"]),

@@ -8,6 +8,7 @@ from scipy import stats
 from sim_rig import GRADIENT_F_PER_M, config, plant, settle
 
 from sim.motion.noise import next_u64, normal, stream
+from sim.motion.streams import start_streams
 
 
 @settings(max_examples=30)
@@ -16,6 +17,24 @@ def test_the_bits_are_numpys_own(seed, source, offset):
     words = stream(seed, source, offset)
     oracle = np.random.SFC64(np.random.SeedSequence(seed, spawn_key=(source, offset)))
     assert [int(next_u64(words)) for _ in range(50)] == oracle.random_raw(50).tolist()
+
+
+@settings(max_examples=50)
+@given(
+    st.integers(0, 2**128 - 1), st.dictionaries(st.integers(0, 13), st.integers(-(2**31), 2**33), min_size=1)
+)  # fmt: skip
+def test_sources_that_are_started_together_have_the_streams_of_each(seed, offsets):
+    random = np.zeros((14, 4), np.uint64)
+    start_streams(random, seed, offsets)
+    for source in range(14):
+        alone = stream(seed, source, offsets[source]) if source in offsets else np.zeros(4, np.uint64)
+        assert random[source].tolist() == alone.tolist()
+
+
+def test_a_seed_that_is_too_long_is_refused():
+    for seed in (-1, 2**128):
+        with pytest.raises(ValueError, match="128 bits"):
+            start_streams(np.zeros((14, 4), np.uint64), seed, {0: 0})
 
 
 def test_deviates_are_normal():
