@@ -68,7 +68,7 @@ def run(
         plant, memory = setup.new_plant(), new_memory(Mode.IDLE)
         run_block = runner_of(law, None if setup.triggers is None else setup.new_outputs())
         run_block(law, memory, standing_still(), plant.params, plant.state, np.zeros(0, np.int64), blocks.rows, 0)
-        _sample_us(setup, 0, 0)
+        instants_us(setup, 0, 0)
         begin_s = time.perf_counter()
         missed, load, faults = 0, None, _run_fast(setup, run_block, memory, plant, blocks)
     elif lane == Lane.LOCKSTEP:
@@ -89,7 +89,14 @@ def _run_fast(setup: Setup, run_block: RunBlock, memory: NDArray[np.void], plant
     while count := blocks.next_count(memory):
         reference = blocks.reference(memory)
         run_block(
-            law, memory, reference, plant.params, plant.state, _sample_us(setup, blocks.done, count), blocks.rows, count
+            law,
+            memory,
+            reference,
+            plant.params,
+            plant.state,
+            instants_us(setup, blocks.done, count),
+            blocks.rows,
+            count,
         )
         entered = np.flatnonzero(
             (blocks.rows["mode"][:count] == Mode.FAULT) & (np.r_[mode, blocks.rows["mode"][: count - 1]] != Mode.FAULT)
@@ -100,7 +107,7 @@ def _run_fast(setup: Setup, run_block: RunBlock, memory: NDArray[np.void], plant
     return faults
 
 
-def _sample_us(setup: Setup, first: int, count: int) -> NDArray[np.int64]:
+def instants_us(setup: Setup, first: int, count: int) -> NDArray[np.int64]:
     """Plant time of the samples: end of each tick's SYNC (its length depends on its counter), since the first one."""
     tick = np.arange(first, first + count, dtype=np.int64)
     can = setup.bus.can

@@ -10,7 +10,7 @@ from functools import cache
 import numpy as np
 
 from hil.lanes.fast import runner_of
-from hil.lanes.in_process import _sample_us
+from hil.lanes.in_process import instants_us
 from hil.lanes.setup import Setup
 from hil.runs.scenario import load_scenario
 from hil.studies.montecarlo import Study
@@ -54,7 +54,7 @@ def stopped(
     for target in at:
         while (ahead := int(target) - int(memory["reference_tick"][0])) > 0:
             count = ahead if memory["mode"][0] == Mode.TRACKING else 20
-            sample_us = _sample_us(setup, done, count)
+            sample_us = instants_us(setup, done, count)
             run_block(base.law, memory, reference, plant.params, plant.state, sample_us, rows, count)
             done += count
             if memory["mode"][0] == Mode.FAULT:
@@ -62,7 +62,7 @@ def stopped(
         state, left = plant.state.copy(), memory.copy()
         left["input"]["trips"] = int(trip)
         count = round(AFTER_S * 1e6) // period_us
-        sample_us = _sample_us(setup, done, count)
+        sample_us = instants_us(setup, done, count)
         run_block(base.law, left, reference, plant.params, state, sample_us, rows, count)
         assert left["mode"][0] == Mode.FAULT
         hits = int(state["event_count"][0]) - int(plant.state["event_count"][0])

@@ -8,7 +8,7 @@ from learning_rig import PERIOD, errors_of, setup
 from loop_rig import first_difference
 
 from hil.lanes.fast import run_block
-from hil.lanes.in_process import _sample_us
+from hil.lanes.in_process import instants_us
 from hil.lanes.live_reference import LiveReference
 from hil.runs.learning import belongs
 from hil.runs.period_errors import PeriodErrors
@@ -87,7 +87,7 @@ def test_in_pieces_between_ticks_it_learns_the_same_bits():
     law, plant, memory = short.law, short.new_plant(), new_memory(Mode.IDLE)
     live = LiveReference(short.trajectory, short.bus.period_us, short.new_learner())
     rows = np.zeros(1, ROW)
-    sample_us = _sample_us(short, 0, short.ticks)
+    sample_us = instants_us(short, 0, short.ticks)
     for tick in range(short.ticks):
         run_block(law, memory, live.rows, plant.params, plant.state, sample_us[tick : tick + 1], rows, 1)
         live.after(memory)

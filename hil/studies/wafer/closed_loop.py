@@ -10,7 +10,7 @@ Links are taken to be alike (their mean), which the plant's mechanism has them.
 """
 
 import math
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
 from typing import Any
@@ -19,6 +19,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from hil.lanes import in_process as lanes
+from hil.lanes import many
 from hil.lanes.lane import Lane
 from hil.lanes.setup import Setup
 from hil.runs.metrics import Metrics
@@ -104,14 +105,14 @@ class ClosedLoops:
         still = {name: Spread(mean=getattr(of.process, name).mean) for name in SOURCES}
         mean = replace(of, process=of.process.model_copy(update=still))
         truth = Truth(of.stage, of.as_drawn, mean.made(sample_devices(mean.process, of.seed, 0, 1)))
-        setup = truth.setup(self.scenario)
+        setup = truth.setup(self._as_shipped)
         strokes = np.full(3, 0.5 * (of.stage.limits.stroke_min_m + of.stage.limits.stroke_max_m))
         return identify(setup, strokes, Lane.FAST).modes
 
     def drawn_peak_s(self) -> float:
         """Ms of the drawing as drawn under the law as shipped."""
         drawn = self.wafers.as_drawn
-        return Truth(self.wafers.stage, drawn, drawn).peak_sensitivity(self.scenario.setup())
+        return Truth(self.wafers.stage, drawn, drawn).peak_sensitivity(self._as_shipped)
 
     def numbers(self, part: int) -> NDArray[np.int64]:
         """Numbers of the devices of a part: one on each of its wafers."""
@@ -156,18 +157,21 @@ class ClosedLoops:
         sampled = sample_numbered(of.process, of.seed, numbers)
         size, made = sizes(of.process, sampled), of.made(sampled)
         meets = of.verdicts(figures(of.stage, of.as_drawn, made))["ok"]
-        found = []
-        for n, number in enumerate(numbers.tolist()):
-            truth = Truth(of.stage, of.as_drawn, made.take(np.array([n])))
-            row = {"own": float(meets[n]), **{name: float(size[name][n].mean()) for name in SOURCES}}
-            for law in self.laws:
-                row |= {f"{law}.{name}": value for name, value in self._run(truth, number, law).items()}
-            found.append(row)
+        truths = [Truth(of.stage, of.as_drawn, made.take(np.array([n]))) for n in range(len(numbers))]
+        means = {name: size[name].mean(axis=1) for name in SOURCES}
+        found = [
+            {"own": float(meets[n]), **{name: float(mean[n]) for name, mean in means.items()}}
+            for n in range(len(numbers))
+        ]
+        for law in self.laws:
+            for row, values in zip(found, self._run(truths, numbers.tolist(), law), strict=True):
+                row |= {f"{law}.{name}": value for name, value in values.items()}
         return found
 
     @cached_property
-    def _shipped_law(self) -> NDArray[np.void]:
-        return self.scenario.setup().law
+    def _as_shipped(self) -> Setup:
+        """Of the scenario's own plant and device."""
+        return self.scenario.setup()
 
     def _believed(self, truth: "Truth", number: int, law: str) -> StageConfig:
         """The stage file that a law is designed for."""
@@ -178,30 +182,58 @@ class ClosedLoops:
         measured = find(self.wafers.stage, truth.itself, self.mean_modes, farad_per_count, rng)
         return self.wafers.stage.model_copy(update={"calibration": measured})
 
-    def _run(self, truth: "Truth", number: int, law: str) -> dict[str, float]:
-        seeded = self.scenario.config.model_copy(update={"seed": number})
-        setup = truth.setup(replace(self.scenario, config=seeded))
+    def _setup(self, truth: "Truth", number: int, law: str) -> Setup | None:
+        """A device under a law; None where there is no law for it, as it is refused as no device of this drawing."""
+        setup = replace(truth.setup(self._as_shipped), seed=number)
         if law == "shipped":
-            setup.__dict__["law"] = self._shipped_law
-        else:
-            try:
-                setup = replace(setup, stage=self._believed(truth, number, law))
-            except FitError:  # refused as no device of this drawing: there is no law for it
-                return dict.fromkeys(LOOP_FIGURES, math.inf)
-            # of no use to anybody else: not to be kept with the shipped ones
-            setup.__dict__["law"] = design_law(Stage(setup.stage), setup.controller, setup.bus, autostart=True)
-        metrics = Metrics(setup.trajectory, setup.bus.period_us)
-        ran = lanes.run(setup, Lane.FAST, on_block=metrics.update)
-        seen = metrics.figures()
+            setup.__dict__["law"] = self._as_shipped.law
+            return setup
+        try:
+            setup = replace(setup, stage=self._believed(truth, number, law))
+        except FitError:
+            return None
+        # of no use to anybody else: not to be kept with the shipped ones
+        setup.__dict__["law"] = design_law(Stage(setup.stage), setup.controller, setup.bus, autostart=True)
+        return setup
 
-        def worst(values: Mapping[str, float] | None) -> float:
-            return math.inf if ran.faults or values is None else max(values.values())
+    def _run(self, truths: "list[Truth]", numbers: list[int], law: str) -> list[dict[str, float]]:
+        """``LOOP_FIGURES`` of each device under a law."""
+        setups = [self._setup(truth, number, law) for truth, number in zip(truths, numbers, strict=True)]
+        errors = iter(scan_errors_nm([setup for setup in setups if setup is not None]))
+        return [
+            dict.fromkeys(LOOP_FIGURES, math.inf)
+            if setup is None
+            else {"peak_s": truth.peak_sensitivity(setup), **next(errors)}
+            for truth, setup in zip(truths, setups, strict=True)
+        ]
 
-        return {
-            "peak_s": truth.peak_sensitivity(setup),
-            "error_nm": worst(seen.rms_error_nm),
-            "error_about_mean_nm": worst(seen.error_deviation_nm),
-        }
+
+def scan_errors_nm(setups: Sequence[Setup]) -> list[dict[str, float]]:
+    """RMS error of the scan of each run, of the worst axis; infinite where it ended in a fault. Runs that differ in
+    device and law alone, of laws of one kind.
+    """
+    if not setups or not many.can_run(setups[0]):
+        return [_scan_error_nm(setup) for setup in setups]
+    alike = all(setup.law is setups[0].law for setup in setups)
+    laws = setups[0].law if alike else np.concatenate([setup.law for setup in setups])
+    laws.flags.writeable = False
+    scanned = many.scan_errors(setups[0], laws, [setup.new_plant() for setup in setups])
+    ended = (scanned["faulted"] != 0) | (scanned["ticks"] == 0)
+    errors = (many.rms_m(scanned), many.deviation_m(scanned))
+    rms_nm, deviation_nm = (np.where(ended, math.inf, 1e9 * e.max(axis=1)) for e in errors)
+    return [{"error_nm": float(e), "error_about_mean_nm": float(d)} for e, d in zip(rms_nm, deviation_nm, strict=True)]
+
+
+def _scan_error_nm(setup: Setup) -> dict[str, float]:
+    """The same of one run, whatever it is."""
+    metrics = Metrics(setup.trajectory, setup.bus.period_us)
+    ran = lanes.run(setup, Lane.FAST, on_block=metrics.update)
+    seen = metrics.figures()
+
+    def worst(values: Mapping[str, float] | None) -> float:
+        return math.inf if ran.faults or values is None else max(values.values())
+
+    return {"error_nm": worst(seen.rms_error_nm), "error_about_mean_nm": worst(seen.error_deviation_nm)}
 
 
 class Truth:
@@ -238,10 +270,9 @@ class Truth:
         """The same with links as they were made: all of the device, by the drawing's mass."""
         return self.stage.model_copy(update={"geometry": self._drawing.geometry.model_copy(update=self._links())})
 
-    def setup(self, scenario: Scenario) -> Setup:
-        """A scenario on this device, under the law as shipped."""
-        asked = replace(scenario, plant=self.plant(scenario.plant)).setup()
-        return replace(asked, device=self.device(asked.device))
+    def setup(self, shipped: Setup) -> Setup:
+        """A run on this device in place of its own."""
+        return replace(shipped, plant=self.plant(shipped.plant), device=self.device(shipped.device))
 
     def device(self, drawn: Device) -> Device:
         """Links as they were made, for the plant."""
@@ -249,18 +280,19 @@ class Truth:
 
     def plant(self, plant: PlantConfig) -> PlantConfig:
         """A plant with this device's errors in place of its own of these kinds."""
-        data = plant.model_dump()
-        data["stiffness_mismatch"] |= {
-            "on": True,
-            "leaf": _triple(self._slider - 1.0),
-            "crank_hinge": _triple(self._crank - 1.0),
-            "link_hinge": (self._link - 1.0,) * 3,
+        own: dict[str, dict[str, Any]] = {
+            "stiffness_mismatch": {
+                "leaf": _triple(self._slider - 1.0),
+                "crank_hinge": _triple(self._crank - 1.0),
+                "link_hinge": (self._link - 1.0,) * 3,
+            },
+            "mass_error": {"relative": self._mass - 1.0},
+            "comb_mismatch": {"relative": _triple(self._comb - 1.0)},
+            "sense_gain": {"relative": _triple(self._sense - 1.0)},
+            "damping": {"quality_factor": self._quality},
         }
-        data["mass_error"] |= {"on": True, "relative": self._mass - 1.0}
-        data["comb_mismatch"] |= {"on": True, "relative": _triple(self._comb - 1.0)}
-        data["sense_gain"] |= {"on": True, "relative": _triple(self._sense - 1.0)}
-        data["damping"] |= {"on": True, "quality_factor": self._quality}
-        return PlantConfig.model_validate(data)
+        sections = {name: getattr(plant, name).model_copy(update={"on": True, **of}) for name, of in own.items()}
+        return plant.model_copy(update=sections)
 
     def peak_sensitivity(self, setup: Setup) -> float:
         """Ms of this device under a setup's law, in the middle of the strokes, sensed and pulled as that law has it."""
