@@ -13,6 +13,7 @@ measurement. For the MIMO system the norm is the structured one, the factors of 
 import math
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
+from functools import lru_cache
 
 import numpy as np
 from numba import njit
@@ -105,14 +106,25 @@ def frequency_grid_hz(plant: LoopPlant, law: DiscreteLaw, points: int = 600) -> 
 def _grid_hz(poles: Sequence[Complex], period_s: float, points: int, about: int) -> Array:
     """... with so many points on either side of each pole, out to 10 times its distance from the circle."""
     nyquist = 0.5 / period_s
-    spread = np.geomspace(0.02, 10.0, about)
     near = np.concatenate(poles)
-    near = np.log(near[np.abs(near) > 1e-9].astype(complex)) / period_s / (2.0 * math.pi)
+    near = np.log(near[np.abs(near) > 1e-9]) / period_s / (2.0 * math.pi)
     near = near[near.imag > 1.0]
-    around = near.imag[:, None] + np.abs(near.real)[:, None] * np.r_[-spread, 0.0, spread]
-    grid = np.concatenate([np.geomspace(0.5, nyquist, points), around.ravel()])
+    around = near.imag[:, None] + np.abs(near.real)[:, None] * _about(about)
+    grid = np.concatenate([_by_ratio(0.5, nyquist, points), around.ravel()])
     grid = np.unique(grid[(grid >= 0.5) & (grid <= nyquist)])
     return grid[np.diff(grid, prepend=0.0) > 1e-6 * grid]  # poles that are the same twice are one
+
+
+@lru_cache(maxsize=8)
+def _by_ratio(low: float, high: float, points: int) -> Array:
+    return np.geomspace(low, high, points)
+
+
+@lru_cache(maxsize=8)
+def _about(points: int) -> Array:
+    """Places by the distance from a pole (2 points + 1,)."""
+    spread = np.geomspace(0.02, 10.0, points)
+    return np.r_[-spread, 0.0, spread]
 
 
 def margins(plant: LoopPlant, law: DiscreteLaw) -> Margins:

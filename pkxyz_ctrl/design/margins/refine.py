@@ -12,6 +12,7 @@ Function = Callable[[Array], Array]
 
 _POINTS = 9
 """Looked at between two points in a round."""
+_SHARES = np.arange(_POINTS + 2) / (_POINTS + 1)
 
 
 def peak(grid_hz: Array, values: Array, function: Function, *, maxima: int = 3, rounds: int = 4) -> float:
@@ -29,7 +30,7 @@ def peak(grid_hz: Array, values: Array, function: Function, *, maxima: int = 3, 
 
 def _largest_between(low: Array, high: Array, function: Function) -> tuple[Array, Array, Array]:
     """Largest values (k,) between ``low`` and ``high`` (k,), and the points on both sides of where they are."""
-    f = np.linspace(low, high, _POINTS + 2, axis=1)
+    f = low[:, None] + (high - low)[:, None] * _SHARES
     seen = function(f.ravel()).reshape(f.shape)
     rows, at = np.arange(len(f)), seen.argmax(axis=1)
     return seen[rows, at], f[rows, np.maximum(at - 1, 0)], f[rows, np.minimum(at + 1, _POINTS + 1)]

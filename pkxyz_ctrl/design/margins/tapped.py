@@ -38,10 +38,12 @@ class TappedSensitivity:
 
     def __init__(self, plant: LoopPlant, law: TappedLaw) -> None:
         base, self._law, self._plant = law.law, law, plant
-        forced = np.zeros((base.order, 3))
-        forced[law.told] = -np.eye(3)
-        enters = np.block([[-plant.b @ base.d, -plant.b], [base.b, forced]])
-        leaves = np.block([[plant.c, np.zeros((3, base.order))], [plant.c, -law.seen]])
+        states = len(plant.a)
+        enters, leaves = np.zeros((states + base.order, 6)), np.zeros((6, states + base.order))
+        enters[:states, :3], enters[states:, :3] = -plant.b @ base.d, base.b
+        enters[:states, 3:], enters[states:][law.told, 3:] = -plant.b, -np.eye(3)
+        leaves[:3, :states] = leaves[3:, :states] = plant.c
+        leaves[3:, states:] = -law.seen
         self._base = Transfer(closed_loop(plant, base), enters, leaves, plant.period_s)
         self._period_s, self._taps = plant.period_s, np.ascontiguousarray(law.taps)
 
@@ -75,7 +77,8 @@ class TappedSensitivity:
         size = np.abs(self._base.poles)
         if np.abs(size - 1.0).min() < NEAR_CIRCLE:
             return self._is_stable_by_poles()
-        determinant = np.linalg.det(m)
+        determinant = np.empty(len(m), np.complex128)
+        _determinants(m, determinant)
         turns = float(np.angle(determinant[1:] / determinant[:-1]).sum()) / math.pi  # of the upper half circle
         return int(np.count_nonzero(size > 1.0)) == round(turns)
 
@@ -95,16 +98,15 @@ class TappedSensitivity:
 def _close(wide: Complex, z: Complex, taps: Array, s: Complex, m: Complex) -> None:
     """``s`` and ``m`` (k,3,3) from I + G (k,6,6) at points z (k,)."""
     right, inverse = np.empty((3, 3), np.complex128), np.empty((3, 3), np.complex128)
+    q = np.empty(3, np.complex128)
     for n in range(len(z)):
-        g, out, back = wide[n], m[n], 1.0 / z[n]
+        g, out = wide[n], m[n]
+        _responses(taps, 1.0 / z[n], q)
         for i in range(3):
-            q = 0j
-            for k in range(len(taps) - 1, -1, -1):
-                q = q * back + taps[k, i]
             for j in range(3):
                 unit = 1.0 if i == j else 0.0
-                right[i, j] = q * (unit + g[3 + i, j])
-                out[i, j] = unit - q * (g[3 + i, 3 + j] - unit)
+                right[i, j] = q[i] * (unit + g[3 + i, j])
+                out[i, j] = unit - q[i] * (g[3 + i, 3 + j] - unit)
         for i in range(3):
             a, b = (i + 1) % 3, (i + 2) % 3
             for j in range(3):
@@ -121,9 +123,51 @@ def _close(wide: Complex, z: Complex, taps: Array, s: Complex, m: Complex) -> No
                     s[n, i, j] += g[i, 3 + k] * x
 
 
+@njit(cache=True, error_model="numpy")
+def _responses(taps: Array, back: complex, out: Complex) -> None:
+    """Q (3,) of taps (k,3) by 1 / z: even and odd ones of all axes side by side, as each waits for the one before."""
+    square, x, y, z = back * back, 0j, 0j, 0j
+    odd_x, odd_y, odd_z = 0j, 0j, 0j
+    for k in range(len(taps) - 1 - (len(taps) - 1) % 2, -1, -2):
+        x, y, z = x * square + taps[k, 0], y * square + taps[k, 1], z * square + taps[k, 2]
+        if k + 1 < len(taps):
+            odd_x = odd_x * square + taps[k + 1, 0]
+            odd_y = odd_y * square + taps[k + 1, 1]
+            odd_z = odd_z * square + taps[k + 1, 2]
+    out[0], out[1], out[2] = x + back * odd_x, y + back * odd_y, z + back * odd_z
+
+
+@njit(cache=True, error_model="numpy")
+def _determinants(m: Complex, out: Complex) -> None:
+    for n in range(len(m)):
+        a = m[n]
+        out[n] = (
+            a[0, 0] * (a[1, 1] * a[2, 2] - a[1, 2] * a[2, 1])
+            - a[0, 1] * (a[1, 0] * a[2, 2] - a[1, 2] * a[2, 0])
+            + a[0, 2] * (a[1, 0] * a[2, 1] - a[1, 1] * a[2, 0])
+        )
+
+
 def _far_apart(m: Complex) -> NDArray[np.int64]:
     """Which neighbours (of m - 1 pairs) are too far from each other for a turn to be told."""
-    square = np.einsum("nij,nij->n", m.real, m.real) + np.einsum("nij,nij->n", m.imag, m.imag)
-    least = 2.0 * np.abs(np.linalg.det(m)) / square  # the smallest singular value is not below this
-    step = np.linalg.norm(m[1:] - m[:-1], axis=(1, 2))
-    return np.flatnonzero(~(step <= STEP_MOST * np.minimum(least[1:], least[:-1])))
+    determinant, far = np.empty(len(m), np.complex128), np.empty(len(m) - 1, np.bool_)
+    _determinants(m, determinant)
+    _tell_far(m, determinant, far)
+    return np.flatnonzero(far)
+
+
+@njit(cache=True, error_model="numpy")
+def _tell_far(m: Complex, determinant: Complex, far: NDArray[np.bool_]) -> None:
+    before = 0.0
+    for n in range(len(m)):
+        square, step = 0.0, 0.0
+        for i in range(3):
+            for j in range(3):
+                square += m[n, i, j].real ** 2 + m[n, i, j].imag ** 2
+                if n:
+                    move = m[n, i, j] - m[n - 1, i, j]
+                    step += move.real**2 + move.imag**2
+        least = 2.0 * abs(determinant[n]) / square  # the smallest singular value is not below this
+        if n:
+            far[n - 1] = not math.sqrt(step) <= STEP_MOST * min(least, before)
+        before = least

@@ -205,6 +205,8 @@ def _sampled(a: Array, b: Array, period_s: float, delay_s: float) -> tuple[Array
 def _held(a: Array, b: Array, time_s: float) -> tuple[Array, Array]:
     """Phi and Gamma over a time for a held input."""
     n = len(a)
+    if time_s == 0.0:
+        return np.eye(n), np.zeros((n, 3))
     augmented = np.zeros((n + 3, n + 3))
     augmented[:n, :n], augmented[:n, n:] = a, b
     exponential = scipy.linalg.expm(augmented * time_s)
