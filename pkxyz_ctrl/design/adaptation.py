@@ -9,13 +9,6 @@ from pkxyz_ctrl.config.bus import BusConfig
 from pkxyz_ctrl.config.controller import ControllerConfig
 from pkxyz_ctrl.core import adaptation as learning
 from pkxyz_ctrl.design.device_errors import spreads, within
-from pkxyz_ctrl.design.laws.estimator_gain import (
-    innovation_variance,
-    measurement_matrix,
-    measurement_noise,
-    process_noise,
-)
-from pkxyz_ctrl.design.model.plant_model import LinearStage, SampledStage
 from pkxyz_ctrl.stage import Stage
 
 Array = NDArray[np.float64]
@@ -24,18 +17,14 @@ FRINGE_M = 25e-6
 """Stroke over which growth of a comb's pull is counted."""
 
 
-def fill_adaptation(
-    tick: Any, stage: Stage, controller: ControllerConfig, bus: BusConfig, model: LinearStage, sampled: SampledStage
-) -> None:
-    """Fill ``tick["adaptation"]``; ``tick["estimator"]`` is there already."""
+def fill_adaptation(tick: Any, stage: Stage, controller: ControllerConfig, bus: BusConfig, variance_m2: Array) -> None:
+    """Fill ``tick["adaptation"]``; ``tick["estimator"]`` is there already, and the (3,3) of its innovations."""
     record, filter_, config = tick["adaptation"][0], tick["estimator"][0], controller.adaptation
-    _, q = process_noise(model, controller.estimator, bus.period_s)
-    variance = innovation_variance(sampled, q, measurement_matrix(stage), measurement_noise(stage, model, bus))
     phi, gamma = np.vstack([filter_["transition"], np.eye(9)[6:]]), np.vstack([filter_["input"], np.zeros((3, 3))])
     for axis in range(3):
         keep = slice(axis, None, 3)
         record["transition"][axis], record["input"][axis] = phi[keep, keep], gamma[keep, axis]
-        record["gain"][axis], record["variance_m2"][axis] = filter_["gain"][keep, axis], variance[axis, axis]
+        record["gain"][axis], record["variance_m2"][axis] = filter_["gain"][keep, axis], variance_m2[axis, axis]
     record["sense_delay_s"] = filter_["sense_delay_s"]
     record["spread"] = spreads(controller, stage)
     most = np.full(learning.PARAMETERS, config.most_relative)

@@ -15,7 +15,7 @@ from pkxyz_ctrl.core.demand import LINEAR, OPEN_LOOP, PREDICTIVE, STATE_FEEDBACK
 from pkxyz_ctrl.design.adaptation import fill_adaptation
 from pkxyz_ctrl.design.drive_limits import count_max, slew_counts
 from pkxyz_ctrl.design.laws.chosen_law import chosen_law, unwinding
-from pkxyz_ctrl.design.laws.estimator_gain import kalman_gain, measurement_matrix, measurement_noise, process_noise
+from pkxyz_ctrl.design.laws.estimator_gain import measurement_matrix, measurement_noise, process_noise, steady_filter
 from pkxyz_ctrl.design.laws.regulator import cost_to_go, regulator_gain
 from pkxyz_ctrl.design.model.discrete_law import LawError
 from pkxyz_ctrl.design.model.loop_plant import held_force_softening, loop_plant
@@ -48,11 +48,11 @@ def design_law(stage: Stage, controller: ControllerConfig, bus: BusConfig, *, au
     sampled = sample(model, bus.period_s, amplifier_time_constant_s(stage))
     law = np.zeros(1, cycle.LAW)
     _fill_stage(law["tick"], stage, bus)
-    _fill_estimator(law["tick"]["estimator"], stage, controller, bus, model, sampled)
+    variance_m2 = _fill_estimator(law["tick"]["estimator"], stage, controller, bus, model, sampled)
     _fill_feedback(law["tick"]["feedback"], stage, controller, bus, model, sampled)
     _fill_set_points(law["tick"]["set_points"], controller, sampled)
     _fill_drive(law["tick"]["drive"], stage, controller, bus, model)
-    fill_adaptation(law["tick"], stage, controller, bus, model, sampled)
+    fill_adaptation(law["tick"], stage, controller, bus, variance_m2)
     _fill_monitors(law["limits"], controller, bus)
     if controller.law in KINDS:
         law["tick"]["kind"] = KINDS[controller.law]
@@ -105,13 +105,14 @@ def _fill_stage(law: Any, stage: Stage, bus: BusConfig) -> None:
 
 def _fill_estimator(
     law: Any, stage: Stage, controller: ControllerConfig, bus: BusConfig, model: LinearStage, sampled: SampledStage
-) -> None:
+) -> Array:
+    """Variance (3,3) in m^2 of the innovations."""
     _, q = process_noise(model, controller.estimator, bus.period_s)
     r = measurement_noise(stage, model, bus)
     law["transition"] = sampled.phi[:6]
     law["input"] = sampled.gamma[:6]
     law["input_lag"] = sampled.gamma_lag[:6]
-    law["gain"] = kalman_gain(sampled, q, measurement_matrix(stage), r)
+    law["gain"], variance_m2 = steady_filter(sampled, q, measurement_matrix(stage), r)
     law["stiffness_n_per_m"] = model.stiffness_n_per_m
     law["operating_point_m"] = model.position_m
     law["sense_delay_s"] = stage.sense_delay_s
@@ -119,6 +120,7 @@ def _fill_estimator(
     law["decoupled"] = _are_diagonal(
         *(law[name][0] for name in ("transition", "input", "input_lag", "stiffness_n_per_m"))
     )
+    return variance_m2
 
 
 def _are_diagonal(*matrices: Array) -> bool:

@@ -65,22 +65,16 @@ def measurement_matrix(stage: Stage) -> Array:
 _UNITS = np.repeat([1e-9, 1e-6, 1e-6], 3)
 
 
-def kalman_gain(sampled: SampledStage, q: Array, h: Array, r: Array) -> Array:
-    """Steady-state gain (9,3) of the measurement update, by scipy's discrete Riccati solver; raises ``DesignError``
-    unless filterpy agrees.
+def steady_filter(sampled: SampledStage, q: Array, h: Array, r: Array) -> tuple[Array, Array]:
+    """Steady-state gain (9,3) of the measurement update, and the covariance (3,3) in m^2 of its innovations, by scipy's
+    discrete Riccati solver; raises ``DesignError`` unless filterpy agrees.
     """
     scale = _UNITS
     phi, q_scaled, h_scaled, r_scaled, predicted = _steady(sampled, q, h, r)
     innovation = h_scaled @ predicted @ h_scaled.T + r_scaled
     gain: Array = np.asarray(np.linalg.solve(innovation, h_scaled @ predicted).T, dtype=np.float64)
     _agree_with_filterpy(phi, q_scaled, h_scaled, r_scaled, predicted, gain)
-    return gain * scale[:, None] / 1e-9
-
-
-def innovation_variance(sampled: SampledStage, q: Array, h: Array, r: Array) -> Array:
-    """(3,3) in m^2: covariance of the steady filter's innovations."""
-    _, _, h_scaled, r_scaled, predicted = _steady(sampled, q, h, r)
-    return np.asarray(h_scaled @ predicted @ h_scaled.T + r_scaled) * 1e-18
+    return gain * scale[:, None] / 1e-9, np.asarray(innovation) * 1e-18
 
 
 def _steady(sampled: SampledStage, q: Array, h: Array, r: Array) -> tuple[Array, Array, Array, Array, Array]:

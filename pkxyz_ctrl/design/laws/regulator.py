@@ -1,6 +1,5 @@
-"""State feedback: a discrete linear-quadratic regulator, solved by python-control and checked by its residual."""
+"""State feedback: a discrete linear-quadratic regulator, solved by scipy and checked by its residual."""
 
-import control
 import numpy as np
 import scipy.linalg
 from numpy.typing import NDArray
@@ -26,7 +25,8 @@ def regulator_gain(sampled: SampledStage, config: RegulatorConfig | SetPointsCon
     phi = sampled.phi[:6, :6] * scale[None, :] / scale[:, None]
     gamma = sampled.gamma[:6] * config.force_n / scale[:, None]
     q = weights * np.outer(scale, scale) / config.force_n**2
-    gain, solution, _ = (np.asarray(part) for part in control.dlqr(phi, gamma, q, np.eye(3)))
+    solution = np.asarray(scipy.linalg.solve_discrete_are(phi, gamma, q, np.eye(3)))
+    gain = scipy.linalg.solve(gamma.T @ solution @ gamma + np.eye(3), gamma.T @ solution @ phi)
     # Solved there, checked here: the Riccati equation's residual, by its own arithmetic.
     cost = phi.T @ solution @ (phi - gamma @ gain) + q
     error = float(np.abs(cost - solution).max() / np.abs(solution).max())
