@@ -193,7 +193,7 @@ def side_left(offset: Array) -> Array:
     """
     d = np.asarray(offset, dtype=np.float64)
     u = np.cbrt(d) + d  # above the root, where the cubic is convex: Newton comes down to it
-    for _ in range(60):
+    for _ in range(12):
         value = 4.0 * u**3 - 3.0 * d * u**2 - d
         slope = 12.0 * u**2 - 6.0 * d * u
         u = u - np.where(slope > 0.0, value / np.where(slope > 0.0, slope, 1.0), 0.0)

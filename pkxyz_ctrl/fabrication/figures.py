@@ -114,12 +114,12 @@ def corner_voltage_v(devices: Devices, low_m: float, high_m: float | Array) -> A
     """Voltage (n,) of the corner of the strokes from ``low_m`` to ``high_m``, () or (n,), that takes most; infinite
     where one takes a push.
     """
-    low, high = np.broadcast_arrays(np.array(low_m), high_m)
-    most = np.zeros(len(devices))
-    for corner in itertools.product((low, high), repeat=3):
-        volt = needed_voltage_v(devices, np.stack(corner, axis=-1))
-        most = np.maximum(most, np.where(np.isnan(volt), np.inf, volt))
-    return most
+    ends = np.array(np.broadcast_arrays(low_m, high_m, np.empty(len(devices)))[:2])
+    corners = np.array(list(itertools.product((0, 1), repeat=3)))
+    strokes = np.moveaxis(ends[corners], 1, 2)  # (corner, device, chain)
+    of = np.tile(np.arange(len(devices)), len(corners))
+    volt = needed_voltage_v(devices.take(of), strokes.reshape(-1, 3)).reshape(len(corners), -1)
+    return np.asarray(np.where(np.isnan(volt), np.inf, volt).max(axis=0, initial=0.0))
 
 
 def held_stroke_m(devices: Devices, top_v: Array, low_m: float, high_m: float, limit_v: float) -> Array:

@@ -114,13 +114,16 @@ def pose(devices: Devices, position_m: Array) -> Pose:
 
 
 def pose_of_strokes(devices: Devices, strokes_m: Array) -> tuple[Pose, Array]:
-    """Devices at strokes (n, 3) and their positions (n, 3): Newton's method from rest, on the exact closure."""
+    """Devices at strokes (n, 3) and their positions (n, 3): Newton's method from rest, on the exact closure. Each takes
+    the steps that it needs, whoever is beside it.
+    """
     wanted = np.broadcast_to(np.asarray(strokes_m, dtype=np.float64), (len(devices), 3))
-    position = np.zeros((len(devices), 3))
+    position, moves = np.zeros((len(devices), 3)), np.ones((len(devices), 1))
     for _ in range(8):
         there = pose(devices, position)
-        step = np.linalg.solve(there.jacobian, (wanted - there.stroke_m)[..., None])[..., 0]
+        step = moves * np.linalg.solve(there.jacobian, (wanted - there.stroke_m)[..., None])[..., 0]
         position = position + step
-        if np.abs(step).max() < 1e-17:
+        moves = np.where(np.abs(step).max(axis=1, keepdims=True) < 1e-17, 0.0, moves)
+        if not moves.any():
             break
     return pose(devices, position), position
