@@ -1,7 +1,8 @@
 """Many devices through one compiled loop: the fast lane's ticks, of which only the errors of the scans are kept.
 
-A device is run to its end before the next begins, by the kernels of ``fast.run_block`` in their order: what it meets
-does not depend on who is run beside it. One that ends in a fault is left there, as nobody clears it in this lane.
+They go tick by tick, all of them through one part of the tick before any through the next, which keeps that part's code
+at hand; of each the kernels of ``fast.run_block`` in their order, so it does not matter who is run beside it. One that
+ends in a fault is left there, as nobody clears it in this lane.
 """
 
 from collections.abc import Sequence
@@ -16,7 +17,7 @@ from hil.lanes.in_process import instants_us
 from hil.lanes.setup import Setup
 from pkxyz_ctrl.compiled.kernel import kernel
 from pkxyz_ctrl.core.demand import PREDICTIVE
-from pkxyz_ctrl.loop.cycle import cycle, new_memory
+from pkxyz_ctrl.loop.cycle import new_memory, observe, respond
 from pkxyz_ctrl.safety.modes import Mode
 from sim.plant import Plant
 
@@ -49,7 +50,7 @@ def scan_errors(setup: Setup, laws: Records, plants: Sequence[Plant]) -> Records
     """(n,) of ``SCANNED`` of plants at rest under ``laws``, (n,) of ``cycle.LAW`` or (1,) for all; the rest of the run,
     which ``can_run`` allows, is that of ``setup``.
     """
-    fresh, memory = new_memory(Mode.IDLE), new_memory(Mode.IDLE)
+    memory = np.repeat(new_memory(Mode.IDLE), max(1, len(plants)))
     reference = Handout(setup.trajectory, setup.bus.period_us).rows(memory, setup.ticks)
     windows_us = [s.scan_us for s in setup.trajectory.segments if s.scan_us]
     windows = np.array(windows_us, dtype=np.int64).reshape(-1, 2)
@@ -57,7 +58,7 @@ def scan_errors(setup: Setup, laws: Records, plants: Sequence[Plant]) -> Records
     if len(plants):
         params, states = (np.concatenate(each) for each in zip(*((p.params, p.state) for p in plants), strict=True))
         at_us = instants_us(setup, 0, setup.ticks)
-        _run_each(laws, fresh, memory, reference, params, states, at_us, windows, found)
+        _run_together(laws, memory, reference, params, states, at_us, windows, found)
     return found
 
 
@@ -76,10 +77,9 @@ def deviation_m(scanned: Records) -> Array:
 
 
 @kernel
-def _run_each(
+def _run_together(
     laws: Records,
-    fresh: Records,
-    memory: Records,
+    memories: Records,
     reference: Records,
     params: Records,
     states: Records,
@@ -87,25 +87,31 @@ def _run_each(
     windows_us: NDArray[np.int64],
     found: Records,
 ) -> None:
-    seen, row = memory[0]["input"], memory[0]["row"]
-    for n in range(len(params)):
-        at = n if len(laws) > 1 else 0
-        law, plant, state = laws[at : at + 1], params[n : n + 1], states[n : n + 1]
-        memory[0] = fresh[0]
-        due = memory[0]["tick"]["count"][law[0]["tick"]["delay_periods"] - 1]
-        for i in range(len(at_us)):
-            exchange(plant, state, at_us[i], due, row, seen["sense_count"])
-            cycle(law, memory, reference)
-            if row["mode"] == _FAULT:
-                found[n]["faulted"] = 1
-                break
-            if row["mode"] == _TRACKING:
-                _take(row, row["reference_tick"] * law[0]["period_us"], windows_us, found[n])
+    each = 1 if len(laws) > 1 else 0
+    count, late = len(params), laws[0]["tick"]["delay_periods"] - 1
+    for i in range(len(at_us)):
+        for n in range(count):
+            if found[n]["faulted"] == 0:
+                memory = memories[n]
+                due, counts = memory["tick"]["count"][late], memory["input"]["sense_count"]
+                exchange(params[n : n + 1], states[n : n + 1], at_us[i], due, memory["row"], counts)
+        for n in range(count):
+            if found[n]["faulted"] == 0:
+                observe(laws[each * n : each * n + 1], memories[n : n + 1], reference)
+        for n in range(count):
+            if found[n]["faulted"] == 0:
+                respond(laws[each * n : each * n + 1], memories[n : n + 1])
+                _take(memories[n]["row"], laws[0]["period_us"], windows_us, found[n])
 
 
 @kernel
-def _take(row: np.void, t_us: int, windows_us: NDArray[np.int64], found: np.void) -> None:
-    """The error of a tick, once for each scan that it lies in."""
+def _take(row: np.void, period_us: int, windows_us: NDArray[np.int64], found: np.void) -> None:
+    """Whether a tick has ended in a fault, and its error, once for each scan that it lies in."""
+    if row["mode"] == _FAULT:
+        found["faulted"] = 1
+    if row["mode"] != _TRACKING:
+        return
+    t_us = row["reference_tick"] * period_us
     for k in range(len(windows_us)):
         if windows_us[k, 0] <= t_us < windows_us[k, 1]:
             found["ticks"] += 1
