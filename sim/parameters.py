@@ -11,7 +11,7 @@ from sim.motion.layout import PARAMS, STATE
 from sim.motion.mechanics import acceleration, stiffness
 from sim.motion.parasitic import rest
 from sim.motion.streams import start_streams
-from sim.structure.build import build_flexible_modes, build_misalignment, build_tilt
+from sim.structure.build import build_flexible_modes, build_general_response, build_misalignment, build_tilt
 from sim.structure.pose import combs_seen
 from sim.structure.side import balance
 from sim.surroundings.build import build_surroundings, start_surroundings
@@ -48,6 +48,8 @@ def build_parameters(
     p["general_on"] = any(
         p[name] for name in ("mode_count", "misaligned_on", "shaken_on", "tone_count", "amplifier_noise_on")
     ) or bool(p["sense_flicker_on"])
+    if p["general_on"]:
+        build_general_response(p, stiff)
     if p["slow_on"]:
         grow_old(p, 0)
     return params

@@ -14,8 +14,7 @@ STEPS_A_PERIOD = 6.0
 
 
 def build_flexible_modes(p: np.void, config: FlexibleModes, rest_n_per_m: np.ndarray) -> None:
-    """Modes, the longest step, and the response of all coordinates to a transient of the amplifier; needs the damping
-    and the stiffness (3, 3) at rest."""
+    """Modes and the longest step; needs the stiffness (3, 3) at rest."""
     modes = config.modes if config.on else ()
     p["mode_count"] = len(modes)
     p["longest_s"] = LONGEST_S
@@ -25,6 +24,10 @@ def build_flexible_modes(p: np.void, config: FlexibleModes, rest_n_per_m: np.nda
         p["mode_per_kg"][k] = mode.compliance_share * w**2 / rest_n_per_m[0, 0]
         p["mode_comb"][k], p["mode_table"][k] = mode.comb_shape, mode.table_shape
         p["longest_s"] = min(p["longest_s"], 1.0 / (STEPS_A_PERIOD * mode.frequency_hz))
+
+
+def build_general_response(p: np.void, rest_n_per_m: np.ndarray) -> None:
+    """Response of all coordinates to a transient of the amplifier; needs the modes and the damping."""
     kappa = np.hstack([np.eye(3), -p["mode_table"].T])  # of the mechanism's pose by (table, modes)
     stiff = kappa.T @ rest_n_per_m @ kappa * np.concatenate([np.full(3, p["per_kg"]), p["mode_per_kg"]])[:, None]
     stiff[3:, 3:] += np.diag(p["mode_w2_per_s2"])

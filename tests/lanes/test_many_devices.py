@@ -58,7 +58,7 @@ def test_errors_are_those_of_the_rows(controller):
 def test_who_is_run_beside_whom_changes_no_bit():
     asked = setups()
     together = many.scan_errors(asked[0], asked[0].law, [setup.new_plant() for setup in asked])
-    own_laws = np.concatenate([setup.law for setup in asked])
+    own_laws = many.joined([setup.law for setup in asked])
     own_laws.flags.writeable = False
     assert np.array_equal(together, many.scan_errors(asked[0], own_laws, [setup.new_plant() for setup in asked]))
     for n, setup in enumerate(asked):
