@@ -56,10 +56,15 @@ def scan_errors(setup: Setup, laws: Records, plants: Sequence[Plant]) -> Records
     windows = np.array(windows_us, dtype=np.int64).reshape(-1, 2)
     found = np.zeros(len(plants), SCANNED)
     if len(plants):
-        params, states = (np.concatenate(each) for each in zip(*((p.params, p.state) for p in plants), strict=True))
+        params, states = (joined(each) for each in zip(*((p.params, p.state) for p in plants), strict=True))
         at_us = instants_us(setup, 0, setup.ticks)
         _run_together(laws, memory, reference, params, states, at_us, windows, found)
     return found
+
+
+def joined(records: Sequence[Records]) -> Records:
+    """Records (1,) of one kind as (n,). ``np.concatenate`` asks for every field whether there is a type for both."""
+    return np.frombuffer(bytearray(b"".join(each.tobytes() for each in records)), records[0].dtype)
 
 
 def rms_m(scanned: Records) -> Array:

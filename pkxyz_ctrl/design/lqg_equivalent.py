@@ -6,8 +6,6 @@ input is taken at the estimate's own mid-period position, so where the stage's g
 the difference M (x + T/2 v) is part of the prediction.
 """
 
-from dataclasses import replace
-
 import numpy as np
 from numpy.typing import NDArray
 
@@ -51,9 +49,8 @@ def lqg_in_parts(
     if numbers["kind"] == PREDICTIVE:
         gains[:, :6] += softening @ _midway(filter_, gains[:, :6])
     gains *= share
-    equivalent = _assemble(filter_, softening, gains, delay, float(law["period_us"][0]) * 1e-6)
-    if numbers["kind"] != PREDICTIVE:
-        equivalent = replace(equivalent, set_point_gain=set_point_gain(numbers))
+    regulator = None if numbers["kind"] == PREDICTIVE else set_point_gain(numbers)
+    equivalent = _assemble(filter_, softening, gains, delay, float(law["period_us"][0]) * 1e-6, regulator)
     taps = numbers["youla"]["tap_n_per_m"][: int(numbers["youla"]["taps"])]
     if not len(taps):
         return equivalent
@@ -73,7 +70,9 @@ def _midway(filter_: np.void, gains: Array) -> Array:
     return np.hstack([0.5 * np.eye(3), bend_s * np.eye(3)]) + 0.5 * closed[:3] - bend_s * closed[3:]
 
 
-def _assemble(filter_: np.void, softening: Array, gains: Array, delay: int, period_s: float) -> DiscreteLaw:
+def _assemble(
+    filter_: np.void, softening: Array, gains: Array, delay: int, period_s: float, regulator: Array | None
+) -> DiscreteLaw:
     phi = np.vstack([filter_["transition"], np.eye(9)[6:]])
     gamma, lag = (np.vstack([filter_[name], np.zeros((3, 3))]) for name in ("input", "input_lag"))
     phi = phi + gamma @ softening @ np.hstack([np.eye(3), filter_["half_period_s"] * np.eye(3), np.zeros((3, 3))])
@@ -95,7 +94,8 @@ def _assemble(filter_: np.void, softening: Array, gains: Array, delay: int, peri
     after[:9] = predicted
     after[9:12] = force
     after[12:order, 9 : order - 3] = np.eye(order - 12)
-    return DiscreteLaw(period_s, after[:, :order], after[:, order:], -force[:, :order], -force[:, order:], told_from=9)
+    a, b, c, d = after[:, :order], after[:, order:], -force[:, :order], -force[:, order:]
+    return DiscreteLaw(period_s, a, b, c, d, told_from=9, set_point_gain=regulator)
 
 
 def seen_by(filter_: np.void) -> Array:

@@ -12,7 +12,7 @@ Links are taken to be alike (their mean), which the plant's mechanism has them.
 import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
-from functools import cached_property
+from functools import cached_property, lru_cache
 from typing import Any
 
 import numpy as np
@@ -215,7 +215,7 @@ def scan_errors_nm(setups: Sequence[Setup]) -> list[dict[str, float]]:
     if not setups or not many.can_run(setups[0]):
         return [_scan_error_nm(setup) for setup in setups]
     alike = all(setup.law is setups[0].law for setup in setups)
-    laws = setups[0].law if alike else np.concatenate([setup.law for setup in setups])
+    laws = setups[0].law if alike else many.joined([setup.law for setup in setups])
     laws.flags.writeable = False
     scanned = many.scan_errors(setups[0], laws, [setup.new_plant() for setup in setups])
     ended = (scanned["faulted"] != 0) | (scanned["ticks"] == 0)
@@ -298,7 +298,7 @@ class Truth:
         """Ms of this device under a setup's law, in the middle of the strokes, sensed and pulled as that law has it."""
         limits = self._drawing.limits
         strokes = np.full(3, 0.5 * (limits.stroke_min_m + limits.stroke_max_m))
-        belief = Stage(setup.stage)
+        belief = _stage_of(setup.stage)
         itself = Stage(self.itself)
         believed = setup.stage.calibration or Calibration()
         pull = self._comb / self._mass / np.array(believed.comb_gain)
@@ -318,6 +318,12 @@ class Truth:
             "link_length_m": None,
             "elevation_rest_rad": None,
         }
+
+
+@lru_cache(maxsize=4)
+def _stage_of(config: StageConfig) -> Stage:
+    """The drawing's is asked for with each device."""
+    return Stage(config)
 
 
 def _triple(values: Array) -> Triple:

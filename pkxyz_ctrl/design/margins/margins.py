@@ -107,7 +107,7 @@ def _grid_hz(poles: Sequence[Complex], period_s: float, points: int, about: int)
     """... with so many points on either side of each pole, out to 10 times its distance from the circle."""
     nyquist = 0.5 / period_s
     near = np.concatenate(poles)
-    near = np.log(near[np.abs(near) > 1e-9]) / period_s / (2.0 * math.pi)
+    near = np.asarray(np.log(near[np.abs(near) > 1e-9]) / period_s / (2.0 * math.pi), dtype=np.complex128)
     near = near[near.imag > 1.0]
     around = near.imag[:, None] + np.abs(near.real)[:, None] * _about(about)
     grid = np.concatenate([_by_ratio(0.5, nyquist, points), around.ravel()])

@@ -6,6 +6,7 @@ substitution, n^2 in place of n^3.
 """
 
 import math
+from functools import lru_cache
 
 import numpy as np
 import scipy.linalg
@@ -43,7 +44,7 @@ class Transfer:
     def __init__(self, a: Array, enters: Array, leaves: Array, period_s: float) -> None:
         # balanced, as states of all sizes are turned into one another: forces, positions, velocities
         balanced, scale = _balanced(a)
-        self._triangle, turn = scipy.linalg.schur(balanced, output="complex", check_finite=False)
+        self._triangle, turn = _schur(balanced)
         self.poles: Complex = np.asarray(np.diag(self._triangle))
         """(n,) of the system"""
         self._enters = turn.conj().T @ (enters / scale[:, None])
@@ -100,6 +101,26 @@ def _balanced(a: Array) -> tuple[Array, Array]:
     if failed:
         raise LawError("the loop's states can't be brought to one size")
     return np.asarray(balanced), np.asarray(scale)
+
+
+def _schur(a: Array) -> tuple[Complex, Complex]:
+    """``scipy.linalg.schur`` in complex form, without what that asks and looks at each time."""
+    triangle, _, _, turn, _, failed = scipy.linalg.lapack.zgees(
+        _unsorted, a.astype(np.complex128), lwork=_schur_room(len(a)), overwrite_a=True
+    )
+    if failed:
+        raise LawError("the loop's poles can't be found")
+    return np.asarray(triangle), np.asarray(turn)
+
+
+@lru_cache(maxsize=32)
+def _schur_room(order: int) -> int:
+    work = scipy.linalg.lapack.zgees(_unsorted, np.eye(order, dtype=np.complex128), lwork=-1)[-2]
+    return int(work[0].real)
+
+
+def _unsorted(_: complex) -> bool:
+    return False
 
 
 _TOGETHER = 32

@@ -59,6 +59,12 @@ class Perturbation:
 
 
 NOMINAL = Perturbation()
+_ACROSS = tuple(
+    np.array([math.cos(angle), math.sin(angle), 0.0])
+    for angle in (math.radians(d + 90.0) for d in (90.0, 210.0, 330.0))
+)
+"""Across the strokes of the chains."""
+_SQUARES = tuple(np.outer(across, across) for across in _ACROSS)
 
 
 @dataclass(frozen=True)
@@ -126,11 +132,9 @@ def held_force_softening(stage: Stage, position_m: Array, force_n: Array | None 
     crank, link = float(geometry["crank_m"]), float(geometry["link_m"])
     height = float(geometry["height_rest_m"]) + position_m[2]
     g = np.zeros((3, 3))
-    for i, degrees in enumerate((90.0, 210.0, 330.0)):
-        angle = math.radians(degrees + 90.0)
-        across = np.array([math.cos(angle), math.sin(angle), 0.0])
+    for i, across in enumerate(_ACROSS):
         offset = float(across @ position_m)
-        g += force[i] * np.outer(across, across) * crank**2 / (crank**2 - offset**2) ** 1.5
+        g += force[i] * _SQUARES[i] * crank**2 / (crank**2 - offset**2) ** 1.5
         g[2, 2] += force[i] * link**2 / (link**2 - height**2) ** 1.5
     return g
 
