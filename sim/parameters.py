@@ -7,6 +7,7 @@ import numpy as np
 from sim.config import Device, PlantConfig
 from sim.motion import layout
 from sim.motion.geometry import strokes
+from sim.motion.kernel import kernel
 from sim.motion.layout import PARAMS, STATE
 from sim.motion.mechanics import acceleration, stiffness
 from sim.motion.parasitic import rest
@@ -91,7 +92,10 @@ def _mechanism(p: np.void, config: PlantConfig, device: Device) -> None:
 
 def rest_stiffness(p: np.void, position_m: np.ndarray) -> np.ndarray:
     """Hessian of the elastic energy, (3, 3), N/m."""
-    xx, xy, xz, yy, yz, zz = stiffness(p, *position_m)
+    return _symmetric(*stiffness(p, *position_m))
+
+
+def _symmetric(xx: float, xy: float, xz: float, yy: float, yz: float, zz: float) -> np.ndarray:
     return np.array([[xx, xy, xz], [xy, yy, yz], [xz, yz, zz]])
 
 
@@ -228,13 +232,13 @@ def state_at_rest(params: np.ndarray, config: PlantConfig, seed: int) -> np.ndar
     s["target_v"] = s["voltage_v"] = p["amplifier_offset_v"]
     s["force_n"] = p["weight_n"]
     volt2 = s["voltage_v"] ** 2
-    s["motion"][:3] = equilibrium(p, s, volt2)
+    s["motion"][:3] = equilibrium(params, state, volt2)
     if p["parasitic_on"]:
         s["parasitic"][0] = rest(p, volt2)
     bend(p, s, volt2)
     if p["misaligned_on"]:
         balance(p, s)
-    combs_seen(p, s, s["filtered_m"], s["rates_m_per_s"])
+    _see(params, state)
     s["knot_m"][0] = s["filtered_m"]
     s["knot_count"] = 1
     s["filtered_v"] = s["voltage_v"]
@@ -263,14 +267,33 @@ def bend(p: np.void, s: np.void, volt2: np.ndarray) -> None:
         s["motion"][:3] += p["mode_table"][k] * s["modes"][0, k]
 
 
-def equilibrium(p: np.void, s: np.void, volt2: np.ndarray) -> np.ndarray:
+@kernel
+def _see(params: np.ndarray, state: np.ndarray) -> None:
+    """What the sense chain starts from. Records in arrays: numba takes twenty times as long to tell the type of one
+    alone."""
+    s = state[0]
+    combs_seen(params[0], s, s["filtered_m"], s["rates_m_per_s"])
+
+
+@kernel
+def _push(
+    params: np.ndarray, state: np.ndarray, volt2: np.ndarray, x: np.ndarray, force_n: np.ndarray, hessian: np.ndarray
+) -> None:
+    """Force (3,), N, on the table at rest at ``x``, and the Hessian (6,) of its springs as ``stiffness`` has it."""
+    p = params[0]
+    ax, ay, az = acceleration(p, state[0], volt2, x[0], x[1], x[2], 0.0, 0.0, 0.0)
+    force_n[0], force_n[1], force_n[2] = p["mass_kg"] * ax, p["mass_kg"] * ay, p["mass_kg"] * az
+    hessian[0], hessian[1], hessian[2], hessian[3], hessian[4], hessian[5] = stiffness(p, x[0], x[1], x[2])
+
+
+def equilibrium(params: np.ndarray, state: np.ndarray, volt2: np.ndarray) -> np.ndarray:
     """Position (3,), m, where elastic, comb and constant forces balance, by Newton's method from rest.
 
     Raises ArithmeticError if it does not settle, which needs forces far beyond the stage's own."""
-    x = np.zeros(3)
+    x, force, hessian = np.zeros(3), np.empty(3), np.empty(6)
     for _ in range(50):
-        force = p["mass_kg"] * np.array(acceleration(p, s, volt2, *x, 0.0, 0.0, 0.0))
-        change = np.linalg.solve(rest_stiffness(p, x), force)
+        _push(params, state, volt2, x, force, hessian)
+        change = np.linalg.solve(_symmetric(*hessian), force)
         x = x + change
         if np.abs(change).max() < 1e-18:
             return x

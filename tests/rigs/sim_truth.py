@@ -30,7 +30,8 @@ class Truth:
 
 def truth_about(plant: Plant, squared_v2: Array, held_s: float) -> Truth:
     """About squared voltages asked for (3,), which charged the combs for ``held_s``; drift and weight are at work."""
-    p, s = plant.params[0], plant.state[0].copy()
+    p, state = plant.params[0], plant.state.copy()
+    s = state[0]
     s["force_n"] = p["weight_n"]
     scale = p["volt_per_count"] / nominal_v_per_count(plant)
     held_v = np.sqrt(squared_v2) * scale + p["amplifier_offset_v"]
@@ -41,7 +42,7 @@ def truth_about(plant: Plant, squared_v2: Array, held_s: float) -> Truth:
         volt = np.sqrt(asked_v2) * scale + p["amplifier_offset_v"]
         acting = (volt - charge_v) ** 2
         q = np.empty(3)
-        strokes(p, np.concatenate([equilibrium(p, s, acting), np.zeros(3)]), q)
+        strokes(p, np.concatenate([equilibrium(plant.params, state, acting), np.zeros(3)]), q)
         if p["parasitic_on"]:
             q += p["parasitic_comb"] * rest(p, acting * (1 + p["fringe_per_m"] * q))
         farad = p["sense_f_per_m"] * q * (1 + 0.5 * p["sense_curvature_per_m"] * q) + p["feedthrough_f_per_v"] * volt
@@ -52,7 +53,7 @@ def truth_about(plant: Plant, squared_v2: Array, held_s: float) -> Truth:
         change = np.eye(3)[j] * step_v2
         static[:, j] = (counts(squared_v2 + change) - counts(squared_v2 - change)) / (2 * step_v2)
     acting = (held_v - charge_v) ** 2
-    at = np.concatenate([equilibrium(p, s, acting), np.zeros(3)])
+    at = np.concatenate([equilibrium(plant.params, state, acting), np.zeros(3)])
     a = np.zeros((6, 6))
     a[:3, 3:] = np.eye(3)
     for k, step in enumerate([1e-9] * 3 + [1e-6] * 3):

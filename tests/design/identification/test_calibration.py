@@ -101,10 +101,10 @@ def strokes_under(plant, squared_v2):
     from sim.motion.geometry import strokes
     from sim.parameters import equilibrium
 
-    p, s = plant.params[0], plant.state[0].copy()
-    s["force_n"] = p["weight_n"]
+    p, state = plant.params[0], plant.state.copy()
+    state["force_n"] = p["weight_n"]
     q = np.empty(3)
-    strokes(p, np.concatenate([equilibrium(p, s, squared_v2), np.zeros(3)]), q)
+    strokes(p, np.concatenate([equilibrium(plant.params, state, squared_v2), np.zeros(3)]), q)
     return q
 
 
