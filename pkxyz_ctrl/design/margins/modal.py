@@ -95,13 +95,13 @@ def _powers(
     """Add what ``left`` (n, q) of ``enters`` makes of ``terms`` from the first on; how many there are then, or -1."""
     n, inputs = left.shape
     for m in range(first, len(terms)):
-        gone = True
+        negligible = True
         for q in range(inputs):
             most, now = 0.0, 0.0
             for i in range(n):
                 most, now = max(most, abs(enters[i, q])), max(now, abs(left[i, q]))
-            gone = gone and now <= NOTHING * most
-        if gone:
+            negligible = negligible and now <= NOTHING * most
+        if negligible:
             return m
         for o in range(len(leaves)):
             for q in range(inputs):

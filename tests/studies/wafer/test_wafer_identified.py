@@ -48,7 +48,7 @@ def flat(numbers, names=NUMBERS):
 
 def test_it_is_what_the_command_finds_of_that_device():
     """Both have errors of their own: none of eleven numbers beyond 4.5 standard errors of a difference."""
-    real = identify(unlike().setup(SCENARIO), MIDDLE, Lane.FAST).calibrated.calibration
+    real = identify(unlike().setup(SCENARIO.setup()), MIDDLE, Lane.FAST).calibrated.calibration
     model = modelled(0)
     error = np.hypot(flat(real.standard_error), flat(model.standard_error))
     assert (np.abs(flat(real) - flat(model)) < 4.5 * error).all()
@@ -98,4 +98,4 @@ def test_a_device_that_is_not_this_drawing_has_no_law():
     """Fifteen times the counts per V^2: refused by the command, a loop that fails here."""
     gains = {"comb_gain": np.full((1, 3), 5.0), "sense_gain": np.full((1, 3), 3.0)}
     strange = Truth(STAGE, devices(), replace(devices(), **gains))
-    assert loops()._run(strange, 0, "identified") == dict.fromkeys(LOOP_FIGURES, np.inf)
+    assert loops()._run([strange], [0], "identified") == [dict.fromkeys(LOOP_FIGURES, np.inf)]

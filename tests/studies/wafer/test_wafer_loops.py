@@ -6,7 +6,9 @@ import numpy as np
 import pytest
 from process_rig import SHIPPED, STAGE, devices, process
 
+from hil.bench.study import short_scan
 from hil.lanes import in_process as lanes
+from hil.lanes import many
 from hil.lanes.lane import Lane
 from hil.runs.metrics import Metrics
 from hil.runs.scenario import load_scenario
@@ -15,6 +17,7 @@ from hil.studies.wafer.closed_loop import PART_DEVICES, ClosedLoops, Truth
 from hil.studies.wafer.study import WaferStudy
 from pkxyz_ctrl.config.bound import Bound
 from pkxyz_ctrl.config.files import ConfigError
+from pkxyz_ctrl.design.margins import sensitivity
 from pkxyz_ctrl.fabrication.statics import pose, pose_of_strokes
 from pkxyz_ctrl.fabrication.wafer import dies_per_wafer, sample_devices, sample_numbered
 from pkxyz_ctrl.stage import Stage
@@ -113,6 +116,17 @@ def test_devices_at_once_are_the_same_to_the_bit_as_each_alone():
         alone = asked.made(sample_devices(asked.process, asked.seed, number, 1))
         for name, values in vars(alone).items():
             assert np.array_equal(vars(some.take(np.array([n])))[name], values), name
+
+
+def test_devices_together_have_the_figures_of_each_by_its_rows_and_by_substitution(monkeypatch):
+    """Errors from a recording's rows, Ms without modes: as one device was looked at before there were many."""
+    asked = ClosedLoops(WaferStudy(SHIPPED, STAGE, 1), short_scan(), known=True)
+    numbers = asked.numbers(2)[:6]
+    found = asked.devices(numbers)
+    monkeypatch.setattr(many, "can_run", lambda setup: False)
+    monkeypatch.setattr(sensitivity, "split", lambda *of: None)
+    for row, other in zip(found, asked.devices(numbers), strict=True):
+        assert row == pytest.approx(other, rel=1e-9)
 
 
 def test_a_requirement_on_a_loop_that_is_none_is_refused():
