@@ -71,8 +71,8 @@ def _answers(python: _Seen, by_native: _Seen) -> list[Figure]:
             [percentile_us(turn, share) for turn in seen.answer_us] for seen in (python, by_native)
         )  # fmt: skip
         detail = (
-            f"from a sense frame read to the drive frame handed over, us in {TURNS} turns: {_listed(of_native)}; "
-            f"Python's loop {_listed(of_python)}"
+            f"from a sense frame read to the drive frame handed over, in the middle of {TURNS} turns: "
+            f"{median(of_native)} us, Python's loop {median(of_python)} us ({_listed(of_native)}; {_listed(of_python)})"
         )
         ratio = median(of_native) / max(1.0, median(of_python))
         figures.append(Figure(f"native.answer_{name}", ratio, "x", target, "at most", detail=detail))
