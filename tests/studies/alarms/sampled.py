@@ -44,10 +44,11 @@ KEPT = Path(__file__).parents[3] / "docs" / "tables" / "alarms.jsonl"
 PIECE = 50
 """Devices after which what was found is kept."""
 BEFORE_TICKS = 50
-SWING_S, SWINGS, SWING_GROWTH, SWING_LEAST_M = 0.1, 4, 1.2, 50e-9
-"""A stage whose true error (standard deviation) has grown by this factor from each of so many equal parts of the time
-before it was stopped to the next, up to more than this, was not stopped for nothing: its loop is not stable, whatever
-the linear plant says.
+SWINGS_S, SWINGS, SWING_GROWTH, SWING_LEAST_M = (0.1, 0.4), 4, 1.2, 50e-9
+"""A stage whose true error (standard deviation) has grown by this factor from each of so many equal parts of one of
+these times before it was stopped to the next, up to more than this, was not stopped for nothing: its loop is not
+stable, whatever the linear plant says. What grows fast has not begun 0.4 s before, what grows slowly is not seen in
+0.1 s.
 """
 STOP_M = 25e-6
 """Of a slider, at either end of its stroke."""
@@ -91,13 +92,13 @@ def stopped(motion: str, law: str, seed: int) -> Stopped | None:
     study, base = designed(motion, law)
     setup = dataclasses.replace(base, plant=study.sampled(seed).plant, seed=seed)
     vars(setup)["law"] = base.law
-    kept_ticks = round(SWING_S / setup.bus.period_s)
+    spans = [round(span_s / setup.bus.period_s) for span_s in SWINGS_S]
     last = np.zeros(0, ROW)
 
     def on_block(block: Any) -> None:
         nonlocal last
         driven = block[LOOP_CLOSED[block["mode"]] != 0]
-        last = np.concatenate([last, driven])[-kept_ticks:]
+        last = np.concatenate([last, driven])[-max(spans) :]
 
     faults = in_process.run(setup, Lane.FAST, on_block=on_block).faults
     if not faults:
@@ -106,7 +107,7 @@ def stopped(motion: str, law: str, seed: int) -> Stopped | None:
     strokes = Stage(setup.stage).inverse_kinematics(end["position_m"]) if len(end) else np.zeros((1, 3))
     at_limits = float(end["saturated"].mean()) > 0.5 if len(end) else False
     is_beyond = bool(strokes.max() > STOP_M or strokes.min() < 0.0) or at_limits
-    return Stopped(faults[0].splitlines()[0], is_beyond, swings(last))
+    return Stopped(faults[0].splitlines()[0], is_beyond, any(swings(last[-ticks:]) for ticks in spans))
 
 
 def is_stable(motion: str, law: str, seed: int) -> bool:
