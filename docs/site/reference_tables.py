@@ -137,7 +137,8 @@ def alarms() -> str:
         devices = [m["devices"] for m in run]
         stopped = sum(len(m["unstable"]) + len(m["beyond"]) for m in run)
         false = sum(len(m["false"]) for m in run)
-        counts = len(run), f"{min(devices)} to {max(devices)}", sum(devices), stopped, false
+        each = f"{min(devices)}" if min(devices) == max(devices) else f"{min(devices)} to {max(devices)}"
+        counts = len(run), each, sum(devices), stopped, false
         rows.append([f"`{law}`", *map(str, counts)])
     header = [
         "law",
