@@ -68,7 +68,7 @@ class NodeAtWork:
         settings = (
             node.od[0x1005, 0] & 0x7FF, node._drive_pdo.cob_id, node._sense_pdo.cob_id,
             next(iter(node.digital.receivers), -1), *(watched[-1] if watched else (-1, 0)),
-            node._drive._limit, node._step_max, node.od[0x1019, 0],
+            node._drive._limit, node._step_max, 0 if b"" in node._sync_following else len(node._sync_following),
             node._sense.turnaround_us, node._drive_timeout_us, node._heartbeat.beat_period_us,
             node.signature.cob_id, node.signature.every,
         )  # fmt: skip

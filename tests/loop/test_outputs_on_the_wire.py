@@ -272,7 +272,7 @@ def test_a_change_at_work_trips_within_the_time_between_two_signatures(key: tupl
 
 def test_a_signature_that_stays_away_trips_within_twice_that_time() -> None:
     setup = setup_of("fd_5k", 0.25)
-    rig, blocks = LockstepRig(setup), Bits(setup)
+    rig, blocks = LockstepRig(setup, whole_ticks=False), Bits(setup)  # whole ticks go by the node's rules
     rig.node.signature.ride = lambda has_heartbeat: None
     rig.run(blocks)
     rows = np.concatenate(blocks.got)
