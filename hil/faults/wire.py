@@ -90,7 +90,7 @@ class WireFaults:
                 self._install_identity(round(fault["product_code"]))
                 if fault.at_us > 0:
                     self._node.power_on()
-            case "wrong_configuration":
+            case "wrong_configuration":  # who has written leaves: a guest keeps ticks from being whole
                 guest = self._plug_in(fault, lambda sent, t_us: self._clock.call_at(t_us, lambda: self._unplug(fault)))
                 guest.send(self._frame(0x600 + self._driver.node_id, _download(fault)))
             case "forged":

@@ -88,16 +88,8 @@ def _run_fast(setup: Setup, run_block: RunBlock, memory: NDArray[np.void], plant
     law, mode = setup.law, int(Mode.IDLE)
     while count := blocks.next_count(memory):
         reference = blocks.reference(memory)
-        run_block(
-            law,
-            memory,
-            reference,
-            plant.params,
-            plant.state,
-            instants_us(setup, blocks.done, count),
-            blocks.rows,
-            count,
-        )
+        at_us = instants_us(setup, blocks.done, count)
+        run_block(law, memory, reference, plant.params, plant.state, at_us, blocks.rows, count)
         entered = np.flatnonzero(
             (blocks.rows["mode"][:count] == Mode.FAULT) & (np.r_[mode, blocks.rows["mode"][: count - 1]] != Mode.FAULT)
         )

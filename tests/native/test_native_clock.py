@@ -13,8 +13,10 @@ LATE = 5 / 8
 
 @pytest.fixture(scope="module")
 def program(tmp_path_factory):
+    if (cc := compiler()) is None:
+        pytest.skip("no C compiler")
     built = tmp_path_factory.mktemp("clock") / "clock"
-    words = [compiler(), *FLAGS, "-Wno-unused-parameter", "-o", str(built), str(HERE / "clock_alone.c")]
+    words = [cc, *FLAGS, "-Wno-unused-parameter", "-o", str(built), str(HERE / "clock_alone.c")]
     subprocess.run(words, check=True, capture_output=True, text=True)
     return built
 
