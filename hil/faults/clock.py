@@ -1,6 +1,7 @@
 """Faults of the controller's own time: ticks that begin late, ticks that are lost, and the end of the program."""
 
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
+from itertools import chain
 
 from hil.bus.clock import Lockstep
 from hil.faults.fault import Fault
@@ -16,7 +17,9 @@ class FaultyClock:
     def __init__(self, clock: Lockstep, faults: Sequence[Fault], origin_us: int, period_us: int) -> None:
         self._clock = clock
         self._period_us = period_us
-        self._faults = sorted((f for f in faults if f.family == "controller"), key=lambda f: f.at_us, reverse=True)
+        own = (f for f in faults if f.family == "controller")
+        self._to_come = sorted(own, key=lambda f: f.at_us, reverse=True)  # the next is the last
+        self._on: list[Fault] = []
         self._origin_us = origin_us
         self._done: set[int] = set()
         self.spend = clock.spend
@@ -31,7 +34,7 @@ class FaultyClock:
         this one is.
         """
         now_us, ends = t_us - self._origin_us, []
-        for fault in reversed(self._faults):  # the next to begin is the last
+        for fault in self._in_turn():
             if fault.at_us > now_us:
                 ends.append(fault.at_us)
                 break
@@ -44,20 +47,24 @@ class FaultyClock:
     def late_us(self, t_us: int) -> int:
         """How late the tick of ``t_us`` begins."""
         now_us, late_us = t_us - self._origin_us, 0
-        for fault in reversed(self._faults):
+        for fault in self._in_turn():
             if fault.at_us > now_us:
                 break
             late_us += round(fault["late_us"]) if fault.kind == "late_tick" and fault.is_on(now_us) else 0
         return late_us
 
+    def _in_turn(self) -> Iterator[Fault]:
+        """All that are not over, as they begin."""
+        return chain(self._on, reversed(self._to_come))
+
     def _due(self) -> list[Fault]:
         """Those that are on; what is over is forgotten."""
         now_us = self._clock.now_us - self._origin_us
-        if not self._faults or self._faults[-1].at_us > now_us:
-            return []
-        for fault in [f for f in self._faults if f.end_us is not None and f.end_us <= now_us]:
-            self._faults.remove(fault)
-        return [f for f in self._faults if f.is_on(now_us)]
+        while self._to_come and self._to_come[-1].at_us <= now_us:
+            self._on.append(self._to_come.pop())
+        if self._on:
+            self._on = [f for f in self._on if f.is_on(now_us)]
+        return self._on
 
     def wait_until(self, t_us: int) -> None:
         """Return at ``t_us``, or later; raises ``ControllerKilledError`` if there is nobody any more to return to."""
