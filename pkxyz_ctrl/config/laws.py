@@ -123,6 +123,8 @@ class InnovationFilter(FrozenModel):
 
     period_us: Annotated[int, Field(gt=0)]
     delay_periods: Annotated[int, Field(ge=1, le=2)] = 1
+    sense_delay_max_us: Annotated[float, Field(gt=0, le=1000)] = 1000.0
+    """for stages whose sense electronics delay by so much at most, and by more than those of other filters"""
     plane: Taps
     """q_0, q_1, ... of x and of y"""
     z: Taps
@@ -147,7 +149,8 @@ class Youla(FrozenModel):
     """
 
     filter: tuple[InnovationFilter, ...] = ()
-    """one for each kind of bus; on others the state feedback stands alone"""
+    """one for each kind of bus, or several for sense chains that lag more or less; on other buses the state feedback
+    stands alone"""
     fade_s: Positive = 0.02
     """how long the filter takes to fade to that of a quiet hold, and to come back"""
     quiet_holds: bool = False
@@ -155,11 +158,25 @@ class Youla(FrozenModel):
 
     @model_validator(mode="after")
     def _one_for_each(self) -> Self:
-        kinds = [(f.period_us, f.delay_periods) for f in self.filter]
+        kinds = [(f.period_us, f.delay_periods, f.sense_delay_max_us) for f in self.filter]
         twice = [kind for kind in kinds if kinds.count(kind) > 1]
         if twice:
-            raise ValueError(f"there are two filters for a period of {twice[0][0]} us; remove one")
+            period_us, _, lag_us = twice[0]
+            raise ValueError(
+                f"there are two filters for a period of {period_us} us and sense delays up to {lag_us:g} us; remove one"
+            )
         return self
+
+    def place_of_filter(self, period_us: int, delay_periods: int, sense_delay_us: float) -> int | None:
+        """Which of ``filter`` is for a bus and a stage: of those for the bus, the one with the least limit that the
+        sense delay keeps, or else the largest. None without any for that bus.
+        """
+        for_bus = [
+            (f.sense_delay_max_us < sense_delay_us, abs(f.sense_delay_max_us - sense_delay_us), place)
+            for place, f in enumerate(self.filter)
+            if (f.period_us, f.delay_periods) == (period_us, delay_periods)
+        ]
+        return min(for_bus)[2] if for_bus else None
 
 
 LAWS = Literal["lqg", "youla", "open_loop", "pi_notch", "irc", "hinf", "linear", "mpc"]

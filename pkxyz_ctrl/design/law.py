@@ -60,7 +60,7 @@ def design_law(stage: Stage, controller: ControllerConfig, bus: BusConfig, *, au
         law["tick"]["kind"] = LINEAR
         _fill_linear(law["tick"]["linear"], stage, controller, bus)
     if controller.youla is not None:
-        _fill_youla(law["tick"]["youla"], controller.youla, bus)
+        _fill_youla(law["tick"]["youla"], controller.youla, stage, bus)
         law["quiet_holds"] = controller.youla.quiet_holds
     if controller.mpc is not None:
         _fill_predictive(law["tick"], controller.mpc, controller.regulator)
@@ -178,13 +178,14 @@ def _fill_linear(record: Any, stage: Stage, controller: ControllerConfig, bus: B
     record["d"], record["unwind"][:, :n], record["order"] = law.d, unwind, n
 
 
-def _fill_youla(record: Any, youla: Youla, bus: BusConfig) -> None:
-    for taps in youla.filter:
-        if (taps.period_us, taps.delay_periods) == (bus.period_us, bus.delay_periods):
-            quiet_plane, quiet_z = taps.quiet_plane or taps.plane, taps.quiet_z or taps.z
-            record["tap_n_per_m"][:, : len(taps.z)] = np.stack([taps.plane, taps.plane, taps.z], axis=1)
-            record["quiet_tap_n_per_m"][:, : len(taps.z)] = np.stack([quiet_plane, quiet_plane, quiet_z], axis=1)
-            record["taps"] = len(taps.z)
+def _fill_youla(record: Any, youla: Youla, stage: Stage, bus: BusConfig) -> None:
+    place = youla.place_of_filter(bus.period_us, bus.delay_periods, 1e6 * stage.sense_delay_s)
+    if place is not None:
+        taps = youla.filter[place]
+        quiet_plane, quiet_z = taps.quiet_plane or taps.plane, taps.quiet_z or taps.z
+        record["tap_n_per_m"][:, : len(taps.z)] = np.stack([taps.plane, taps.plane, taps.z], axis=1)
+        record["quiet_tap_n_per_m"][:, : len(taps.z)] = np.stack([quiet_plane, quiet_plane, quiet_z], axis=1)
+        record["taps"] = len(taps.z)
     record["fade_ticks"] = max(1, round(youla.fade_s / bus.period_s))
 
 

@@ -4,6 +4,7 @@ follow from it, and the file that comes out.
 It is convex, so there is nothing to try: no trials, no database, the same taps every time.
 """
 
+import json
 from collections.abc import Callable
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -18,6 +19,7 @@ from pkxyz_ctrl.config import files as config
 from pkxyz_ctrl.config.bus import BusConfig
 from pkxyz_ctrl.config.controller import ControllerConfig
 from pkxyz_ctrl.config.files import ConfigError, FrozenModel
+from pkxyz_ctrl.config.laws import Youla
 from pkxyz_ctrl.config.refused import reason
 from pkxyz_ctrl.design.hold_noise import rounding_force_n
 from pkxyz_ctrl.design.law import design_law
@@ -172,16 +174,32 @@ def _rounded(taps: Array) -> tuple[float, ...]:
 
 
 def write_taps(search: TapsSearch, found: FoundTaps, path: Path) -> None:
-    """The search's controller file with these taps in place of those for the same bus. Raises ``ConfigError`` where it
-    can't be written.
+    """The search's controller file with these taps in place of those that its stage would have on this bus. Raises
+    ``ConfigError`` where it can't be written.
     """
     document = tomlkit.parse(config.find("controllers", search.controller).read_text(encoding="utf-8"))
-    bus = config.load("buses", search.bus, BusConfig)
+    bus, delay_us = config.load("buses", search.bus, BusConfig), 1e6 * Stage.load(search.stage).sense_delay_s
     section: Any = document["youla"]
-    kept = [f for f in section.get("filter", []) if (f["period_us"], f.get("delay_periods", 1)) != _kind(bus)]
-    filters = tomlkit.aot()
-    for old in kept:
-        filters.append(old)
+    youla = Youla.model_validate_json(json.dumps(section.unwrap()))
+    place = youla.place_of_filter(bus.period_us, bus.delay_periods, delay_us)
+    tables, table = list(section.get("filter", [])), _table(search, found, bus)
+    if place is None:
+        tables.append(table)
+    else:
+        if "sense_delay_max_us" in tables[place]:
+            table.add("sense_delay_max_us", tables[place]["sense_delay_max_us"])
+        tables[place] = table
+    section["filter"] = tomlkit.aot()
+    for each in tables:
+        section["filter"].append(each)
+    document["name"] = path.stem
+    try:
+        path.write_text(tomlkit.dumps(document), encoding="utf-8")
+    except OSError as error:
+        raise ConfigError(f"{path}: {reason(error)}; give another --out") from None
+
+
+def _table(search: TapsSearch, found: FoundTaps, bus: BusConfig) -> Any:
     table = tomlkit.table()
     table.add("period_us", bus.period_us)
     table.add("delay_periods", bus.delay_periods)
@@ -192,18 +210,8 @@ def write_taps(search: TapsSearch, found: FoundTaps, path: Path) -> None:
         table.add("quiet_z", _array(found.quiet.z))
     x, z = (1e9 * value for value in found.hold_noise_m)
     table.comment(f"pkxyz tune {search.name}: stage {search.stage}, {x:.2f} nm of noise in x and y, {z:.2f} in z")
-    filters.append(table)
-    section["filter"] = filters
-    document["name"] = path.stem
-    try:
-        path.write_text(tomlkit.dumps(document), encoding="utf-8")
-    except OSError as error:
-        raise ConfigError(f"{path}: {reason(error)}; give another --out") from None
+    return table
 
 
 def _array(taps: tuple[float, ...]) -> Any:
     return tomlkit.item(list(taps)).multiline(True)
-
-
-def _kind(bus: BusConfig) -> tuple[int, int]:
-    return bus.period_us, bus.delay_periods

@@ -5,12 +5,14 @@ from pathlib import Path
 import numpy as np
 import pytest
 from loop_rig import MIDDLE, bus, stage
+from pydantic import ValidationError
 
 from hil.studies.margins.loop import Loop, over_changed_plants
 from hil.studies.tune.taps import TapsSearch, asks_for_taps, find_taps, without_filter, write_taps
 from pkxyz_ctrl.config.controller import ControllerConfig
 from pkxyz_ctrl.config.files import ConfigError, load
 from pkxyz_ctrl.config.laws import InnovationFilter, Youla
+from pkxyz_ctrl.config.stage import StageConfig
 from pkxyz_ctrl.design.hold_noise import hold_noise_m
 from pkxyz_ctrl.design.law import design_law
 from pkxyz_ctrl.design.law_about import law_about
@@ -18,6 +20,7 @@ from pkxyz_ctrl.design.margins.margins import frequency_grid_hz, loop_response
 from pkxyz_ctrl.design.margins.tolerances import Case, Tolerances
 from pkxyz_ctrl.design.model.discrete_law import response
 from pkxyz_ctrl.design.model.loop_plant import NOMINAL, Perturbation, loop_plant
+from pkxyz_ctrl.stage import Stage
 
 
 def loop_of(config):
@@ -100,17 +103,12 @@ def behind_a_slow_filter(config):
     return Loop(lab, bus(), design_law(lab, config, bus(), autostart=True))
 
 
-def test_behind_a_slow_sense_filter_the_shipped_taps_do_not_bear_every_device():
-    """Nine of 500 are unstable: the lag takes phase that the taps reckon with. README says so."""
-    loop = behind_a_slow_filter(load("controllers", "youla", ControllerConfig))
-    tolerances = load("tolerances", "wide", Tolerances)
-    sampled = [loop.peak_sensitivity(tolerances.sample(seed)) for seed in range(1, 501)]
-    assert np.flatnonzero(np.isinf(sampled)).tolist() == [3, 9, 78, 175, 204, 214, 316, 335, 448]
-
-
-def test_taps_for_that_stage_bear_them_all():
-    """What `pkxyz tune youla_lab` finds, kept."""
-    loop = behind_a_slow_filter(load("controllers", Path(__file__).with_name("youla_lab.toml"), ControllerConfig))
+def test_behind_a_slow_sense_filter_other_taps_bear_every_device():
+    """Those of `pkxyz tune youla_lab`: the lag takes phase that the others reckon with, of which nine of 500 are
+    unstable there.
+    """
+    config = load("controllers", "youla", ControllerConfig)
+    loop = behind_a_slow_filter(config)
     axes = loop.margins(MIDDLE).axes
     assert 150.0 <= min(axis.bandwidth_hz for axis in axes) < 160.0
     assert 1.5 < max(axis.peak_s for axis in axes) <= 1.9
@@ -120,6 +118,36 @@ def test_taps_for_that_stage_bear_them_all():
     assert 3.0 < max(sampled) <= 4.0
     plant, about = loop_plant(stage("lab"), bus(), MIDDLE), law_about(stage("lab"), loop.law, MIDDLE)
     assert 0.7 < 1e9 * hold_noise_m(stage("lab"), bus(), plant, about).max() <= 0.85
+    fast = config.youla.model_copy(update={"filter": config.youla.filter[:1]})
+    other = behind_a_slow_filter(config.model_copy(update={"youla": fast}))
+    unstable = [seed for seed in range(1, 101) if np.isinf(other.peak_sensitivity(tolerances.sample(seed)))]
+    assert unstable == [4, 10, 79]
+
+
+@pytest.mark.parametrize(("sense_delay_us", "place"), [(0.0, 0), (65.0, 0), (65.1, 1), (99.5, 1), (2000.0, 1)])
+def test_a_stage_has_the_taps_with_the_least_limit_that_its_sense_delay_keeps(sense_delay_us, place):
+    youla = load("controllers", "youla", ControllerConfig).youla
+    assert [f.sense_delay_max_us for f in youla.filter] == [65.0, 1000.0]
+    assert youla.place_of_filter(200, 1, sense_delay_us) == place
+    turned = youla.model_copy(update={"filter": youla.filter[::-1]})
+    assert turned.place_of_filter(200, 1, sense_delay_us) == 1 - place
+    assert youla.place_of_filter(200, 2, sense_delay_us) is None
+    assert youla.place_of_filter(500, 1, sense_delay_us) is None
+
+
+@pytest.mark.parametrize("delay_us", [25.0, 48.0, 75.0, 120.0])
+def test_between_both_stages_the_taps_bear_the_devices(delay_us):
+    config = load("stages", "reconstructed", StageConfig)
+    between = Stage(config.model_copy(update={"sense": config.sense.model_copy(update={"delay_s": 1e-6 * delay_us})}))
+    law = design_law(between, load("controllers", "youla", ControllerConfig), bus(), autostart=True)
+    loop, tolerances = Loop(between, bus(), law), load("tolerances", "wide", Tolerances)
+    assert 2.2 < max(loop.peak_sensitivity(tolerances.sample(seed)) for seed in range(1, 81)) <= 4.0
+
+
+def test_two_filters_for_one_stage_are_refused():
+    taps = load("controllers", "youla", ControllerConfig).youla.filter
+    with pytest.raises(ValidationError, match="two filters for a period of 200 us and sense delays up to 65 us"):
+        Youla(filter=(*taps, taps[0]))
 
 
 def test_on_a_bus_without_a_filter_the_state_feedback_stands_alone():
@@ -182,7 +210,9 @@ def test_what_no_filter_can_do_is_refused_with_what_would_help():
 def test_the_found_taps_run_from_the_file_that_is_written(found, tmp_path):
     write_taps(small(), found, tmp_path / "mine.toml")
     written = load("controllers", tmp_path / "mine.toml", ControllerConfig)
-    assert [(f.plane, f.z) for f in written.youla.filter] == [(found.plane, found.z)]
+    own, slower = written.youla.filter
+    assert (own.plane, own.z, own.sense_delay_max_us) == (found.plane, found.z, 65.0)
+    assert slower == load("controllers", "youla", ControllerConfig).youla.filter[1]  # not for the search's stage
     assert written.name == "mine"
     assert asks_for_taps("youla")
     assert not asks_for_taps("lqg")
