@@ -42,7 +42,7 @@ class ToldController(Controller):
         self._begin = self._answer(Call.BEGIN)
         self._on_frame = self._answer(Call.FRAME)
         self._period = self._answer(Call.PERIOD)
-        self._finish = self._answer(Call.FINISH)
+        self._finish, self._prepare = self._answer(Call.FINISH), self._answer(Call.PREPARE)
 
     def _answer(self, call: Call) -> Any:
         return lambda *_: self._told[call]

@@ -15,7 +15,7 @@ from hil.node.rules import NEVER_US, OPERATIONAL
 from hil.whole_ticks.happenings import Bytes, Line, Records, Stage, happen, look, next_us, pass_time, send, take_first
 from pkxyz_ctrl.can.driver_rules import FRESH, RUNNING, START_UP
 from pkxyz_ctrl.compiled.kernel import kernel
-from pkxyz_ctrl.loop.exchange import BLOCKED, NOT_RESTARTED, RESTARTED, begin, finish, on_frame, period
+from pkxyz_ctrl.loop.exchange import BLOCKED, NOT_RESTARTED, RESTARTED, begin, finish, on_frame, period, prepare
 from pkxyz_ctrl.safety.modes import Mode
 
 Pair = tuple[Records, Records]
@@ -106,6 +106,7 @@ def _tick(
     told = finish(config, memory, now_us, lane["t_us"] + lane["heartbeat_us"])
     if told & BLOCKED or not send(memory, wire, told, now_us):
         return False
+    prepare(config, memory)
     _record(memory, lane, stage, rows, seen_v, done, now_us)
     if not pass_time(lane, its, own, stage, line, end_us):
         return False

@@ -16,7 +16,8 @@ theta as the filter itself does (Friedland 1969): with U the change of the filte
 Recursive least squares (a Kalman filter of numbers that drift slowly) works on nu with d nu, one axis a tick. Its
 covariance never exceeds what was known beforehand. It stands still where the reference does, where the stage is not
 where it should be, and after a comb was at a limit. What acts follows it within some milliseconds, and the filter's
-state moves along by U: then it is as if the filter had always known, and nothing kicks.
+prediction moves along by U: then it is as if the filter had always known, and nothing kicks. All this is done when the
+voltages are on their way, so that nobody waits for it.
 
 Beside it stands what was known once, the base. If one cause alone has changed since (a comb, a chain's springs, the
 hinges), one number makes the innovations that the base would leave as small as those that are left: it is a warning.
@@ -46,7 +47,7 @@ LEAST_LOSS = 0.1
 _MOST_SPARED = 0.5  # of a comb's pull: one that has become stronger is told as at most twice as strong
 _PARAMETERS, _CAUSES = np.int32(PARAMETERS), np.int32(CAUSES)  # a processor of 32 bits counts these for less
 _FLOOR_N = 1e-100  # in each force: else what is at rest falls below the normal numbers, and a PC slows down fivefold
-AGES = 2  # intervals that are remembered: two periods of delay
+AGES = 3  # intervals that are remembered: two periods of delay, and the one that was decided last
 
 ADAPTATION = np.dtype(
     [
@@ -122,16 +123,17 @@ def learn(
     origin_m: Array,
     innovation_m: Array,
     filtered: Array,
+    predicted: Array,
     has_measurement: bool,
 ) -> None:
-    """Take in the innovation (3,) of this sample, move the filter's state (9,) about ``origin_m`` along, and carry U to
-    the next sample.
+    """Take in the innovation (3,) of this sample, where the filter's state (9,) about ``origin_m`` was ``filtered``,
+    carry U to the next one, and move what is ``predicted`` (9,) for it along. After ``note`` of this tick.
     """
     if state["begun"] == 0:
         begin(adaptation, state)
     if has_measurement:
-        _show(adaptation, state, state["motion"][delay - 1])
-    row, near = state["motion"][delay - 1], has_measurement
+        _show(adaptation, state, state["motion"][delay])
+    row, near = state["motion"][delay], has_measurement
     for i in range(3):
         near = near and abs(origin_m[i] + filtered[i] - row[i]) < adaptation["near_m"]
     state["calm"] = min(state["calm"] + 1, adaptation["calm_ticks"]) if near else 0
@@ -145,16 +147,16 @@ def learn(
         state["acting"][p] += change[p]
     for i in range(3):
         u, phi, gamma = state["sensitivity"][i], adaptation["transition"][i], adaptation["input"][i]
-        force = state["force_n"][delay - 1, i]
-        for s in range(3):
-            moved = 0.0
-            for p in range(_PARAMETERS):
-                moved += u[s, p] * change[p]
-            filtered[3 * s + i] += moved
+        force = state["force_n"][delay, i]
         for p in range(_PARAMETERS):
             x, v, d, f = u[0, p], u[1, p], u[2, p], force[p] + _FLOOR_N
             u[0, p] = phi[0, 0] * x + phi[0, 1] * v + phi[0, 2] * d - gamma[0] * f
             u[1, p] = phi[1, 0] * x + phi[1, 1] * v + phi[1, 2] * d - gamma[1] * f
+        for s in range(3):
+            moved = 0.0
+            for p in range(_PARAMETERS):
+                moved += u[s, p] * change[p]
+            predicted[3 * s + i] += moved
 
 
 @kernel

@@ -3,8 +3,8 @@ allocation and voltage; PURE and compiled.
 
 Three steps, so that whoever composes them can look between: ``measure`` (counts -> position), ``estimate`` (filter
 and its prediction to the instant of action), ``act`` (law -> comb forces -> counts). ``rest`` stands in for ``act``
-while the loop is open. Everything works on two records: ``law`` (numbers that were designed, never written) and
-``memory`` (what lives from tick to tick).
+while the loop is open; ``prepare`` is what the voltages do not wait for. Everything works on two records: ``law``
+(numbers that were designed, never written) and ``memory`` (what lives from tick to tick).
 """
 
 import math
@@ -64,6 +64,7 @@ unless ``kind`` is LINEAR, nor beyond the rows of ``a`` that the order has.
 """
 
 DELAY_MAX = set_point_model.DELAY_MAX
+_BLIND, _SEEN = 1, 2
 
 SCRATCH = np.dtype(
     [
@@ -113,6 +114,8 @@ MEMORY = np.dtype(
         ("coming", COMING),
         ("feedforward_known", "i4"),
         ("active_set_steps", "i4"),
+        ("to_learn", "i4"),  # of this tick, by ``prepare``: 0 nothing, _BLIND without a measurement, _SEEN with one
+        ("to_follow", "i4"),  # 1: the model of the set-points is not where this tick's forces lead it
         ("landing", "i4"),  # 1: the stage is led down; instead of the feedback acts ...
         ("landing_share", "f8"),  # ... so much of its last force
         ("scratch", SCRATCH),
@@ -153,9 +156,7 @@ def estimate(law: np.void, memory: np.void, has_measurement: bool) -> None:
     filtering.update(estimator, state, seen, has_measurement)
     youla.note(law["youla"], memory["youla"], state["innovation_m"])
     if online:
-        adaptation.learn(
-            law["adaptation"], learnt, delay, origin, state["innovation_m"], state["filtered"], has_measurement
-        )
+        memory["to_learn"] = _SEEN if has_measurement else _BLIND
     position, w, w_change = scratch["position_m"], scratch["w_n"], scratch["w_change_n"]
     acting, acted, start = scratch["acting_n"], scratch["acted_n"], scratch["state"]
     ahead, none = state["ahead"], scratch["nothing"]
@@ -208,11 +209,25 @@ def act(law: np.void, memory: np.void, now: Array, after: Array, later: Array) -
         memory["slack_n"][i] = demand[i] - applied[i]
     if law["adaptation"]["on"] != 0 and (memory["active_set_steps"] > 1 or memory["landing"] != 0):
         adaptation.disturb(memory["adaptation"])
-    if kind != PREDICTIVE:
-        _follow(law, memory)
+    memory["to_follow"] = 1 if kind != PREDICTIVE else 0
     if kind == LINEAR:
         linear_law.advance(law["linear"], memory["linear"], share)
     return memory["active_set_steps"] > 1
+
+
+@kernel
+def prepare(law: np.void, memory: np.void) -> None:
+    """What the next tick begins with: to be called between two ticks, when the voltages are on their way."""
+    if memory["to_learn"] != 0:
+        estimator, state = law["estimator"], memory["estimate"]
+        adaptation.learn(
+            law["adaptation"], memory["adaptation"], law["delay_periods"], estimator["operating_point_m"],
+            state["innovation_m"], state["filtered"], state["predicted"], memory["to_learn"] == _SEEN,
+        )  # fmt: skip
+        memory["to_learn"] = 0
+    if memory["to_follow"] != 0:
+        _follow(law, memory)
+        memory["to_follow"] = 0
 
 
 @kernel
@@ -249,6 +264,7 @@ def release(law: np.void, memory: np.void) -> None:
     memory["active_set_steps"] = 0
     memory["feedforward_known"] = 0
     memory["landing"] = 0
+    memory["to_follow"] = 0
     linear_law.clear(memory["linear"])
     if law["youla"]["taps"] > 0:
         youla.clear(memory["youla"])

@@ -23,7 +23,7 @@ CALL = np.dtype(
         ("can_id", "i4"),
         ("flags", "i4"),
         ("length", "i4"),
-        ("kind", "i2"),  # START to CLEAR
+        ("kind", "i2"),  # a ``Call``
         ("mode", "i2"),  # for JUDGE: of the controller
     ],
     align=True,
@@ -44,6 +44,7 @@ class Call(IntEnum):
     JUDGE = 8
     REQUEST = 9
     CLEAR = 10
+    PREPARE = 11
 
 
 class RecordedController(Controller):
@@ -92,6 +93,7 @@ class RecordedController(Controller):
     def finish(self, t_us: int, heartbeat_until_us: int) -> None:
         self._note(Call.FINISH, t_us, heartbeat_until_us)
         super().finish(t_us, heartbeat_until_us)
+        self._note(Call.PREPARE, t_us)
 
     def stop(self, t_us: int) -> None:
         self._note(Call.STOP, t_us)

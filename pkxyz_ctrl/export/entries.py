@@ -100,6 +100,13 @@ ENTRIES = (
         (_CONFIG, _MEMORY, _T_US, Argument("heartbeat_until_us")),
         f"The drive frame of this period, for the next SYNC, and our heartbeat if it is due and fits. {_OUT}.",
     ),
+    Entry(
+        "pkxyz_prepare",
+        exchange.prepare,
+        (_CONFIG, _MEMORY),
+        "Behind the drive frame: what it did not have to wait for. Left out, the next period begins with it.",
+        told=False,
+    ),
     Entry("pkxyz_stop", exchange.stop, (_CONFIG, _MEMORY, _T_US), f"0 V and pre-operational. {_OUT}."),
     Entry(
         "pkxyz_judge",

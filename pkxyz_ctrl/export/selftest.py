@@ -71,7 +71,7 @@ class Board:
         exchange.switch_on(self.memory)
         c, m = self._config, self.memory
         self._begin, self._finish = direct(exchange.begin, c, m, 0), direct(exchange.finish, c, m, 0, 0)
-        self._on_frame = direct(exchange.on_frame, c, m, *[0] * 5)
+        self._on_frame, self._prepare = direct(exchange.on_frame, c, m, *[0] * 5), direct(exchange.prepare, c, m)
         period = planned.period if is_planned(self._config["law"][0]) else exchange.period
         self._period = direct(period, self._whole, self._whole_memory, reference, 0)
 
@@ -80,7 +80,7 @@ class Board:
         kind = int(call["kind"])
         told = self._called(kind, call)
         told_words = np.array([told], np.int64).view(np.uint64)
-        if kind in (Call.COME_UP, Call.REQUEST, Call.CLEAR):
+        if kind in (Call.COME_UP, Call.REQUEST, Call.CLEAR, Call.PREPARE):
             return told_words
         if kind == Call.PERIOD:
             return np.concatenate([told_words, canonical(self.row)])
@@ -99,6 +99,8 @@ class Board:
             told = self._period(self._whole, self._whole_memory, self._reference, data)
         elif kind == Call.FINISH:
             told = self._finish(config, memory, t_us, data)
+        elif kind == Call.PREPARE:
+            self._prepare(config, memory)
         elif kind == Call.COME_UP:
             told = exchange.come_up(memory)
         elif kind == Call.JUDGE:

@@ -90,7 +90,7 @@ class Controller:
     def _load_kernels(self) -> None:
         """All that it calls: now, not in the first tick."""
         config, memory = self.record, self.exchange
-        self._begin = direct(exchange.begin, config, memory, 0)
+        self._begin, self._prepare = direct(exchange.begin, config, memory, 0), direct(exchange.prepare, config, memory)
         self._on_frame = direct(exchange.on_frame, config, memory, *[0] * 5)
         self._finish = direct(exchange.finish, config, memory, 0, 0)
         self._start, self._wait = direct(exchange.start, config, memory, 0), direct(exchange.wait, config, memory, 0)
@@ -227,7 +227,7 @@ class Controller:
             self.driver.told(frame, told, t_us)
             if told & START_UP:
                 self._pass_on(BLOCKED | int(self.exchange["driver"]["outgoing"][0, 0]), t_us)
-        return bool(told & FRESH)
+        return told & FRESH != 0
 
     def compute(self, reference: Records, overrun: int) -> None:
         """Run the cycle on what has come since the SYNC. ``reference`` (n,) of ``REFERENCE``;
@@ -242,9 +242,10 @@ class Controller:
 
     def finish(self, t_us: int, heartbeat_until_us: int) -> None:
         """Send the voltages of this tick, and our heartbeat behind them if it is due
-        and still fits before the next SYNC.
+        and still fits before the next SYNC. Then do what they did not have to wait for.
         """
         self._pass_on(self._finish(self.record, self.exchange, t_us, heartbeat_until_us), t_us)
+        self._prepare(self.record, self.exchange)
 
     def _pass_on(self, told: int, t_us: int) -> None:
         """Send what the compiled part wants to send and may; a voltage that may not be sent is 0 V in the next."""

@@ -136,6 +136,7 @@ def cycle(law_array: Records, memory_array: Records, reference: Records) -> None
 @kernel
 def observe(law_array: Records, memory_array: Records, reference: Records) -> None:
     """First part of the period: event and mode, measurement, estimate, the rows of the reference that count."""
+    prepare(law_array, memory_array)  # unless it is done
     law, memory = law_array[0], memory_array[0]
     _handle(law, memory, _asked(law, memory))
     if memory["mode"] == _LANDING:
@@ -183,6 +184,14 @@ def respond(law_array: Records, memory_array: Records) -> None:
     seen["event"] = _NONE
     seen["trips"] = 0
     state["plan_known"] = state["solver_iterations"] = 0
+
+
+@kernel
+def prepare(law_array: Records, memory_array: Records) -> None:
+    """What the period has taught, and where the model of the set-points is led: whoever wants his voltages out first
+    calls it behind them. Else it is the beginning of the next period, with the same result.
+    """
+    tick.prepare(law_array[0]["tick"], memory_array[0]["tick"])
 
 
 @kernel

@@ -250,6 +250,12 @@ def finish(config_array: Records, memory_array: Records, t_us: int, heartbeat_un
 
 
 @kernel
+def prepare(config_array: Records, memory_array: Records) -> None:
+    """What can wait until the voltages are on their way: see ``cycle.prepare``."""
+    cycling.prepare(config_array[0]["law"], memory_array[0]["cycle"])
+
+
+@kernel
 def _short_frames(config: np.void, memory: np.void, begun_us: int, t_us: int, until_us: int) -> int:
     """How many frames of one byte, up to ``_SHORT_FRAMES_MOST``, still fit behind a drive frame that is sent at
     ``t_us``, of which the first had to be sent by ``until_us``; the node's heartbeat, where it is due in the period

@@ -37,6 +37,7 @@ def take_over(law_array: Records, memory_array: Records, change_array: Records) 
     """Write the numbers of the new law into ``law_array`` (1,) of ``cycle.LAW``, which the loop reads, and its memory
     (1,) of ``cycle.MEMORY`` likewise. Between two ticks, the stage at rest or its loop open.
     """
+    cycling.prepare(law_array, memory_array)
     law, state, change = law_array[0]["tick"], memory_array[0]["tick"], change_array[0]
     new, held_n, adapts = change["law"]["tick"], state["held_n"], law["adaptation"]["on"] != 0
     for i in range(3):  # the filter's states are about an operating point, which may be another one

@@ -192,7 +192,8 @@ def test_a_jump_a_limit_and_a_missing_sample_teach_nothing():
     numbers, filtered = setup.law["tick"][0]["adaptation"], np.zeros(9)
     for has_measurement, calm in ((True, 51), (False, 0)):
         state["calm"] = 50
-        adaptation.learn(numbers, state, 1, state["motion"][0, :3].copy(), np.zeros(3), filtered, has_measurement)
+        origin, nothing = state["motion"][1, :3].copy(), np.zeros(3)
+        adaptation.learn(numbers, state, 1, origin, nothing, filtered, filtered.copy(), has_measurement)
         assert state["calm"] == min(calm, numbers["calm_ticks"])
     state["calm"] = 50
     adaptation.disturb(state)

@@ -67,7 +67,7 @@ def test_the_calls_alone_give_the_frames_and_rows_of_the_run(run):
         board.play(call)
         if call["kind"] == Call.PERIOD:
             rows.append(board.row.copy())
-        elif call["kind"] != Call.COME_UP:
+        elif call["kind"] not in (Call.COME_UP, Call.PREPARE):
             sent += frames_of(board)
     truth = ("position_m", "stroke_m", "comb_voltage_v")
     seen = run.rows.copy()
@@ -86,7 +86,7 @@ def test_calls_of_a_run_that_breaks_and_is_cleared_give_its_frames_as_well():
     for call in run.calls:
         board.play(call)
         modes.add(int(board.memory["cycle"]["mode"][0, 0]))
-        if call["kind"] not in (Call.PERIOD, Call.COME_UP, Call.CLEAR):
+        if call["kind"] not in (Call.PERIOD, Call.COME_UP, Call.CLEAR, Call.PREPARE):
             sent += frames_of(board)
     assert (run.calls["kind"] == Call.CLEAR).any()
     assert {Mode.FAULT, Mode.BOOT, Mode.PRE_OPERATIONAL, Mode.TRACKING} <= modes

@@ -1,5 +1,5 @@
-/* The self-test's exchange once more on the emulated board: how long each period takes from its beginning to its drive
-   frame, frames and gate included, by the board's own counter. */
+/* The self-test's exchange once more on the emulated board: how long each period takes from its beginning to the end of
+   what its drive frame did not wait for, frames and gate included, by the board's own counter. */
 #define main self_test_main
 #include "main.c"
 #undef main
@@ -31,7 +31,7 @@ int main(void)
         counts[periods] += (before - SYSTICK_VALUE) & 0xffffff;
         if (calls[n].kind == PKXYZ_CALL_COME_UP && told == 1)
             counts[periods] = 0; /* of the start-up */
-        if (calls[n].kind == PKXYZ_CALL_FINISH)
+        if (calls[n].kind == PKXYZ_CALL_PREPARE)
             periods++;
     }
     const uint32_t file = opened("counts", 6, TO_WRITE);

@@ -58,6 +58,7 @@ def test_a_law_takes_over_as_it_does_in_numpy(seed):
     dice = np.random.default_rng(seed)
     present, new, memory = filled(cycling.LAW, dice), filled(cycling.LAW, dice), filled(cycling.MEMORY, dice)
     present["tick"]["adaptation"]["on"] = seed % 2
+    memory["tick"]["to_learn"] = memory["tick"]["to_follow"] = 0  # the last period is through
     if seed % 3 == 0:
         new["tick"]["adaptation"] = present["tick"]["adaptation"]
     heard = dice.standard_normal(24)

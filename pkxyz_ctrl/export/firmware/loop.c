@@ -128,6 +128,9 @@ static void finished(int64_t heartbeat_until_us)
     stopwatch_pause();
     require(status);
     send_what_may_be_sent();
+    stopwatch_go_on();
+    require(pkxyz_prepare(config, memory)); /* what no voltage waits for */
+    stopwatch_pause();
     head.period_counts = stopwatch();
     note_call(PKXYZ_CALL_FINISH);
 }

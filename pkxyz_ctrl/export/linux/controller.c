@@ -31,6 +31,7 @@ void controller_warm_up(void)
         pkxyz_on_frame(config, &warm, config->driver->sense->pdo->cob_id, 0, 8, 0, n * WARM_UP_US, &told);
         pkxyz_period(config, &warm, &still, 1, 0, &told);
         pkxyz_finish(config, &warm, n * WARM_UP_US, 0, &told);
+        pkxyz_prepare(config, &warm);
     }
 }
 
@@ -149,6 +150,7 @@ void controller_finish(int64_t t_us, int64_t heartbeat_until_us)
     int64_t told = 0;
     const int32_t status = pkxyz_finish(config, memory, t_us, heartbeat_until_us, &told);
     send_out(status, told, t_us);
+    note(pkxyz_prepare(config, memory)); /* what no voltage waits for */
 }
 
 void controller_stop(int64_t t_us)

@@ -54,6 +54,9 @@ static int32_t called(const pkxyz_exchange *config, const pkxyz_reference *path,
     case PKXYZ_CALL_CLEAR:
         memory->clearing = (int32_t)call->data;
         break;
+    case PKXYZ_CALL_PREPARE:
+        *told = 0;
+        return pkxyz_prepare(config, memory);
     default:
         return 1;
     }
