@@ -16,8 +16,7 @@ theta as the filter itself does (Friedland 1969): with U the change of the filte
 Recursive least squares (a Kalman filter of numbers that drift slowly) works on nu with d nu, one axis a tick. Its
 covariance never exceeds what was known beforehand. It stands still where the reference does, where the stage is not
 where it should be, and after a comb was at a limit. What acts follows it within some milliseconds, and the filter's
-prediction moves along by U: then it is as if the filter had always known, and nothing kicks. All this is done when the
-voltages are on their way, so that nobody waits for it.
+prediction moves along by U: then it is as if the filter had always known, and nothing kicks. No voltage waits for it.
 
 Beside it stands what was known once, the base. If one cause alone has changed since (a comb, a chain's springs, the
 hinges), one number makes the innovations that the base would leave as small as those that are left: it is a warning.
@@ -117,17 +116,11 @@ def seen(adaptation: np.void, state: np.void, measured_m: Array, delay: int, out
 
 @kernel
 def learn(
-    adaptation: np.void,
-    state: np.void,
-    delay: int,
-    origin_m: Array,
-    innovation_m: Array,
-    filtered: Array,
-    predicted: Array,
-    has_measurement: bool,
-) -> None:
-    """Take in the innovation (3,) of this sample, where the filter's state (9,) about ``origin_m`` was ``filtered``,
-    carry U to the next one, and move what is ``predicted`` (9,) for it along. After ``note`` of this tick.
+    adaptation: np.void, state: np.void, delay: int, origin_m: Array, innovation_m: Array, filtered: Array,
+    predicted: Array, has_measurement: bool,
+) -> None:  # fmt: skip
+    """After ``note``: take in the innovation (3,) of this sample, where the filter's state (9,) about ``origin_m`` was
+    ``filtered``, carry U to the next one, and move what is ``predicted`` (9,) for it along.
     """
     if state["begun"] == 0:
         begin(adaptation, state)

@@ -47,13 +47,17 @@ def flat(numbers, names=NUMBERS):
 
 
 def test_it_is_what_the_command_finds_of_that_device():
-    """Both have errors of their own: none of eleven numbers beyond 4.5 standard errors of a difference."""
-    real = identify(unlike().setup(SCENARIO.setup()), MIDDLE, Lane.FAST).calibrated.calibration
-    model = modelled(0)
-    error = np.hypot(flat(real.standard_error), flat(model.standard_error))
-    assert (np.abs(flat(real) - flat(model)) < 4.5 * error).all()
-    assert flat(real.standard_error) == pytest.approx(flat(model.standard_error), rel=0.5)
-    assert (np.abs(flat(real) - 1.0)[:9] > 4.5 * error[:9]).sum() > 5  # they do differ from the drawing
+    """Both have errors of their own: none of eleven numbers beyond 4.5 standard errors of a difference. What is left of
+    some dozen forces scales the command's: by 1.1 to 1.6 of the model's with the noise, so four are looked at.
+    """
+    setup, model, scales = unlike().setup(SCENARIO.setup()), modelled(0), []
+    for seed in (1, 2, 3, 4):
+        real = identify(replace(setup, seed=seed), MIDDLE, Lane.FAST).calibrated.calibration
+        error = np.hypot(flat(real.standard_error), flat(model.standard_error))
+        assert (np.abs(flat(real) - flat(model)) < 4.5 * error).all()
+        assert (np.abs(flat(real) - 1.0)[:9] > 4.5 * error[:9]).sum() > 5  # they do differ from the drawing
+        scales.append(flat(real.standard_error) / flat(model.standard_error))
+    assert np.mean(scales, axis=0) == pytest.approx(1.0, rel=0.5)
 
 
 def test_its_errors_scatter_as_it_says():
