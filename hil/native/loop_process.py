@@ -7,8 +7,6 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import Any, NoReturn
 
-import numpy as np
-
 from hil.lanes.ending import Ended, Ending
 from hil.lanes.setup import Setup
 from hil.lanes.wall import AmplifierGoneError, alone
@@ -40,7 +38,7 @@ class LoopProcess:
         self._mapped, self._told, self._held, self._ending = mapped, told, held, ending
         self.shared = mapped.shared[0]
         told.outputs[0] = setup.new_outputs()[0]
-        self.shared["config"], self.shared["memory"] = told.record, told.exchange
+        told.lay_out(self.shared)
         self.state: Any = self.shared["state"][0]
         self._process: subprocess.Popen[bytes] | None = None
         self._asked = 0
@@ -112,7 +110,7 @@ class LoopProcess:
 
     def _remember(self) -> None:
         self._told.take(self.shared["events"][0])
-        self._told.remember(np.atleast_1d(self.shared["memory"]), self.state["port"][0])
+        self._told.remember(self.shared["memory"]["own"][0], self.state["port"][0])
 
     def _killed(self, code: int) -> NoReturn:
         self._remember()

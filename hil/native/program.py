@@ -62,7 +62,7 @@ def compiled() -> Path:
 def build(folder: Path, with_compiler: str) -> None:
     """Header, object and sources into ``folder``, and ``loop`` out of them. Raises ``ExportError``."""
     (folder / "pkxyz.h").write_text(loop_header(), encoding="utf-8")
-    (folder / "pkxyz.o").write_bytes(lower(kernels(), TARGETS["linux"]).code)
+    (folder / "pkxyz.o").write_bytes(lower(kernels(is_planned=True), TARGETS["linux"]).code)
     sources = [str(path) for path in sorted(LOOP_SOURCES.glob("*.c"))]
     words = [with_compiler, *FLAGS, "-I", str(folder), "-o", str(folder / "loop"), *sources, str(folder / "pkxyz.o")]
     done = subprocess.run(words, check=False, capture_output=True, text=True)

@@ -24,7 +24,7 @@ def standalone(setup: Setup, can: CanConfig, company_s: float) -> bytes:
         raise ConfigError(f"--ticks: path and rows of {setup.ticks} ticks take {size >> 20} MiB; give {ticks} or less")
     mapped, told = Mapped(blocks, ring_bytes), Teller(setup)
     shared = mapped.shared[0]
-    shared["config"], shared["memory"] = told.record, told.exchange
+    told.lay_out(shared)
     fill(shared["settings"], setup, can, company_s)
     PathFeeder(setup, mapped.blocks)
     content = mapped.content

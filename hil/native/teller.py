@@ -1,5 +1,7 @@
 """The words for what a native loop did: a controller that is never run, and remembers what the loop's remembered."""
 
+from typing import Any
+
 import numpy as np
 from numpy.typing import NDArray
 
@@ -7,6 +9,7 @@ from hil.lanes.setup import Setup
 from hil.lanes.wall import wall_gate
 from pkxyz_ctrl.can.driver import bytes_of
 from pkxyz_ctrl.can.frame import Frame
+from pkxyz_ctrl.export.planned import begins, whole
 from pkxyz_ctrl.export.shared import EVENTS, Told
 from pkxyz_ctrl.io.can_port import complaint_of, refusal_of
 from pkxyz_ctrl.loop.controller import Controller
@@ -17,9 +20,7 @@ Records = NDArray[np.void]
 
 
 class Teller(Controller):
-    """``record`` and ``exchange`` are what the loop begins with. ``faults`` grows as ``take`` reads events; after
-    ``remember`` the rest of a controller's words hold, too.
-    """
+    """``faults`` grows as ``take`` reads events; after ``remember`` the rest of a controller's words hold, too."""
 
     def __init__(self, setup: Setup) -> None:
         self._port: np.void | None = None
@@ -38,6 +39,12 @@ class Teller(Controller):
         if port is None:
             return ""
         return complaint_of(bool(port["is_bus_off"]), refusal_of(int(port["refusal"])) if port["refuses"] else "")
+
+    def lay_out(self, shared: Any) -> None:
+        """Write what the loop begins with into a record of ``SHARED``."""
+        config = whole(self.record)
+        begins(shared["config"], config.dtype)[:] = config
+        shared["memory"]["own"] = self.exchange
 
     def remember(self, memory: Records, port: np.void) -> None:
         """Take over what the loop remembers: (1,) of ``EXCHANGE_MEMORY``, and ``PORT``."""

@@ -282,3 +282,8 @@ class Setpoints:
 def rows_of(law: NDArray[np.void]) -> tuple[int, int]:
     """``delay_periods`` and ``ramp_rows`` of a law (1,) of ``cycle.LAW``."""
     return int(law["tick"]["delay_periods"][0]), int(law["feed_hold_ticks"][0])
+
+
+def planned_rows_of(law: NDArray[np.void]) -> int:
+    """How many rows more a law (1,) of ``cycle.LAW`` looks at that plans ahead; 0 for another one."""
+    return int(law["tick"]["predictive"]["horizon"][0])

@@ -19,7 +19,7 @@ from pkxyz_ctrl.export.entries import FIELD, RECORD, Argument, Entry, entries_fo
 def main(out: Path, *, is_planned: bool) -> None:
     """Compile every entry and write one module."""
     module, symbols = None, {}
-    for entry in entries_for(has_loop=True, is_planned=is_planned):
+    for entry in entries_for(has_loop=is_planned):
         overload = _compiled(entry)
         symbols[entry.name] = overload.fndesc.llvm_func_name
         part = llvm.parse_assembly(overload.library.get_llvm_str())

@@ -151,10 +151,9 @@ _PLANNED = {
 
 
 def entries_for(*, has_loop: bool, is_planned: bool = False) -> tuple[Entry, ...]:
-    """Those that a target has, with the native loop or without, or for a law that plans."""
-    if is_planned:
-        return tuple(_planned(entry) for entry in ENTRIES)
-    return ENTRIES + OF_LOOP if has_loop else ENTRIES
+    """Those that a target has, with the native loop, which takes any law, or without; there also for one that plans."""
+    entries = tuple(_planned(entry) for entry in ENTRIES) if has_loop or is_planned else ENTRIES
+    return entries + OF_LOOP if has_loop else entries
 
 
 def _planned(entry: Entry) -> Entry:

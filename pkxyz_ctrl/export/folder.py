@@ -94,11 +94,6 @@ def require_exportable(law: Records, name: str, target: str) -> None:
             f"a period of {period_us} us is too short for {target}, where the longest tick takes {most_us} us; give a "
             f"bus of {math.ceil(most_us / BUSY_MOST)} us or more, {fewer}or another target"
         )
-    if is_planned(law) and target_of(target).has_loop:
-        raise ExportError(
-            f"controller {name!r} solves a problem in the middle of a tick, and the loop at rate in C has no place for "
-            "what it remembers; choose another one (--controller robust)"
-        )
 
 
 def tick_most_us(law: Records, target: Target) -> int:
@@ -128,7 +123,7 @@ def write(out: Path, target_name: str, exported: Exported) -> dict[str, Any]:
         rows = REFERENCE_MAX_BYTES // exported.reference.itemsize
         require_room(exported.reference, f"give --ticks {rows} or less, and stream the rest")
     test = self_test(exported.config, exported.reference, exported.calls)
-    lowered = lower(kernels(is_planned=is_planned(exported.law)), target)
+    lowered = lower(kernels(is_planned=target.has_loop or is_planned(exported.law)), target)
     files = _files(target_name, target, exported, test, lowered)
     manifest = _manifest(target_name, target, exported, test, lowered, files)
     files["manifest.json"] = (json.dumps(manifest, indent=2) + "\n").encode()

@@ -25,7 +25,7 @@ class ExportError(ValueError):
 
 class Kernels(NamedTuple):
     """``ir``: one module with all of them. ``symbols``: names of the entries' functions in it. ``is_planned``: those of
-    a law that plans.
+    any law, the one that plans too, and of the native loop.
     """
 
     ir: str

@@ -1,5 +1,5 @@
 """The predictive law as it is exported: what it has besides stands behind the records of every law, and its period is
-composed with a plan. None of it is in the export of another law.
+composed with a plan. None of it is in a board's export of another law; the loop in C takes any law, over these records.
 """
 
 from typing import Any
@@ -58,18 +58,27 @@ def begins(records: Records, dtype: np.dtype[Any]) -> Records:
 
 @kernel
 def cycle(law_array: Records, memory_array: Records, reference: Records) -> None:
-    """``cycle.cycle`` with a plan, over (1,) of ``PLANNED_LAW`` and of ``PLANNED_MEMORY``."""
+    """``cycle.cycle`` of any law, over (1,) of ``PLANNED_LAW`` and of ``PLANNED_MEMORY``."""
     law, memory = law_array[0], memory_array[0]
-    predictive_cycle.cycle(law["own"], memory["own"], reference, law["problem"], memory["planner"])
+    _cycle(law["own"], memory["own"], reference, law["problem"], memory["planner"])
 
 
 @kernel
 def period(config_array: Records, memory_array: Records, reference: Records, overrun: int) -> int:
-    """``exchange.period`` with a plan, over (1,) of ``PLANNED_EXCHANGE`` and of ``PLANNED_EXCHANGE_MEMORY``."""
+    """``exchange.period`` of any law, over (1,) of ``PLANNED_EXCHANGE`` and of ``PLANNED_EXCHANGE_MEMORY``."""
     config, memory = config_array[0], memory_array[0]
     law, own = config["own"][0]["law"], memory["own"]
     was = exchange.hand_over(own, overrun)
-    predictive_cycle.cycle(law, own[0]["cycle"], reference, config["problem"], memory["planner"])
+    _cycle(law, own[0]["cycle"], reference, config["problem"], memory["planner"])
     outputs.decide(law, own[0]["cycle"], own[0]["outputs"], reference)
     left: int = exchange.take_over(own, was)
     return left
+
+
+@kernel
+def _cycle(law: Records, memory: Records, reference: Records, problem: Records, planner: Records) -> None:
+    """With a plan where the law is one that plans; else nothing of the last two is touched, nor need be there."""
+    if law[0]["tick"]["kind"] == PREDICTIVE:
+        predictive_cycle.cycle(law, memory, reference, problem, planner)
+    else:
+        cycling.cycle(law, memory, reference)

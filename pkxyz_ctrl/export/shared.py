@@ -13,7 +13,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from pkxyz_ctrl.can.driver_rules import OUTGOING
-from pkxyz_ctrl.loop.exchange import EXCHANGE, EXCHANGE_MEMORY
+from pkxyz_ctrl.export.planned import PLANNED_EXCHANGE, PLANNED_EXCHANGE_MEMORY
+from pkxyz_ctrl.loop.exchange import EXCHANGE_MEMORY
 from pkxyz_ctrl.loop.law_change import CHANGE
 from pkxyz_ctrl.loop.reference import REFERENCE
 
@@ -262,8 +263,8 @@ SHARED = np.dtype(
         ("settings", SETTINGS, (1,)),
         ("state", STATE, (1,)),
         ("ring", RING, (1,)),
-        ("config", EXCHANGE, (1,)),
-        ("memory", EXCHANGE_MEMORY, (1,)),
+        ("config", PLANNED_EXCHANGE, (1,)),
+        ("memory", PLANNED_EXCHANGE_MEMORY, (1,)),
         ("events", EVENTS_RING, (1,)),
         ("operated", OPERATED, (1,)),
     ],

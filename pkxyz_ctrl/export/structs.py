@@ -19,8 +19,10 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
+from pkxyz_ctrl.core.demand import PREDICTIVE
 from pkxyz_ctrl.export.calls import CALL, Call
 from pkxyz_ctrl.export.entries import ENTRIES, MANY, OF_LOOP, Entry
+from pkxyz_ctrl.export.planned import PLANNED_EXCHANGE, PLANNED_EXCHANGE_MEMORY
 from pkxyz_ctrl.export.shared import (
     BLOCK_ROWS,
     EVENTS,
@@ -88,10 +90,10 @@ def header(period_us: int, held: Stored) -> str:
 
 def loop_header(period_us: int = 0, held: Stored | None = None) -> str:
     """``pkxyz.h`` with what the native loop shares, which itself takes any law."""
-    held = held or Stored(EXCHANGE.itemsize, EXCHANGE_MEMORY.itemsize)
+    held = held or Stored(PLANNED_EXCHANGE.itemsize, PLANNED_EXCHANGE_MEMORY.itemsize)
     law = _LAW.format(period_us=period_us, settings=held.settings, memory=held.memory)
     numbers = {"MAGIC": f"{MAGIC:#x}", "LAYOUT": f"{layout():#x}", "BLOCK_ROWS": BLOCK_ROWS, "EVENTS": EVENTS}
-    numbers["HISTOGRAM_US"], numbers["SNAPSHOTS"] = HISTOGRAM_US, SNAPSHOTS
+    numbers["HISTOGRAM_US"], numbers["SNAPSHOTS"], numbers["PREDICTIVE"] = HISTOGRAM_US, SNAPSHOTS, PREDICTIVE
     defined = "".join(f"#define PKXYZ_{name} {value}\n" for name, value in numbers.items())
     return _HEAD + law + defined + _body() + _shared_body() + _TAIL
 

@@ -21,7 +21,6 @@ from pkxyz_ctrl.loop.reference import REFERENCE
         (("--target", "z80"), "--target: 'z80' is none; choose host, linux, cortex-m7"),
         (("nowhere",), "nowhere"),
         (("--controller", "mpc"), "the longest tick takes 5034 us; give a bus of 6293 us or more, fewer rounds of its"),
-        (("--controller", "mpc", "--target", "linux"), "controller 'mpc' solves a problem in the middle of a tick"),
         (("--controller", "nope"), "nope"),
         (("--ticks", "10"), "ticks"),
         (("--target", "cortex-m4"), "a period of 200 us is too short for cortex-m4, where the longest tick takes 3750"),

@@ -10,7 +10,7 @@ from hil.lanes.lockstep import LockstepRig
 from hil.runs.scenario import load_scenario
 from pkxyz_ctrl.export import planned
 from pkxyz_ctrl.export.calls import Call, RecordedController
-from pkxyz_ctrl.export.entries import entries_for
+from pkxyz_ctrl.export.entries import OF_LOOP, entries_for
 from pkxyz_ctrl.export.selftest import Board
 from pkxyz_ctrl.export.stored import stored, stored_in_exchange
 from pkxyz_ctrl.loop import cycle as cycling
@@ -38,11 +38,11 @@ def test_what_a_planner_has_besides_stands_right_behind_what_every_law_has(large
     assert max(offset + kind.itemsize for kind, offset, *_ in record.fields.values()) == record.itemsize
 
 
-def test_no_other_law_has_its_kernels():
-    for has_loop in (False, True):
-        kernels = {entry.kernel for entry in entries_for(has_loop=has_loop)}
-        assert not kernels & {planned.cycle, planned.period}
-    for entry in entries_for(has_loop=False, is_planned=True):
+def test_on_a_board_no_other_law_has_its_kernels_and_the_loop_in_c_has_them_for_any():
+    assert not {entry.kernel for entry in entries_for(has_loop=False)} & {planned.cycle, planned.period}
+    of_loop = entries_for(has_loop=True)
+    assert of_loop == (*entries_for(has_loop=False, is_planned=True), *OF_LOOP)
+    for entry in of_loop:
         is_its_own = entry.kernel in (planned.cycle, planned.period)
         assert is_its_own == (entry.name in ("pkxyz_cycle", "pkxyz_period"))
         assert any(argument.whole is not None for argument in entry.arguments) == is_its_own

@@ -222,7 +222,8 @@ def changed_order(ir: str) -> str:
 
 def lowered(name: str) -> Lowered:
     """The kernels for a target."""
-    return lower(kernels(), TARGETS[name])
+    target = TARGETS[name]
+    return lower(kernels(is_planned=target.has_loop), target)
 
 
 def clean(board: Path, others: dict[str, Lowered], again: Kernels) -> list[str]:

@@ -1,5 +1,5 @@
 """What the native loop does not wait for, and what it does not take: a writer or a path that comes too late, folders
-that are not ours, laws and buses that do not go.
+that are not ours, learning and buses that do not go.
 """
 
 import dataclasses
@@ -118,7 +118,6 @@ def test_a_folder_that_is_not_ours_alone_is_refused_in_the_words_of_python_s_bus
 @pytest.mark.parametrize(
     ("words", "says"),
     [
-        (("--controller", "mpc"), "controller 'mpc' solves a problem in the middle of a tick"),
         (("--learn", "--bus", "unix_5k"), "learning writes the path while the loop runs"),
         (("--bus", "serial.toml"), "knows pkxyz-unix and socketcan, not 'slcan'"),
         (("--bus", "loud.toml"), "does not know can.options.receive_own_messages"),

@@ -3,6 +3,7 @@ no row that the law has seen ever becomes another one, and no set-point jumps.
 """
 
 import ctypes
+import dataclasses
 import subprocess
 from pathlib import Path
 
@@ -16,7 +17,7 @@ from hil.native.program import FLAGS, compiler
 from hil.native.teller import Teller
 from hil.operate.running.ordered import Ordered
 from hil.operate.running.sheets import Sheets
-from hil.operate.setpoints import rows_of
+from hil.operate.setpoints import planned_rows_of, rows_of
 from hil.runs.scenario import load_scenario
 from pkxyz_ctrl.export.folder import LOOP_SOURCES
 from pkxyz_ctrl.export.shared import LoopEnd
@@ -56,11 +57,12 @@ class Side:
         self.library, mapped = library, Mapped(blocks=1)
         self.shared = mapped.shared[0]
         self.ordered = Ordered(setup, self.shared)
-        self.shared["config"], self.shared["memory"] = self.ordered.record, self.ordered.exchange
+        self.ordered.lay_out(self.shared)
         self.shared["settings"]["blind_ticks"] = BLIND_TICKS
         sheets = self.shared["operated"]["sheets"][0]
-        self.setpoints = Sheets(200, *rows_of(self.ordered.law), sheets, self.ordered.present_row)
-        self.memory = self.shared["memory"][0]
+        law = self.ordered.law
+        self.setpoints = Sheets(200, *rows_of(law), sheets, self.ordered.present_row, planned_rows_of(law))
+        self.memory = self.shared["memory"]["own"][0, 0]
         self.keep = mapped
         self.delay = rows_of(self.ordered.law)[0]
         self.seen: dict[int, np.ndarray] = {}
@@ -228,6 +230,31 @@ def test_rows_that_end_while_the_set_point_moves_lead_the_stage_down_and_not_whi
     assert side.library.alone_asked() == LoopEnd.SET_POINTS_LATE
     assert side.library.alone_requested() == Event.DISABLE
     assert len(side.played) - before > 0.025 / PERIOD_S
+
+
+@pytest.mark.parametrize("horizon", [10, 20])
+def test_a_law_that_plans_finds_all_rows_to_its_horizon_or_is_led_down(library, horizon):
+    setup = load_scenario("raster", controller="mpc").setup()
+    longer = setup.controller.mpc.model_copy(update={"horizon": horizon})
+    setup = dataclasses.replace(setup, controller=setup.controller.model_copy(update={"mpc": longer}))
+    side = Side(library, setup)
+    side.step(0, lambda setpoints: None)
+    side.tick()
+    ordered, setpoints = side.ordered, side.setpoints
+    assert ordered.look()
+    assert ordered.answered(setpoints)
+    setpoints.advance(int(ordered.memory["reference_tick"][0]))
+    setpoints.go(np.array([9e-6, 0.0, 1e-6]), Limits(50e-6, 0.5, 300.0), fine)
+    ordered.hand_in(setpoints)
+    side.tick()  # before more rows are made
+    assert library.alone_asked() == 0
+    setpoints.extend()
+    while not library.alone_asked():
+        side.tick()
+    assert library.alone_asked() == LoopEnd.SET_POINTS_LATE
+    (page,) = [page for page in side.shared["operated"]["sheets"][0] if page["first"] > 0]
+    furthest = int(side.memory["cycle"]["reference_tick"][0]) - 1 + side.delay + horizon + 1  # of the tick that is over
+    assert furthest == page["first"] + page["count"]  # the first row that is not there
 
 
 def test_a_session_that_looks_at_nothing_for_too_long_has_the_stage_led_down_and_the_last_tick_before_not(

@@ -20,7 +20,7 @@ from hil.operate.memory import StageMemory
 from hil.operate.running.at_rate import KEPT_S, Counted, OperatedLoop, description, session_of
 from hil.operate.running.ordered import Ordered
 from hil.operate.running.sheets import Sheets
-from hil.operate.setpoints import rows_of
+from hil.operate.setpoints import planned_rows_of, rows_of
 from hil.operate.settings import Settings
 from hil.recording.writer_process import END_KIND, ROW_KIND, entries_of, frame_at
 from pkxyz_ctrl.client import place
@@ -91,7 +91,9 @@ def operate_natively(
         memory = StageMemory.made(name, round(KEPT_S / setup.bus.period_s))
         try:
             sheets = mapped.shared["operated"]["sheets"][0, 0]
-            setpoints = Sheets(setup.bus.period_us, *rows_of(ordered.law), sheets, ordered.present_row)
+            setpoints = Sheets(
+                setup.bus.period_us, *rows_of(ordered.law), sheets, ordered.present_row, planned_rows_of(ordered.law)
+            )
             session = session_of(setup, settings, ordered, memory, setpoints)
             operated = OperatedLoop(session, memory, counted, lambda: int(loop.state["stood_us"]))
             beside = _Beside(ordered, setpoints, operated, counted, RingBytes(mapped))

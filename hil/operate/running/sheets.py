@@ -51,9 +51,9 @@ class Sheets(Setpoints):
 
     def __init__(
         self, period_us: int, delay_periods: int, ramp_rows: int, sheets: NDArray[np.void],
-        present_row: Callable[[], int],
+        present_row: Callable[[], int], planned_rows: int = 0,
     ) -> None:  # fmt: skip
-        """``present_row``: which row the loop is at, as it says now."""
+        """``present_row``: which row the loop is at, as it says now. ``planned_rows``: that a law looks ahead."""
         self._pages: list[Any] = [sheets[0], sheets[1]]
         self.page = self.row = self._base = self._filled = 0
         self._present_row = present_row
@@ -61,7 +61,7 @@ class Sheets(Setpoints):
         self._before: _Before | None = None
         self._steps: list[Callable[[], None]] = []
         self._source, self._feed, self.target_m = Standing(np.zeros(3)), Feed(0), np.zeros(3)
-        self._first_rows = _FIRST_ROWS
+        self._first_rows = max(_FIRST_ROWS, planned_rows)
         self._reach_rows = max(_AHEAD_LEAST_ROWS, math.ceil(_AHEAD_S * 1e6 / period_us))
         super().__init__(period_us, delay_periods, ramp_rows)
         self._seen_rows, self._in_time = self._kept, 0

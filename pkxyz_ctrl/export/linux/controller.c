@@ -10,36 +10,43 @@ enum { FRESH = 1, EMERGENCY = 2, START_UP = 4 };                      /* what pk
 enum { BLOCKED = 256, RESTARTED = 512, NOT_RESTARTED = 1024, RARE = BLOCKED | RESTARTED | NOT_RESTARTED };
 
 static pkxyz_exchange *config;
-static pkxyz_exchange_memory *memory, warm;
+static pkxyz_exchange_memory *memory;
+static pkxyz_planned_exchange_memory warm[1];
 static uint32_t closed_modes;
 static int failed;
 
 void controller_begin(pkxyz_shared *shared)
 {
-    config = shared->config;
-    memory = shared->memory;
+    config = shared->config->own;
+    memory = shared->memory->own;
     closed_modes = (uint32_t)shared->settings->loop_closed;
+}
+
+/* A copy of the memory; of what a plan is made in, which is much, only where there is one. */
+static pkxyz_exchange_memory *copied(void)
+{
+    memcpy(warm, memory, config->law->tick.kind == PKXYZ_PREDICTIVE ? sizeof *warm : sizeof *warm->own);
+    return warm->own;
 }
 
 void controller_warm_up(void)
 {
     static const pkxyz_reference still;
+    pkxyz_exchange_memory *copy = copied();
     int64_t told;
-    warm = *memory;
     for (int32_t n = 1; n <= 3; n++) {
-        pkxyz_begin(config, &warm, n * WARM_UP_US, &told);
-        pkxyz_on_frame(config, &warm, config->driver->sense->pdo->cob_id, 0, 8, 0, n * WARM_UP_US, &told);
-        pkxyz_period(config, &warm, &still, 1, 0, &told);
-        pkxyz_finish(config, &warm, n * WARM_UP_US, 0, &told);
-        pkxyz_prepare(config, &warm);
+        pkxyz_begin(config, copy, n * WARM_UP_US, &told);
+        pkxyz_on_frame(config, copy, config->driver->sense->pdo->cob_id, 0, 8, 0, n * WARM_UP_US, &told);
+        pkxyz_period(config, copy, &still, 1, 0, &told);
+        pkxyz_finish(config, copy, n * WARM_UP_US, 0, &told);
+        pkxyz_prepare(config, copy);
     }
 }
 
 void controller_rehearse(const pkxyz_reference *rows, int32_t count)
 {
     int64_t told;
-    warm = *memory;
-    pkxyz_period(config, &warm, rows, count, 0, &told);
+    pkxyz_period(config, copied(), rows, count, 0, &told);
 }
 
 int controller_mode(void)

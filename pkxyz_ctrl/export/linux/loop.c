@@ -105,7 +105,7 @@ static int run(pkxyz_shared *shared)
     static const pkxyz_reference still;
     const pkxyz_shared_settings *settings = shared->settings;
     pkxyz_shared_state *state = shared->state;
-    const pkxyz_exchange_memory *memory = shared->memory;
+    const pkxyz_exchange_memory *memory = shared->memory->own;
     const pkxyz_reference *rows = &still;
     const int64_t period_us = settings->period_us, ticks = settings->ticks + settings->landing_ticks + LANDED_TICKS;
     int32_t rows_count = 1;

@@ -29,7 +29,7 @@ void orders_begin(pkxyz_shared *with, int wake)
 /* The first row of the set-points that the law has not seen. */
 static int64_t free_row(void)
 {
-    return shared->memory->cycle->reference_tick + shared->config->law->tick.delay_periods + LOOKED_AHEAD;
+    return shared->memory->own->cycle->reference_tick + shared->config->own->law->tick.delay_periods + LOOKED_AHEAD;
 }
 
 static int is_in_time(const pkxyz_shared_orders *orders)
@@ -43,7 +43,7 @@ static int is_in_time(const pkxyz_shared_orders *orders)
 
 static void take_outputs(const pkxyz_shared_orders *orders)
 {
-    pkxyz_outputs *outputs = shared->memory->outputs;
+    pkxyz_outputs *outputs = shared->memory->own->outputs;
     pkxyz_outputs_position_trigger *trigger = &outputs->trigger;
     if (orders->bits & PKXYZ_ORDER_SETTLE) {
         outputs->window_m = orders->window_m;
@@ -62,7 +62,7 @@ static void take_outputs(const pkxyz_shared_orders *orders)
 
 static void obey(const pkxyz_shared_orders *orders)
 {
-    pkxyz_exchange_memory *memory = shared->memory;
+    pkxyz_exchange_memory *memory = shared->memory->own;
     obeyed.refused = 0;
     if (orders->bits & PKXYZ_ORDER_SHEET) {
         if (is_in_time(orders))
@@ -113,8 +113,9 @@ void orders_await(void)
 /* Whether the law finds every row of this tick that it looks at, or the set-point stands behind the last one. */
 static int reaches(int64_t count)
 {
-    const int64_t last = sheet->first + count - 1;
-    return last >= free_row() || sheet->rests_from <= last;
+    const pkxyz_tick_law *law = &shared->config->own->law->tick;
+    const int64_t last = sheet->first + count - 1, planned = law->kind == PKXYZ_PREDICTIVE ? law->predictive.horizon - 1 : 0;
+    return last >= free_row() + planned || sheet->rests_from <= last;
 }
 
 void orders_take(const pkxyz_reference **rows, int32_t *count)
@@ -148,7 +149,7 @@ void orders_leave(void)
     atomic_thread_fence(memory_order_release); /* whoever sees any of what follows sees that it was begun */
     *snapshot->obeyed = obeyed; /* with the tick that they acted in, and not before */
     *snapshot->port = *shared->state->port;
-    memcpy(snapshot->memory, shared->memory, sizeof *snapshot->memory);
+    memcpy(snapshot->memory, shared->memory->own, sizeof *snapshot->memory);
     atomic_store_explicit((_Atomic int64_t *)&snapshot->number, number, memory_order_release);
     atomic_store_explicit((_Atomic int64_t *)&operated->newest, number, memory_order_release);
     if (wake_descriptor >= 0 && write(wake_descriptor, &one, sizeof one) < 0)

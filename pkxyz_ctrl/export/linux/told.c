@@ -29,7 +29,7 @@ static void tell(int32_t kind, const frame *came, int64_t told, int64_t t_us)
         memcpy(&event->frame->data, came->data, sizeof event->frame->data);
     }
     *event->port = *shared->state->port;
-    *event->memory = *shared->memory;
+    *event->memory = *shared->memory->own;
     atomic_store_explicit((_Atomic int64_t *)&events->head, head + 1, memory_order_release);
 }
 

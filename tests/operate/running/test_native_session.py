@@ -230,11 +230,15 @@ def said_by(bench, *words, **environment):
 
 def test_a_line_says_which_loop_it_is_and_native_alone_refuses(bench, changes):
     changes("pre-operational", False)
-    assert said_by(bench)[0][-1] == "the loop is the native one, in C"
-    lines, code = said_by(bench, "--native", "--controller", "mpc")
+    for law in ("patient.toml", "mpc"):
+        assert said_by(bench, "--controller", law)[0][-1] == "the loop is the native one, in C"
+    slow = (bench / "slow.toml").read_text(encoding="utf-8")
+    loud = slow.replace("[can.driver]", "[can.options]\nreceive_own_messages = true\n[can.driver]")
+    (bench / "loud.toml").write_text(loud, encoding="utf-8")
+    lines, code = said_by(bench, "--native", "--bus", "loud.toml")
     assert code == 2
     assert lines[-1].startswith("pkxyz: ")
-    lines, _ = said_by(bench, "--controller", "mpc")
+    lines, _ = said_by(bench, "--bus", "loud.toml")
     assert lines[-1].startswith("the loop is Python's, as the native one can't be had: ")
     lines, _ = said_by(bench, CC="no-such-compiler")
     assert lines[-1].startswith("the loop is Python's; `--native` compiles the one in C")
