@@ -114,6 +114,22 @@ def test_everything_that_may_be_asked(bench, changes):
     assert not rows["voltage_v"][-1].any()
 
 
+def test_a_stage_by_the_law_that_plans_follows_a_path_and_keeps_its_law(bench, changes):
+    path, start = raster_rows(1000)
+    (folder := bench / "mpc").mkdir(exist_ok=True)
+    with holding(bench, changes, "--native", "--controller", str(patient_law(folder, "mpc"))) as operator:
+        scan = operator.follow(1, path, start)
+        assert operator.ended(scan)[0] is State.DONE
+        state, words = operator.ended(operator.give(Verb.LAW, law=offer(operator, bench, "lqg")))
+        assert state is State.REFUSED
+        assert "plans beside the tick" in words
+        rows = operator.rows
+    require_no_jump(rows, SPEED)
+    begun = int(np.argmax(rows["mode"] == Mode.TRACKING))
+    assert (rows["mode"][begun:] == Mode.TRACKING).all()
+    assert not rows["trips"].any()
+
+
 def test_a_session_that_stands_still_for_20_ms_in_a_scan_is_not_noticed(bench, changes):
     with scanning(bench, changes) as (operator, scan):
         for _ in range(3):
