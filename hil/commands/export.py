@@ -49,7 +49,7 @@ def export(
         from hil.runs.scenario import load_scenario
 
         loaded = load_scenario(scenario, stage=stage, controller=controller, bus=bus)
-        require_exportable(loaded.setup().law, loaded.controller.name, target)
+        require_exportable(loaded.setup().law, target)
         beside = run_beside(loaded, ticks) if target_of(target).has_loop else ()
         manifest = write(path, target, exported_of(loaded, ticks)._replace(beside=beside))
     except ExportError as error:

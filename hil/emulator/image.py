@@ -56,7 +56,7 @@ def built(config: Records, reference: Records, outputs: Records, can: CanConfig,
     """
     exported = Exported(config, reference, np.zeros(0, CALL), "", controller, "")
     try:
-        require_exportable(exported.law, controller, TARGET)
+        require_exportable(exported.law, TARGET)
         require_room(reference, "give a shorter scenario (duration_s)")
         code = object_code(is_planned=is_planned(exported.law))
     except ExportError as error:

@@ -9,8 +9,6 @@ from hil.lanes.wall import GUARDS_PER_PERIOD, NO_END, SILENT_US
 from pkxyz_ctrl.can import cob_id
 from pkxyz_ctrl.config.bus import CanConfig
 from pkxyz_ctrl.config.files import ConfigError
-from pkxyz_ctrl.export.folder import require_exportable
-from pkxyz_ctrl.export.kernels import ExportError
 from pkxyz_ctrl.export.shared import SETTINGS, Interface
 from pkxyz_ctrl.io.clocks import SPIN_US
 from pkxyz_ctrl.io.realtime import FIFO_PRIORITY
@@ -41,10 +39,6 @@ def require_native(setup: Setup, can: CanConfig) -> None:
     channel = _channel(can)
     if len(channel) >= SETTINGS["channel"].shape[0]:
         raise ConfigError(f"bus {setup.bus.name!r}: can.channel {can.channel!r} is too long; give a shorter one")
-    try:
-        require_exportable(setup.law, setup.controller.name, "linux")
-    except ExportError as error:
-        raise ConfigError(f"{error}, or {_LEAVE}") from None
 
 
 def fill(

@@ -85,8 +85,8 @@ def target_of(name: str) -> Target:
     return TARGETS[name]
 
 
-def require_exportable(law: Records, name: str, target: str) -> None:
-    """Raises ``ExportError`` for a law that does not go whole, or not in time."""
+def require_exportable(law: Records, target: str) -> None:
+    """Raises ``ExportError`` for a law whose longest tick has no room in its period there."""
     period_us, most_us = int(law["period_us"][0]), tick_most_us(law, target_of(target))
     if period_us * BUSY_MOST < most_us:
         fewer = "fewer rounds of its solver (mpc.iterations_max), " if is_planned(law) else ""
@@ -118,7 +118,7 @@ def require_room(reference: Records, instead: str) -> None:
 def write(out: Path, target_name: str, exported: Exported) -> dict[str, Any]:
     """Write the folder, which must be empty or not there; returns its manifest. Raises ``ExportError``, ``OSError``."""
     target = target_of(target_name)
-    require_exportable(exported.law, exported.controller, target_name)
+    require_exportable(exported.law, target_name)
     if not target.is_hosted:
         rows = REFERENCE_MAX_BYTES // exported.reference.itemsize
         require_room(exported.reference, f"give --ticks {rows} or less, and stream the rest")

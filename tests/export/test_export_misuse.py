@@ -38,12 +38,12 @@ def test_what_does_not_go_is_said_in_a_line(tmp_path, capsys, monkeypatch, words
 def test_the_shortest_period_that_it_asks_for_goes(target):
     law = np.zeros(1, LAW)
     with pytest.raises(ExportError, match="is too short") as refused:
-        require_exportable(law, "of_a_test", target)
+        require_exportable(law, target)
     law["period_us"] = int(re.search(r"a bus of (\d+) us or more", str(refused.value))[1])
-    require_exportable(law, "of_a_test", target)
+    require_exportable(law, target)
     law["period_us"] -= 1
     with pytest.raises(ExportError, match="is too short"):
-        require_exportable(law, "of_a_test", target)
+        require_exportable(law, target)
 
 
 @pytest.mark.parametrize("horizon", [10, 20])
@@ -54,11 +54,11 @@ def test_fewer_rounds_of_a_solver_take_less(horizon):
     for rounds, goes in ((8, horizon == 10), (9, False)):
         law["tick"]["predictive"]["iterations_max"] = rounds
         if goes:
-            require_exportable(law, "of_a_test", "cortex-m7")
+            require_exportable(law, "cortex-m7")
         else:
             with pytest.raises(ExportError, match=r"mpc\.iterations_max"):
-                require_exportable(law, "of_a_test", "cortex-m7")
-    require_exportable(law, "of_a_test", "host")
+                require_exportable(law, "cortex-m7")
+    require_exportable(law, "host")
 
 
 def test_nothing_of_the_users_is_overwritten(tmp_path, capsys, monkeypatch):
