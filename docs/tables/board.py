@@ -13,7 +13,8 @@ KEPT = Path(__file__).with_name("board.json")
 MHZ = 480
 SHOWN = ("lqg", "youla")
 HEADER = [
-    "law", "settings, B", "memory, B", "cycle: median", "most", "with driver and gate: median", "most", f"at {MHZ} MHz"
+    "law", "settings, B", "memory, B", "cycle, to the voltages: median", "most",
+    "the period, driver, gate and what waits: median", "most", f"at {MHZ} MHz",
 ]  # fmt: skip
 
 
