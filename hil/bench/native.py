@@ -3,6 +3,7 @@
 import dataclasses
 import shutil
 import tempfile
+from collections.abc import Sequence
 from pathlib import Path
 from statistics import median
 from typing import NamedTuple
@@ -68,15 +69,25 @@ def _answers(python: _Seen, by_native: _Seen) -> list[Figure]:
     figures = []
     for share, name, target in ((0.5, "p50", 0.1), (0.999, "p99_9", 0.2)):
         of_python, of_native = (
-            [percentile_us(turn, share) for turn in seen.answer_us] for seen in (python, by_native)
+            [round(within_us(turn, share), 1) for turn in seen.answer_us] for seen in (python, by_native)
         )  # fmt: skip
         detail = (
             f"from a sense frame read to the drive frame handed over, in the middle of {TURNS} turns: "
             f"{median(of_native)} us, Python's loop {median(of_python)} us ({_listed(of_native)}; {_listed(of_python)})"
         )
-        ratio = median(of_native) / max(1.0, median(of_python))
+        ratio = median(of_native) / max(1.0, median(of_python))  # of none: 0 over 1
         figures.append(Figure(f"native.answer_{name}", ratio, "x", target, "at most", detail=detail))
     return figures
+
+
+def within_us(histogram: list[int], share: float) -> float:
+    """The time in us that a share 0..1 is below, where those of a whole microsecond are spread evenly over it."""
+    wanted, below = share * sum(histogram), 0
+    for whole_us, count in enumerate(histogram):
+        if count and below + count >= wanted:
+            return whole_us + (wanted - below) / count
+        below += count
+    return 0.0
 
 
 def _missed(python: _Seen, by_native: _Seen) -> Figure:
@@ -89,7 +100,7 @@ def _missed(python: _Seen, by_native: _Seen) -> Figure:
     return Figure("native.missed", ratio, "x", 0.1, "at most", detail=detail)
 
 
-def _listed(counts: list[int]) -> str:
+def _listed(counts: Sequence[float]) -> str:
     return ", ".join(map(str, counts))
 
 

@@ -10,12 +10,17 @@ import subprocess
 import sys
 from pathlib import Path
 
+import numpy as np
 import pytest
+from hypothesis import given
+from hypothesis import strategies as st
 
 from hil.bench import beside, quality, startup, suite, tick
+from hil.bench.native import within_us
 from hil.bench.rigs.closed_loop import scan
 from hil.runs.scenario import load_scenario
 from pkxyz_ctrl.config.files import ConfigError
+from pkxyz_ctrl.io.clocks import percentile_us
 
 ROOT = Path(__file__).parents[2]
 KEYS = {"name", "value", "unit", "target", "direction", "met", "median", "detail"}
@@ -133,3 +138,13 @@ def test_what_the_law_reaches_stands_beside_the_open_loop(monkeypatch: pytest.Mo
     # what an identification finds beforehand, the law learns on its way; without feedback it makes a difference
     assert abs(found["beside.raster_lab_identified"].value - found["beside.raster_lab"].value) < 0.5
     assert found["beside.raster_lab_identified"].target < 0.1 * found["beside.raster_lab"].target
+
+
+@given(st.lists(st.integers(0, 50), min_size=1, max_size=40).filter(any), st.floats(0.001, 1.0))
+def test_a_share_within_a_microsecond_is_where_numpy_has_it_if_all_are_spread_evenly(histogram, share):
+    """Each count of a microsecond stands in the middle of its part of it."""
+    times = np.concatenate([us + (np.arange(n) + 0.5) / max(n, 1) for us, n in enumerate(histogram)])
+    found = within_us(histogram, share)
+    assert (times < found).mean() == pytest.approx(share, abs=0.5001 / len(times))
+    assert 0.0 <= found - percentile_us(histogram, share) <= 1.0
+    assert within_us([0] * len(histogram), share) == 0.0
