@@ -46,7 +46,7 @@ LEAST_LOSS = 0.1
 _MOST_SPARED = 0.5  # of a comb's pull: one that has become stronger is told as at most twice as strong
 _PARAMETERS, _CAUSES = np.int32(PARAMETERS), np.int32(CAUSES)  # a processor of 32 bits counts these for less
 _FLOOR_N = 1e-100  # in each force: else what is at rest falls below the normal numbers, and a PC slows down fivefold
-AGES = 3  # intervals that are remembered: two periods of delay, and the one that was decided last
+AGES = 3  # intervals that are remembered: two periods of delay, and the one that is decided
 
 ADAPTATION = np.dtype(
     [
@@ -108,7 +108,7 @@ ADAPTATION_STATE = np.dtype(
 @kernel
 def seen(adaptation: np.void, state: np.void, measured_m: Array, delay: int, out: Array) -> None:
     """Write what was measured (3,), less psi theta, to ``out`` (3,): what the filter's model would have shown."""
-    row, acting, spread = state["motion"][delay - 1], state["acting"], adaptation["spread"]
+    row, acting, spread = state["motion"][delay], state["acting"], adaptation["spread"]
     late_s, bend_s2 = acting[DELAY] * spread[DELAY], acting[BEND] * spread[BEND]
     for i in range(3):
         out[i] = measured_m[i] + late_s * row[3 + i] - bend_s2 * row[6 + i]
@@ -274,7 +274,7 @@ def tell(state: np.void, age: int) -> None:
     """Write -phi theta (3,) of the interval of the force that was decided ``age`` ticks ago to ``told_n``: what the
     filter has to reckon with there.
     """
-    acting, force, out = state["acting"], state["force_n"][age], state["told_n"]
+    acting, force, out = state["acting"], state["force_n"][age + 1], state["told_n"]
     for i in range(3):
         total = 0.0
         for p in range(_PARAMETERS):
@@ -283,33 +283,26 @@ def tell(state: np.void, age: int) -> None:
 
 
 @kernel
-def note(
-    adaptation: np.void,
-    state: np.void,
-    geometry: np.void,
-    elasticity: np.void,
-    damping: Array,
-    start: Array,
-    row: Array,
-    inverse: Array,
-    pulls: Array,
-    feedforward_n: Array,
-) -> None:
-    """Note phi at a row (9,) of the reference, in the middle of the interval that begins at the row ``start``, and
-    write phi theta, which the feed-forward lacks, to ``added_n``.
-
-    ``pulls`` (3,3) and its ``inverse`` are those of the row, ``feedforward_n`` (3,) is what the model needs there.
-    """
-    force, motion, added = state["force_n"], state["motion"], state["added_n"]
+def move_on(state: np.void) -> None:
+    """Between two ticks: what was decided is one older, and there is room for the next interval."""
+    force, motion = state["force_n"], state["motion"]
     for age in range(AGES - 1, 0, -1):
         for i in range(9):
             motion[age, i] = motion[age - 1, i]
         for i in range(3):
             for p in range(_PARAMETERS):
                 force[age, i, p] = force[age - 1, i, p]
-    for i in range(9):
-        motion[0, i] = start[i]
-    newest = force[0]
+
+
+@kernel
+def foresee(
+    adaptation: np.void, state: np.void, geometry: np.void, elasticity: np.void, damping: Array, row: Array,
+    inverse: Array, pulls: Array, feedforward_n: Array,
+) -> None:  # fmt: skip
+    """Write phi of the next interval, with ``row`` (9,) of the reference in its middle, ``pulls`` (3,3) and their
+    ``inverse`` there, and ``feedforward_n`` (3,) as the model needs it.
+    """
+    newest = state["force_n"][0]
     for i in range(3):
         newest[i, FRINGE] = newest[i, LIFT] = 0.0
         newest[i, DAMPING] = damping[i, 0] * row[3] + damping[i, 1] * row[4] + damping[i, 2] * row[5]
@@ -319,10 +312,22 @@ def note(
         pull = inverse[0, i] * feedforward_n[0] + inverse[1, i] * feedforward_n[1] + inverse[2, i] * feedforward_n[2]
         _note_chain(adaptation["fringe_m"], geometry, elasticity, i, row, drop, pulls[i], pull, newest)
     for i in range(3):
-        total = 0.0
         for p in range(_PARAMETERS):
             newest[i, p] *= adaptation["spread"][p]
-            total += newest[i, p] * state["acting"][p]
+
+
+@kernel
+def note(state: np.void, start: Array) -> None:
+    """The interval that was foreseen is decided, and begins at the row ``start`` (9,): write phi theta, which the
+    feed-forward lacks, to ``added_n``.
+    """
+    newest, acting, added = state["force_n"][0], state["acting"], state["added_n"]
+    for i in range(9):
+        state["motion"][0, i] = start[i]
+    for i in range(3):
+        total = 0.0
+        for p in range(_PARAMETERS):
+            total += newest[i, p] * acting[p]
         added[i] = total
 
 

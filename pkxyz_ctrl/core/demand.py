@@ -43,6 +43,16 @@ def _look_ahead(law: np.void, begin: Array, end: Array, coming: np.void) -> None
 
 
 @kernel
+def foresee_errors(law: np.void, memory: np.void, inverse: Array) -> None:
+    """What the device's errors make of the interval in ``coming``; ``inverse`` (3,3) is that of its pulls."""
+    coming = memory["coming"]
+    adaptation.foresee(
+        law["adaptation"], memory["adaptation"], law["geometry"], law["elasticity"],
+        law["feedback"]["damping_n_s_per_m"], coming["row"], inverse, coming["pulls"], coming["needed_n"],
+    )  # fmt: skip
+
+
+@kernel
 def ask(law: np.void, memory: np.void, now: Array, after: Array, later: Array) -> float:
     """Write the demand (3,) at the platform for the reference rows (9,) at the start and the end of the interval of
     action, and a period after that. Returns the feedback's authority. ``law``, ``memory``: the tick's.
@@ -51,7 +61,8 @@ def ask(law: np.void, memory: np.void, now: Array, after: Array, later: Array) -
     j, inverse, row = scratch["pulls"], scratch["inverse"], scratch["row"]
     following, kind, coming = scratch["next_n"], law["kind"], memory["coming"]
     set_points, model, aim = law["set_points"], memory["set_point_model"], memory["set_point_model"]["aim"]
-    if not set_point_model.approach(set_points, model, gains["period_s"], now, after, later):
+    is_foreseen = set_point_model.approach(set_points, model, gains["period_s"], now, after, later)
+    if not is_foreseen:
         _look_ahead(law, aim[0], aim[1], coming)
     for i in range(3):
         demand[i] = coming["needed_n"][i]
@@ -61,10 +72,9 @@ def ask(law: np.void, memory: np.void, now: Array, after: Array, later: Array) -
     share = feedback.authority(gains, inverse, coming["holding_n"])
     learnt, online = memory["adaptation"], law["adaptation"]["on"] != 0
     if online:
-        adaptation.note(
-            law["adaptation"], learnt, law["geometry"], law["elasticity"], gains["damping_n_s_per_m"], aim[0],
-            coming["row"], inverse, j, demand,
-        )  # fmt: skip
+        if not is_foreseen:
+            foresee_errors(law, memory, inverse)
+        adaptation.note(learnt, aim[0])
     _look_ahead(law, aim[1], aim[2], coming)
     last, before = memory["feedforward_n"], scratch["w_n"]
     known = memory["feedforward_known"] != 0

@@ -19,7 +19,7 @@ _LIBRARY = re.compile(r"(__aeabi_)?mem(set|clr|cpy|move)[48]?")
 # loops had better stay loops
 _IN_A_HURRY = re.compile(r"10pkxyz_ctrl4(core|loop10active_set)")
 _APART = re.compile(
-    r"10adaptation(5learn|8_compare|5begin)B|10linear_law(7advance|12add_feedback)B|5youla12add_feedbackB"
+    r"10adaptation(5learn|7foresee|8_compare|5begin)B|10linear_law(7advance|12add_feedback)B|5youla12add_feedbackB"
     r"|9estimator11predict_farB|9feed_hold3rowB|5cycle7observeB"
 )
 _SELDOM = re.compile(

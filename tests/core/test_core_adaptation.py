@@ -66,9 +66,9 @@ def test_what_each_error_lacks_is_what_a_stage_with_that_error_would_need(seed):
     drawn = stage()
     force, pulls, inverse = needed_n(drawn, row), drawn.pulls(row[:3]), np.empty((3, 3))
     inverse3(pulls, inverse)
-    adaptation.note(
+    adaptation.foresee(
         law["adaptation"], memory["adaptation"], law["geometry"], law["elasticity"],
-        law["feedback"]["damping_n_s_per_m"], row, row, inverse, pulls, force,
+        law["feedback"]["damping_n_s_per_m"], row, inverse, pulls, force,
     )  # fmt: skip
     combs, spread = np.linalg.solve(pulls.T, force), law["adaptation"]["spread"]
     found = memory["adaptation"]["force_n"][0] / spread
