@@ -20,10 +20,10 @@ _LIBRARY = re.compile(r"(__aeabi_)?mem(set|clr|cpy|move)[48]?")
 _IN_A_HURRY = re.compile(r"10pkxyz_ctrl4(core|loop10active_set)")
 _APART = re.compile(
     r"10adaptation(5learn|7foresee|8_compare|5begin)B|10linear_law(7advance|12add_feedback)B|5youla12add_feedbackB"
-    r"|9estimator11predict_farB|9feed_hold3rowB|5cycle7observeB"
+    r"|9estimator11predict_farB|9feed_hold3rowB|5cycle(7observe|7respond)B"
 )
 _SELDOM = re.compile(
-    r"10adaptation(5learn|5begin|8set_base|8_compare|5clear)B|9estimator11predict_farB|9feed_hold6sampleB"
+    r"10adaptation(5learn|7foresee|5begin|8set_base|8_compare|5clear)B|9estimator11predict_farB|9feed_hold6sampleB"
 )
 _ROUNDS = 2  # of the passes: what a callee turned out to return is known to its caller in the second
 
