@@ -33,15 +33,17 @@ from pkxyz_ctrl.safety.trips import Trip
 
 SCENARIO = "faults"
 CLEAR_S = 0.02
-AFTER_US = 50_000
-"""From the end of a fault to the last decision that it may lead to: the longest time-out, that of a heartbeat."""
+AFTER_US = 50_400
+"""From the end of a fault to the last decision that it may lead to: the longest time-out, that of a heartbeat, and two
+periods until it is seen and told. What falls into a homing may show as long as the zero is used that was found then.
+"""
 _GAP_S = (0.15, 0.7)  # between the beginnings of faults: some hit a scan, some a start-up, some a homing
 _LASTS_S = (0.0005, 0.06)
 _QUIET_S = 0.05  # at the end, so that the last one is not cut off
 _LEFT_OUT = ("controller:killed", "bus.drive:forged")  # would end the run; has a voltage of its own
 _ROWS_EACH = 300_000  # of one recording: a minute at 5 kHz
 _PIECE_ROWS = 16_384  # of a journal, read at once
-_PARQUET_EACH = 8  # one in so many recordings that are not kept
+_PARQUET_EACH = 8  # one in so many recordings that are not kept; its memory is given back later
 
 
 @dataclass
@@ -181,6 +183,7 @@ class _Log:
         self._reasons: Counter[str] = Counter()
         self._writer: RecordingWriter | None = None
         self._last_mode = int(Mode.IDLE)
+        self._skipped, self._homing_us = 0, (0, 0)
         self._voltages = _Voltages(soaked, rig.setup)
         self._begins_us = [f.at_us for f in rig.setup.faults]
         self._ends_us = [f.end_us or f.at_us for f in rig.setup.faults]
@@ -223,8 +226,8 @@ class _Log:
         for row in rows[entered]:
             self._reasons.update(str(trip.name) for trip in Trip if trip & int(row["trips"]))
         noted = self._controller.decided
-        for decided in noted:
-            self._explain(decided)
+        for decided, homing_us in zip(noted, self._homings_us(rows, mode, entered), strict=False):
+            self._explain(decided, homing_us)
         if len(noted) != len(entered):
             soaked.problems.append(f"{len(noted)} decisions in a block whose rows show {len(entered)}")
         noted.clear()
@@ -237,14 +240,40 @@ class _Log:
         self._rig.controller.faults.clear()  # counted; the words of a thousand faults are of no use
         self._last_mode = int(mode[-1])
 
-    def _explain(self, decided: Decided) -> None:
-        """A decision has to follow a fault: itself, or the emergency that it is for and that came before."""
+    def _homings_us(
+        self, rows: NDArray[np.void], mode: NDArray[np.int64], at: NDArray[np.intp]
+    ) -> list[tuple[int, int]]:
+        """When the latest homing before each of these rows of a block began and ended; ``mode`` has one more before."""
+        skipped = self._skipped + np.cumsum(rows["overrun"])
+        t_us = (rows["tick"] + skipped) * self._rig.setup.bus.period_us
+        self._skipped = int(skipped[-1])
+        is_homing, found = mode == Mode.HOMING, []
+        begun, ended = (
+            np.flatnonzero(is_homing[1:] & ~is_homing[:-1]),
+            np.flatnonzero(~is_homing[1:] & is_homing[:-1]),
+        )
+        for row in (*at, len(rows) - 1):
+            begin_us, end_us = self._homing_us
+            if len(before := begun[begun <= row]):
+                begin_us = int(t_us[before[-1]])
+            if len(before := ended[ended <= row]):
+                end_us = int(t_us[before[-1]])
+            found.append((begin_us, end_us))
+        self._homing_us = found.pop()
+        return found
+
+    def _explain(self, decided: Decided, homing_us: tuple[int, int]) -> None:
+        """A decision has to follow a fault: itself, or the emergency that it is for and that came before; or else there
+        was one while the zero was found.
+        """
         assert self._rig.injection is not None
         t_us = decided.t_us - decided.age_us - self._rig.injection.origin_us
         last = bisect.bisect_right(self._begins_us, t_us) - 1
         since_us = t_us - self._ends_us[last] if last >= 0 else t_us
         self._soaked.latest_us = max(self._soaked.latest_us, since_us)
-        self._soaked.unprovoked += since_us > AFTER_US
+        in_homing = bisect.bisect_left(self._begins_us, homing_us[1]) - 1
+        misled = in_homing >= 0 and self._ends_us[in_homing] > homing_us[0]
+        self._soaked.unprovoked += since_us > AFTER_US and not misled
 
 
 def _read_again(writer: RecordingWriter, *, as_parquet: bool) -> NDArray[np.int64]:
@@ -330,7 +359,8 @@ def _judge(soaked: Soaked, setup: Setup) -> None:
     if soaked.decisions == 0 or soaked.returns == 0:
         problems.append("no fault was decided, or none recovered from")
     if len(soaked.memory_mb) > 4:
-        early, late = soaked.memory_mb[1], soaked.memory_mb[-1]
+        some = min(_PARQUET_EACH, len(soaked.memory_mb) // 2)
+        early, late = min(soaked.memory_mb[1 : 1 + some]), min(soaked.memory_mb[-some:])
         if late > early + 20.0:
             problems.append(f"memory grew from {early:.0f} to {late:.0f} MB")
 

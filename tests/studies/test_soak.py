@@ -134,8 +134,17 @@ def test_a_voltage_that_rises_while_none_is_allowed_is_found(tmp_path, monkeypat
     assert "a comb's voltage rose by 0.3 V while none was allowed" in found.problems
 
 
-def test_a_decision_without_a_fault_is_found(tmp_path, monkeypatch):
-    """An amplifier that trips by itself, 0.15 s after the only fault that was planned."""
+SHIFTED = "sense.1:offset@{}+0.01,offset_m=3e-7"
+
+
+@pytest.mark.parametrize(
+    ("fault", "unprovoked"),
+    [("sense.1:off@0.29+0.01", 1), (SHIFTED.format(0.06), 1), (SHIFTED.format(0.045), 0), (SHIFTED.format(0.001), 0)],
+)
+def test_a_decision_without_a_fault_is_found(tmp_path, monkeypatch, fault, unprovoked):
+    """An amplifier that trips by itself, long after the only fault that was planned. Homing takes the first 50 ms, and
+    what was shifted then shows as long as the zero is used that was found.
+    """
     shipped = Injection.arm
 
     def arm_and_trip(self):
@@ -144,10 +153,11 @@ def test_a_decision_without_a_fault_is_found(tmp_path, monkeypatch):
         return clock
 
     monkeypatch.setattr(Injection, "arm", arm_and_trip)
-    monkeypatch.setattr("hil.studies.soak.random_faults", lambda *_: (parse("sense.1:off@0.29+0.01"),))
+    monkeypatch.setattr("hil.studies.soak.random_faults", lambda *_: (parse(fault),))
     found = soak(0.6, 1, soaked_scenario("lqg"), tmp_path)
-    assert found.unprovoked == 1
-    assert "1 decisions without a fault in the 50 ms before" in found.problems
+    assert found.decisions == 1 + (fault == "sense.1:off@0.29+0.01")
+    assert found.unprovoked == unprovoked
+    assert ("1 decisions without a fault in the 50 ms before" in found.problems) == unprovoked
 
 
 def test_a_defect_within_whole_ticks_is_found(tmp_path, monkeypatch):
@@ -207,7 +217,7 @@ AT_ITS_BOUNDS = Soaked(
         ("unprovoked", 1, "1 decisions without a fault in the 50 ms before"),
         ("decisions", 0, "no fault was decided, or none recovered from"),
         ("returns", 0, "no fault was decided, or none recovered from"),
-        ("memory_mb", [50.0, 100.0, 110.0, 110.0, 120.1], "memory grew from 100 to 120 MB"),
+        ("memory_mb", [50.0, 100.0, 110.0, 130.0, 120.1], "memory grew from 100 to 120 MB"),
     ],
 )
 def test_at_a_bound_all_is_well_and_beyond_it_that_is_told(name, value, words):
