@@ -37,6 +37,7 @@ AFTER_US = 50_400
 """From the end of a fault to the last decision that it may lead to: the longest time-out, that of a heartbeat, and two
 periods until it is seen and told. What falls into a homing may show as long as the zero is used that was found then.
 """
+_RINGS_US = 30_000  # or so shortly before it that the stage still rings: three time constants at 619 Hz and Q 20
 _GAP_S = (0.15, 0.7)  # between the beginnings of faults: some hit a scan, some a start-up, some a homing
 _LASTS_S = (0.0005, 0.06)
 _QUIET_S = 0.05  # at the end, so that the last one is not cut off
@@ -272,7 +273,7 @@ class _Log:
         since_us = t_us - self._ends_us[last] if last >= 0 else t_us
         self._soaked.latest_us = max(self._soaked.latest_us, since_us)
         in_homing = bisect.bisect_left(self._begins_us, homing_us[1]) - 1
-        misled = in_homing >= 0 and self._ends_us[in_homing] > homing_us[0]
+        misled = in_homing >= 0 and self._ends_us[in_homing] + _RINGS_US > homing_us[0]
         self._soaked.unprovoked += since_us > AFTER_US and not misled
 
 
