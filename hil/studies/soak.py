@@ -35,8 +35,9 @@ SCENARIO = "faults"
 CLEAR_S = 0.02
 AFTER_US = 50_400
 """From the end of a fault to the last decision that it may lead to: the longest time-out, that of a heartbeat, and two
-periods until it is seen and told. What falls into a homing may show as long as the zero is used that was found then.
+periods until it is seen and told. What falls into a homing shows when the zero is first used that was found then.
 """
+_FIRST_USE_US = 100_000  # from the end of a homing: the scan has left the rest pose by then
 _RINGS_US = 30_000  # or so shortly before it that the stage still rings: three time constants at 619 Hz and Q 20
 _GAP_S = (0.15, 0.7)  # between the beginnings of faults: some hit a scan, some a start-up, some a homing
 _LASTS_S = (0.0005, 0.06)
@@ -274,6 +275,7 @@ class _Log:
         self._soaked.latest_us = max(self._soaked.latest_us, since_us)
         in_homing = bisect.bisect_left(self._begins_us, homing_us[1]) - 1
         misled = in_homing >= 0 and self._ends_us[in_homing] + _RINGS_US > homing_us[0]
+        misled = misled and t_us <= homing_us[1] + _FIRST_USE_US
         self._soaked.unprovoked += since_us > AFTER_US and not misled
 
 
