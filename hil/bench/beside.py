@@ -1,81 +1,85 @@
-"""How well the default law follows beside the stage without any feedback: on the plant of the drawing, on a good and a
+"""How well the default law does beside the stage without any feedback: on the plant of the drawing, on a good and a
 poor device, in a real room, and there after an identification."""
 
-import dataclasses
-from functools import cache
+import math
 
 import numpy as np
 
+from hil.bench.rigs.answers import jump_settled, move_settled, sine_response
 from hil.bench.rigs.figure import Figure
+from hil.bench.rigs.places import IDENTIFIED, PLACES, setup_at
 from hil.lanes import in_process as lanes
 from hil.lanes.lane import Lane
-from hil.lanes.setup import Setup, bare_setup
 from hil.runs.metrics import Metrics, RowFigures
-from hil.runs.scenario import load_scenario
-from hil.studies.identify.calibrated_stage import calibration_of
-from hil.studies.identify.identification import Identification, identify
-from pkxyz_ctrl.config.bus import BusConfig
-from pkxyz_ctrl.config.controller import ControllerConfig
-from pkxyz_ctrl.config.files import load
 
-OPEN_LOOP = "open_loop"
-PLACES = {
-    "nominal": ("reconstructed", "nominal"),
-    "mild": ("reconstructed", "mild"),
-    "harsh": ("reconstructed", "harsh"),
-    "lab": ("lab", "lab"),
-}
-IDENTIFIED = "lab_identified"
+LAW, OPEN_LOOP = "youla", "open_loop"
 ALLOWED_NM = {"nominal": 0.3}
 """By how much the law may be worse than nothing, where nothing is to be mended."""
-STROKES_M = np.full(3, 12.5e-6)
+SINE_HZ = 1262.0
+"""Twice the first resonance."""
+WAITED_MS = 20.0
+"""So long a step is watched."""
 
 
 def beside() -> list[Figure]:
-    """About the set-point: raster and circle while scanning, and holds, in the axis in which the law errs most; the
-    target is what the open loop has in that axis."""
+    """About the set-point: raster and circle while scanning, and holds, in the axis in which the law errs most; then
+    steps and a sine. The target is what the open loop has."""
+    places = (*PLACES, IDENTIFIED)
+    scans = [figure for place in places for figure in _scans(place)]
+    return scans + [figure for place in places if place != "harsh" for figure in _answers(place)]
+
+
+def _scans(place: str) -> list[Figure]:
     figures = []
-    for place in (*PLACES, IDENTIFIED):
-        for scenario in ("raster", "circle"):
-            law, nothing = _run(scenario, place, None), _run(scenario, place, OPEN_LOOP)
-            allowed = ALLOWED_NM.get(place, 0.0)
-            what = [(scenario, "rms_error_nm", "while scanning")]
-            if scenario == "raster":
-                what.append(("hold", "hold_rms_nm", "in holds"))
-            for name, key, words in what:
-                ours, theirs = getattr(law, key), getattr(nothing, key)
-                worst = max(ours, key=lambda axis: ours[axis])
-                detail = f"rms about the set-point {words}, in {worst} ({_axes(ours)}); open loop {_axes(theirs)}"
-                target = round(theirs[worst] + allowed, 2)
-                figures.append(Figure(f"beside.{name}_{place}", ours[worst], "nm", target, "at most", None, detail))
+    for scenario in ("raster", "circle"):
+        law, nothing = _run(scenario, place, None), _run(scenario, place, OPEN_LOOP)
+        allowed = ALLOWED_NM.get(place, 0.0)
+        what = [(scenario, "rms_error_nm", "while scanning")]
+        if scenario == "raster":
+            what.append(("hold", "hold_rms_nm", "in holds"))
+        for name, key, words in what:
+            ours, theirs = getattr(law, key), getattr(nothing, key)
+            worst = max(ours, key=lambda axis: ours[axis])
+            detail = f"rms about the set-point {words}, in {worst} ({_axes(ours)}); open loop {_axes(theirs)}"
+            target = round(theirs[worst] + allowed, 2)
+            figures.append(Figure(f"beside.{name}_{place}", ours[worst], "nm", target, "at most", None, detail))
     return figures
+
+
+def _answers(place: str) -> list[Figure]:
+    """Moves and jumps of 1 um, the worst axis; and by how much a sine is too large or too small, x and y."""
+    figures = []
+    for name, settled in (("move", move_settled), ("jump", jump_settled)):
+        ours, theirs = (round(settled(law, place).s * 1e3, 1) for law in (LAW, OPEN_LOOP))
+        detail = f"1 um {name}, the worst axis, to within 10 nm of the set-point for good; open loop {_told(theirs)}"
+        target = min(theirs, WAITED_MS)
+        figures.append(Figure(f"beside.{name}_{place}", ours, "ms", target, "at most", None, detail))
+    ours_db, theirs_db = (
+        [float(20 * np.log10(abs(sine_response(axis, SINE_HZ, law, place)))) for axis in "xy"]
+        for law in (LAW, OPEN_LOOP)
+    )
+    worst = int(np.argmax(np.abs(ours_db)))
+    detail = (
+        f"100 nm sine at {SINE_HZ:g} Hz, {ours_db[0]:+.2f} dB in x, {ours_db[1]:+.2f} in y; "
+        f"open loop {theirs_db[0]:+.2f}, {theirs_db[1]:+.2f}"
+    )
+    off_db, target = abs(ours_db[worst]), round(abs(theirs_db[worst]), 2)
+    return [*figures, Figure(f"beside.sine_{place}", off_db, "dB off", target, "at most", None, detail)]
+
+
+def _told(ms: float) -> str:
+    return f"{ms:.1f} ms" if math.isfinite(ms) else f"not in {WAITED_MS:g} ms"
 
 
 def _run(scenario: str, place: str, controller: str | None) -> RowFigures:
     """Figures of one run of the fast lane, with the scenario's own law or another.
     Raises ``RuntimeError`` on a fault."""
-    setup = _setup(scenario, place, controller)
+    setup = setup_at(scenario, place, controller)
     metrics = Metrics(setup.trajectory, setup.bus.period_us)
     result = lanes.run(setup, Lane.FAST, on_block=metrics.update)
     if result.faults:
         raise RuntimeError(f"{scenario} on {place} with {setup.controller.name}: {result.faults[0]}")
     return metrics.figures()
-
-
-def _setup(scenario: str, place: str, controller: str | None) -> Setup:
-    stage, plant = PLACES["lab" if place == IDENTIFIED else place]
-    setup = load_scenario(scenario, stage=stage, plant=plant, controller=controller).setup()
-    if place != IDENTIFIED:
-        return setup
-    measured = calibration_of(_identified(), "bench")
-    return dataclasses.replace(setup, stage=setup.stage.model_copy(update={"calibration": measured}))
-
-
-@cache
-def _identified() -> Identification:
-    """What `pkxyz identify` finds on the plant lab, with the law that it takes."""
-    law, bus = load("controllers", "lqg", ControllerConfig), load("buses", "fd_5k", BusConfig)
-    return identify(bare_setup(*PLACES["lab"], law, bus, 1), STROKES_M, Lane.FAST)
 
 
 def _axes(values: dict[str, float]) -> str:

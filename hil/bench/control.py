@@ -8,6 +8,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from hil.bench.rigs.answers import BAND_M, STEP_M, jump_settled, move_settled, sine_response
 from hil.bench.rigs.figure import Figure
 from hil.bench.rigs.held import HOLD_S, STROKES_M, held_nm, shortest_step_s
 from hil.bench.rigs.motions import MIDDLE_M, error_m, run, settled_s, setup_of
@@ -17,14 +18,10 @@ from pkxyz_ctrl.config.bus import BusConfig
 from pkxyz_ctrl.config.files import load
 from pkxyz_ctrl.design.hold_floor import hold_floor_m
 from pkxyz_ctrl.stage import Stage
-from pkxyz_ctrl.trajectory import Circle, Hold, Move, Raster, Sine, Steps
+from pkxyz_ctrl.trajectory import Circle, Hold, Raster, Steps
 
 LAW = "youla"
 """The default law."""
-BAND_M = 10e-9
-STEP_M = 1e-6
-QUICK = {"velocity_max_m_per_s": 5e-3, "acceleration_max_m_per_s2": 12.0, "jerk_max_m_per_s3": 60e3}
-"""Limits of a 1 um step: 0.8 ms on its way, with forces of some 60 uN and 4 V a tick."""
 SHAKEN_M_PER_S2 = 98.1e-6
 """10 ug/rtHz of the base, one-sided."""
 
@@ -35,24 +32,10 @@ def control() -> list[Figure]:
     return [*motion, *_at_limits(), *_far_jump(), *_mpc_ticks()]
 
 
-def response(axis: str, frequency_hz: float, controller: str = LAW) -> complex:
-    """True position over reference of a 100 nm sine along an axis, 200 periods of it."""
-    motion = run(
-        [Sine(kind="sine", axis=axis, amplitude_m=100e-9, frequency_hz=frequency_hz, cycles=200.0)],  # type: ignore[arg-type]
-        controller,
-    )
-    rows, i = motion.scan(0), "xyz".index(axis)
-    t_s = rows["reference_tick"] * motion.period_us * 1e-6
-    angle = 2 * np.pi * frequency_hz * t_s
-    basis = np.stack([np.cos(angle), np.sin(angle), np.ones(len(angle))], axis=1)
-    true, wanted = (np.linalg.lstsq(basis, rows[name][:, i], rcond=None)[0] for name in ("position_m", "reference_m"))
-    return complex((true[0] - 1j * true[1]) / (wanted[0] - 1j * wanted[1]))
-
-
 def _bandwidth() -> list[Figure]:
     figures = []
     for name, frequency_hz, target in (("gain_631", 631.0, 1.0), ("gain_1262", 1262.0, -0.7)):
-        found = {axis: response(axis, frequency_hz) for axis in "xy"}
+        found = {axis: sine_response(axis, frequency_hz, LAW) for axis in "xy"}
         gain_db = {axis: 20 * np.log10(abs(g)) for axis, g in found.items()}
         words = ", ".join(f"{a} {gain_db[a]:+.2f} dB, {np.degrees(np.angle(g)):+.1f} deg" for a, g in found.items())
         detail = f"100 nm sine at {frequency_hz:g} Hz: {words}"
@@ -66,44 +49,21 @@ def _bandwidth() -> list[Figure]:
 
 
 def _steps() -> list[Figure]:
-    """Ten moves of 1 um to and fro on each axis; the worst counts."""
-    settle_s, beyond = 0.0, 0.0
-    for i in range(3):
-        way = [float(i == k) * STEP_M for k in range(3)]
-        segments: list[Any] = []
-        for n in range(10):
-            to = np.array([0.0, 0.0, MIDDLE_M]) + (np.array(way) if n % 2 == 0 else 0.0)
-            segments += [Move(kind="move", to_m=tuple(to), **QUICK), Hold(kind="hold", duration_s=0.02)]  # type: ignore[arg-type]
-        motion = run(segments, LAW)
-        for n in range(10):
-            begin, end = motion.segments[2 * n].t_start_us, motion.segments[2 * n + 1].t_end_us
-            rows = motion.during((begin, end))
-            settle_s = max(settle_s, settled_s(rows, i, BAND_M, motion.period_us * 1e-6))
-            sign = 1.0 if n % 2 == 0 else -1.0
-            past = sign * (rows["position_m"][:, i] - rows["reference_m"][-1, i])
-            beyond = max(beyond, float(past.max()) / STEP_M)
+    settled = move_settled(LAW)
     words = "1 um from point to point on each axis, to and fro, ten times: the worst"
     return [
-        Figure("control.step_settle", settle_s * 1e3, "ms", 1.4, "at most", None, f"{words}; from its start to 10 nm"),
-        Figure("control.step_overshoot", beyond * 100, "%", 5.0, "at most", None, words),
+        Figure("control.step_settle", settled.s * 1e3, "ms", 1.4, "at most", None, f"{words}; from its start to 10 nm"),
+        Figure("control.step_overshoot", settled.beyond * 100, "%", 5.0, "at most", None, words),
     ]
 
 
 def _jumps() -> list[Figure]:
-    """The same as jumps of the set-point, there and back three times on each axis; the worst counts."""
-    settle_s, beyond = 0.0, 0.0
-    for i in range(3):
-        by = tuple(float(i == k) * STEP_M for k in range(3))
-        motion = run([Steps(kind="steps", by_m=by, count=3, dwell_s=0.02)], LAW)  # type: ignore[arg-type]
-        for at_us in motion.segments[0].jumps_us:
-            rows = motion.during((at_us, at_us + 19_000))
-            settle_s = max(settle_s, settled_s(rows, i, BAND_M, motion.period_us * 1e-6))
-            way = rows["position_m"][:, i] - rows["reference_m"][-1, i]
-            beyond = max(beyond, float((-np.sign(way[0]) * way).max()) / STEP_M)
+    settled, least_ms = jump_settled(LAW), shortest_step_s(STEP_M, BAND_M) * 1e3
     words = "1 um on each axis as a jump of the set-point, which no stage can follow, six times: the worst"
+    beside = f"{words}; to 10 nm, {settled.s * 1e3 / least_ms:.2f} times the shortest that voltage and slew allow"
     return [
-        Figure("control.jump_settle", settle_s * 1e3, "ms", 1.0, "at most", None, f"{words}; to 10 nm"),
-        Figure("control.jump_overshoot", beyond * 100, "%", 5.0, "at most", None, words),
+        Figure("control.jump_settle", settled.s * 1e3, "ms", 1.0, "at most", None, beside),
+        Figure("control.jump_overshoot", settled.beyond * 100, "%", 5.0, "at most", None, words),
     ]
 
 
@@ -191,7 +151,7 @@ def _idle_tones() -> Figure:
 
 def _shortest_step() -> Figure:
     detail = "from the jump of the set-point to within 10 nm of 1 um for good, whatever drove it: slew, voltage, delay"
-    return Figure("control.step_limit", shortest_step_s(1e-6, 10e-9) * 1e3, "ms", None, None, None, detail)
+    return Figure("control.step_limit", shortest_step_s(STEP_M, BAND_M) * 1e3, "ms", None, None, None, detail)
 
 
 def _three(values: NDArray[np.float64]) -> str:

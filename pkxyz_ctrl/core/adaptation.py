@@ -14,9 +14,9 @@ theta as the filter itself does (Friedland 1969): with U the change of the filte
     d nu = psi - H U,    U+ = U + K d nu,    U(next) = Phi U+ - Gamma phi
 
 Recursive least squares (a Kalman filter of numbers that drift slowly) works on nu with d nu, one axis a tick. Its
-covariance never exceeds what was known beforehand. It stands still where the reference does, where the stage is not
-where it should be, and after a comb was at a limit. What acts follows it within some milliseconds, and the filter's
-prediction moves along by U: then it is as if the filter had always known, and nothing kicks. No voltage waits for it.
+covariance never exceeds what was known beforehand. It stands still where the reference does or turns more sharply than
+psi describes, where the stage is not where it should be, and after a comb was at a limit. What acts follows within some
+milliseconds, and the filter's prediction moves along by U, as if it had always known: nothing kicks, no voltage waits.
 
 Beside it stands what was known once, the base. If one cause alone has changed since (a comb, a chain's springs, the
 hinges), one number makes the innovations that the base would leave as small as those that are left: it is a warning.
@@ -64,6 +64,7 @@ ADAPTATION = np.dtype(
         ("follow", "f8"),  # share by which what acts follows what is learnt, each tick
         ("least", "f8"),  # an update has to tell so much: variance of its prediction over that of the noise
         ("near_m", "f8"),  # how near the reference the stage has to be
+        ("turn_m_per_s2", "f8", (3,)),  # most that its acceleration may change by in a period
         ("fringe_m", "f8"),
         ("forget", "f8"),  # share of what speaks against the base that an update forgets
         ("warn", "f8"),  # least change, relative, and ...
@@ -126,9 +127,10 @@ def learn(
         begin(adaptation, state)
     if has_measurement:
         _show(adaptation, state, state["motion"][delay])
-    row, near = state["motion"][delay], has_measurement
+    row, later, near = state["motion"][delay], state["motion"][delay - 1], has_measurement
     for i in range(3):
-        near = near and abs(origin_m[i] + filtered[i] - row[i]) < adaptation["near_m"]
+        off_m, turn_m_per_s2 = origin_m[i] + filtered[i] - row[i], later[6 + i] - row[6 + i]
+        near = near and abs(off_m) < adaptation["near_m"] and abs(turn_m_per_s2) < adaptation["turn_m_per_s2"][i]
     state["calm"] = min(state["calm"] + 1, adaptation["calm_ticks"]) if near else 0
     axis = state["axis"]
     state["axis"] = axis + 1 if axis < 2 else 0
@@ -333,16 +335,9 @@ def note(state: np.void, start: Array) -> None:
 
 @kernel
 def _note_chain(
-    fringe_m: float,
-    geometry: np.void,
-    elasticity: np.void,
-    i: int,
-    row: Array,
-    drop: float,
-    along: Array,
-    pull_n: float,
-    out: Array,
-) -> None:
+    fringe_m: float, geometry: np.void, elasticity: np.void, i: int, row: Array, drop: float, along: Array,
+    pull_n: float, out: Array,
+) -> None:  # fmt: skip
     """What errors of chain i make the feed-forward lack, per unit: its comb's pull, springs, and its share of the rest.
     ``along`` (3,) is where the comb pulls.
     """

@@ -35,6 +35,8 @@ def fill_adaptation(tick: Any, stage: Stage, controller: ControllerConfig, bus: 
     record["follow"] = min(1.0, bus.period_s / config.follow_s)
     record["least"] = config.least_told
     record["near_m"] = config.near_m
+    lag_s = filter_["sense_delay_s"]  # beyond its square, a lag shows by its cube times the jerk: less than the noise
+    record["turn_m_per_s2"] = np.sqrt(record["variance_m2"]) * bus.period_s / lag_s**3 if lag_s > 0.0 else np.inf
     record["calm_ticks"] = max(1, round(config.calm_s / bus.period_s))
     record["fringe_m"] = FRINGE_M
     record["base_updates"] = max(1, round(config.base_s / bus.period_s))

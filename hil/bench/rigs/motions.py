@@ -1,16 +1,17 @@
 """Motions about mid-workspace, run in the fast lane: the reference, and the truth beside it."""
 
 import dataclasses
+import math
 from functools import cache
 from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
+from hil.bench.rigs.places import setup_at
 from hil.lanes import in_process as lanes
 from hil.lanes.lane import Lane
 from hil.lanes.setup import Setup
-from hil.runs.scenario import load_scenario
 from pkxyz_ctrl.config.files import ConfigError
 from pkxyz_ctrl.trajectory import Hold, Move, TimedSegment, Trajectory
 
@@ -43,12 +44,14 @@ class Run(NamedTuple):
 
 
 @cache
-def _setup(controller: str, plant: str) -> Setup:
-    return load_scenario("raster", controller=controller, plant=plant).setup()
+def _setup(controller: str, place: str) -> Setup:
+    return setup_at("raster", place, controller)
 
 
-def setup_of(segments: list[Any], controller: str, plant: str, height_m: float) -> tuple[Setup, int]:
-    """A run of the approach to a height and ``segments`` after it, and how many segments the approach has."""
+def setup_of(segments: list[Any], controller: str, place: str, height_m: float) -> tuple[Setup, int]:
+    """A run at one of the ``places``: the approach to a height and ``segments`` after it, and how many segments the
+    approach has.
+    """
     approach: list[Any] = [
         Hold(kind="hold", duration_s=0.02, measured=False),
         Move(kind="move", to_m=(0.0, 0.0, height_m), **GENTLE),
@@ -56,12 +59,12 @@ def setup_of(segments: list[Any], controller: str, plant: str, height_m: float) 
     ]
     trajectory = Trajectory([*approach, *segments])
     duration_s = trajectory.duration_us * 1e-6 + START_S
-    return dataclasses.replace(_setup(controller, plant), trajectory=trajectory, duration_s=duration_s), len(approach)
+    return dataclasses.replace(_setup(controller, place), trajectory=trajectory, duration_s=duration_s), len(approach)
 
 
-def run(segments: list[Any], controller: str = "lqg", plant: str = "nominal", height_m: float = MIDDLE_M) -> Run:
+def run(segments: list[Any], controller: str = "lqg", place: str = "nominal", height_m: float = MIDDLE_M) -> Run:
     """Move to a height on the axis and go through ``segments`` there. Raises ``ConfigError`` where that faults."""
-    setup, first = setup_of(segments, controller, plant, height_m)
+    setup, first = setup_of(segments, controller, place, height_m)
     return Run(rows_of_setup(setup), setup.trajectory.segments[first:], setup.bus.period_us)
 
 
@@ -81,6 +84,10 @@ def error_m(rows: NDArray[np.void]) -> NDArray[np.float64]:
 
 
 def settled_s(rows: NDArray[np.void], axis: int, band_m: float, period_s: float) -> float:
-    """Time from the first row until the true position of an axis stays within a band about the last reference."""
+    """Time from the first row until the true position of an axis stays within a band about the last reference; infinite
+    if it never does.
+    """
     off = np.abs(rows["position_m"][:, axis] - rows["reference_m"][-1, axis]) > band_m
+    if off[-1]:
+        return math.inf
     return float((np.flatnonzero(off)[-1] + 1) * period_s) if off.any() else 0.0
