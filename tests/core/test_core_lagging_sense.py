@@ -1,4 +1,4 @@
-"""A sine near the corner of the sense chain: what its lag shows there beyond its square is not learnt as the device's."""
+"""A sine near the corner of the sense chain: what its lag shows there beyond its square is not learnt."""
 
 import numpy as np
 import pytest
