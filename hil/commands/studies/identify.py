@@ -169,7 +169,9 @@ def _show_gains(found: "Identification") -> None:
     say("relative to the stage file, the combs if its mass is right:")
     print_whole(table)
     if outside is not None:
-        say(f"reference: {outside.points} points, {outside.residual_m * 1e9:.2f} nm rms left")
+        rests = ", ".join(f"{v * 1e6:.4f}" for v in outside.origin_m)
+        left_nm = outside.residual_m * 1e9
+        say(f"reference: {outside.points} points, {left_nm:.2f} nm rms left; the stage rests at {rests} um")
 
 
 def _show_calibration(found: "Identification") -> None:
