@@ -1,6 +1,6 @@
 """Sampled devices that are stopped in the middle of a scan: how often they meet their stops.
 
-python tests/loop/stopped.py circle youla 500 [unix_1k]
+python tests/studies/alarms/stopped.py circle youla 500 [unix_1k]
 """
 
 import dataclasses
