@@ -97,6 +97,25 @@ def test_for_an_identified_stage_the_same_design_reaches_further():
     assert 0.9 < 1e9 * hold_noise_m(stage(), bus(), plant, about).max() <= 1.05
 
 
+def test_for_an_identified_stage_slow_disturbances_may_be_rejected_further():
+    """What `pkxyz tune youla_rejecting` finds, kept: both lines of docs/understand/margins.md and 202 Hz, and what it
+    says of noise itself.
+    """
+    path = Path(__file__).with_name("youla_rejecting.toml")
+    loop = loop_of(load("controllers", path, ControllerConfig))
+    for hz, db in ((10.0, 34.0), (50.0, 20.0)):
+        assert db - 0.1 < -20.0 * np.log10(s_at(loop, hz)[0].max()) < db + 6.0
+    axes = loop.margins(MIDDLE).axes
+    assert 202.0 <= min(axis.bandwidth_hz for axis in axes) < 215.0
+    assert 1.7 < max(axis.peak_s for axis in axes) <= 2.0
+    tolerances = load("tolerances", "identified", Tolerances)
+    assert 1.9 < max(loop.peak_sensitivity(tolerances.sample(seed)) for seed in range(1, 41)) <= 3.0
+    plant, about = loop_plant(stage(), bus(), MIDDLE), law_about(stage(), loop.law, MIDDLE)
+    x, _, z = (f"{1e9 * value:.2f}" for value in hold_noise_m(stage(), bus(), plant, about))
+    assert (x, z) == ("1.03", "1.05")
+    assert f"{x} nm of noise in x and y, {z} in z" in path.read_text(encoding="utf-8")
+
+
 def behind_a_slow_filter(config):
     """The loop on the stage lab, whose sense chain lags by 100 us."""
     lab = stage("lab")
