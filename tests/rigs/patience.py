@@ -1,4 +1,6 @@
-"""A law and a bus that bear a machine that stands still: for tests whose processes run at rate, and not about that."""
+"""A law, a bus and a stage that bear a machine that stands still: for tests whose processes run at rate, and not about
+that.
+"""
 
 import re
 from pathlib import Path
@@ -40,4 +42,20 @@ def patient_bus(path: Path, name: str = "unix_1k", *, is_node_patient: bool = Tr
     bus = find("buses", name).read_text(encoding="utf-8")
     bus = replaced(r'^channel = "pkxyz"', f'channel = "{path.parent}/bus"', bus) + _TIME_OUTS
     path.write_text(bus + (_OF_THE_NODE if is_node_patient else ""), encoding="utf-8")
+    return path
+
+
+def slow_bus(path: Path) -> Path:
+    """A patient bus at 250 Hz, where even a busy machine misses few ticks."""
+    text = patient_bus(path).read_text(encoding="utf-8")
+    for key, value in (("period", 4000), ("sense_deadline", 3200), ("heartbeat_deadline", 3960)):
+        text = replaced(rf"^{key}_us = \d+", f"{key}_us = {value}", text)
+    path.write_text(text, encoding="utf-8")
+    return path
+
+
+def slow_stage(path: Path) -> Path:
+    """The default stage with a hundred times its mass, which is ten times slower: to 250 Hz what that is to 2.5 kHz."""
+    text = find("stages", "reconstructed").read_text(encoding="utf-8")
+    path.write_text(replaced(r"^mass_kg = 4\.833e-6", "mass_kg = 4.833e-4", text), encoding="utf-8")
     return path

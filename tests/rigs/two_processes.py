@@ -105,6 +105,18 @@ def served(folder):
     assert process.returncode == 0
 
 
+@contextmanager
+def plant_on(bus, stage, plant="nominal"):
+    """Node and plant served on a bus, without a scenario's folder, to the end of what runs beside them."""
+    process = started(bus.parent, "plant", "--bus", bus, "--stage", stage, "--plant", plant, "--json")
+    try:
+        assert "pre-operational" in process.stdout.readline()
+        yield
+    finally:
+        process.terminate()
+        process.communicate(timeout=60)
+
+
 @pytest.fixture(scope="module")
 def changes(bench):
     """Waits for a state of the node that is served in the folder, and returns all changes so far."""
