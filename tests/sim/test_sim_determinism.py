@@ -2,6 +2,7 @@
 
 import ast
 import hashlib
+import json
 import os
 import subprocess
 import sys
@@ -58,6 +59,31 @@ def test_object_and_compiled_loop_agree_bit_for_bit(name):
     assert (by_object(a, 500) == out).all()
     assert a.state.tobytes() == b.state.tobytes()
     assert np.ptp(out, axis=0).min() > 100
+
+
+NOMINAL_M = [
+    [1.6363935702611315e-06, 4.7704144302531885e-06, 1.3192244294787977e-05],
+    [2.9129541844961654e-06, 8.037137450802244e-08, 7.3621092727602535e-06],
+    [1.9903241883966387e-06, -4.798348530051954e-06, 1.2995886837026416e-05],
+    [-3.1944431412771563e-06, 4.741287528042424e-06, 1.2582381407128558e-05],
+    [1.3559970350251793e-06, 9.253856947954961e-07, 7.257508526243264e-06],
+]
+"""After each 40 periods of 200 us."""
+
+
+def test_nominal_stays_as_it_is():
+    """What figures of all times are compared on: the values of its file, and 200 periods from seed 1. Counts, noise
+    included, to the bit; positions to what another machine's exp may round."""
+    values = json.dumps(load("nominal").model_dump(mode="json"), sort_keys=True)
+    assert hashlib.sha256(values.encode()).hexdigest()[:16] == "30bd7a8f9be207cf"
+    p, counts, positions = plant(load("nominal"), seed=1), [], []
+    for row in drives(200):
+        p.drive(row)
+        p.advance_to(p.t_us + 200)
+        counts.append(p.sample())
+        positions.append(p.position_m)
+    assert hashlib.sha256(np.array(counts, "<i4").tobytes()).hexdigest()[:16] == "65c040c09887d316"
+    np.testing.assert_allclose(positions[39::40], NOMINAL_M, rtol=0, atol=1e-18)
 
 
 @pytest.mark.parametrize("name", NAMES)
