@@ -194,7 +194,7 @@ def _show_calibration(found: "Identification") -> None:
     say(
         f"links {_pm(numbers.link_stiffness, errors.link_stiffness)}, lift {_pm(numbers.lift, errors.lift)}, "
         f"Q {_pm(numbers.quality_factor, errors.quality_factor)}, "
-        f"delay {_pm(numbers.sense_delay_s * 1e6, errors.sense_delay_s * 1e6)} us",
+        f"delay {_pm(numbers.sense_delay_s * 1e6, errors.sense_delay_s * 1e6)} us beyond the amplifier as drawn",
     )
     if found.calibrated.differ and not errors.sense_gain[0]:
         say(bad("the ratios of the sense gains contradict reciprocity"))

@@ -106,7 +106,8 @@ class Identification:
     @property
     def not_known(self) -> str:
         """What the calibration leaves open."""
-        return MASS_NOT_KNOWN if self.sense_scale == "instrument" else f"{SCALE_NOT_KNOWN}; {MASS_NOT_KNOWN}"
+        scale = [] if self.sense_scale == "instrument" else [SCALE_NOT_KNOWN]
+        return "; ".join([*scale, MASS_NOT_KNOWN, AMPLIFIER_NOT_KNOWN])
 
     @property
     def drawn_hz(self) -> Array:
@@ -275,6 +276,10 @@ SCALE_NOT_KNOWN = (
     "is the drawing's; --reference FILE.csv of an instrument outside tells"
 )
 MASS_NOT_KNOWN = "the mass, and so the scale of all forces and stiffnesses, which is the drawing's: nothing moves by it"
+AMPLIFIER_NOT_KNOWN = (
+    "the amplifier's pole, which is the drawing's: at the samples it looks like delay, which has what it lags more"
+)
+"""A pole that dies within a period adds to the samples' response what B, C and D of ``modal_fit`` are free to be."""
 NOT_KNOWN = "metres per count and newtons per V^2 by themselves; --reference FILE.csv of an instrument outside tells"
 
 

@@ -8,9 +8,10 @@ S counts per metre and C newtons per V^2 (diagonal), J the strokes' gradients, B
 springs' stiffness, G what the held forces take off it. Two times nine numbers, measured with their covariance
 (``modal_fit``), against ten unknowns by least squares: three comb gains, lift, the out-of-plane hinges, and for the
 six springs of the chains a common factor and two differences each of sliders and of cranks, as the response does not
-tell their common factors apart. The mass is the drawing's: with all forces, stiffnesses and the mass doubled, nothing
-would look different. So are the metres per farad, unless they are given. Damping and delay are one number each: that
-of all modes together.
+tell their common factors apart. Where a slow sense chain leaves the acceleration gains in doubt, the resonances are
+fitted as well. The mass is the drawing's: with all forces, stiffnesses and the mass doubled, nothing would look
+different. So are the metres per farad, unless they are given. Damping and delay are one number each: that of all modes
+together.
 """
 
 import math
@@ -75,12 +76,18 @@ def calibrate(
     """Fit to what was measured about ``strokes_m`` (3,), true to ``sense``. Gains of the sense combs that were only
     assumed give way to reciprocity, if that contradicts them. Raises ``FitError`` for another device.
     """
-    root = np.linalg.cholesky(modes.gains_covariance)
+    late = modes.resonances_covariance
+    root = np.linalg.cholesky(modes.gains_covariance if late is None else late)
     seen = np.concatenate([modes.static_gain.ravel(), modes.acceleration_gain.ravel()])
+    if late is not None:  # a sense chain's pole leaves sudden gains in doubt by per cents, resonances not
+        seen = np.concatenate([seen, modes.frequency_hz[modes.apart]])
 
     def misses(unknown: Array) -> Array:
-        found = config.model_copy(update={"calibration": _numbers(unknown, sense.gain)})
-        return np.asarray(np.linalg.solve(root, gains(Stage(found), strokes_m, farad_per_count).ravel() - seen))
+        stage = Stage(config.model_copy(update={"calibration": _numbers(unknown, sense.gain)}))
+        told = gains(stage, strokes_m, farad_per_count).ravel()
+        if late is not None:
+            told = np.concatenate([told, resonances_hz(stage, strokes_m, modes.apart)])
+        return np.asarray(np.linalg.solve(root, told - seen))
 
     def fitted(start: Array) -> tuple[Array, Array, float]:
         fit = scipy.optimize.least_squares(misses, start, x_scale=0.01)
@@ -135,6 +142,17 @@ def gains(stage: Stage, strokes_m: Array, farad_per_count: float) -> Array:
     moved = np.stack([np.linalg.solve(held, pulls.T), pulls.T / stage.mass_kg])
     count_per_m = stage.sense_gradient_f_per_m / farad_per_count
     return np.asarray(count_per_m[:, None] * (rows @ moved) * stage.force_gain_n_per_v2)
+
+
+def resonances_hz(stage: Stage, strokes_m: Array, apart: NDArray[np.bool_]) -> Array:
+    """Natural frequencies by the model, about strokes, of the modes that are ``apart`` (3,): of those that coincide the
+    mean, (n,) ascending.
+    """
+    position = stage.forward_kinematics(strokes_m)
+    held = stage.stiffness(position) - held_force_softening(stage, position)
+    hz = np.sqrt(np.linalg.eigvalsh(held) / stage.mass_kg) / (2.0 * math.pi)
+    first = np.flatnonzero(apart)
+    return np.asarray(np.add.reduceat(hz, first) / np.diff(first, append=len(apart)))
 
 
 _SPRINGS = np.zeros((6, UNKNOWNS))

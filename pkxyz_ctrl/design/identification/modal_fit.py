@@ -81,6 +81,8 @@ class ModalFit:
     sense_corner_hz: float | None = None
     """of the sense chain; None where it is too fast to tell"""
     sense_corner_standard_error_hz: float | None = None
+    resonances_covariance: Array | None = None
+    """(18 + n, 18 + n) of the gains and of the frequencies of n pairs of poles, where there is a sense chain's too"""
 
     @property
     def noise_alone(self) -> bool:
@@ -174,7 +176,10 @@ def fit_modes(
     spare = residual.size - theta.size - len(modes)
     chi_square = float((residual**2).sum() / spare)
     covariance = _covariance(modes, theta, columns, weight) * max(1.0, chi_square)
-    values, values_covariance = _propagated(modes, theta, covariance, period_s, delay_periods)
+    values, slopes = _propagated(modes, theta, len(covariance), period_s, delay_periods)
+    values_covariance = slopes @ covariance @ slopes.T
+    pairs = len(modes) // 2
+    resonant = np.concatenate([slopes[:18], np.eye(pairs, len(covariance)) * np.exp(modes[:pairs, None])])
     static, acceleration = values[:18].reshape(2, 3, 3)
     gains_covariance = values_covariance[:18, :18]
     lag_s, lag_standard_error_s = combined(values[18:], values_covariance[18:, 18:])
@@ -207,6 +212,7 @@ def fit_modes(
         _delay_periods=delay_periods,
         sense_corner_hz=float(corner[0]) if len(corner) else None,
         sense_corner_standard_error_hz=float(corner[0] * of_corner[0]) if len(corner) else None,
+        resonances_covariance=resonant @ covariance @ resonant.T if len(corner) else None,
     )
 
 
@@ -288,14 +294,12 @@ def _values(modes: Array, theta: Array, period_s: float, delay_periods: int) -> 
     return np.concatenate([static.ravel(), acceleration.ravel(), lags_s])
 
 
-def _propagated(
-    modes: Array, theta: Array, covariance: Array, period_s: float, delay_periods: int
-) -> tuple[Array, Array]:
-    """``_values`` and their covariance, by central differences."""
+def _propagated(modes: Array, theta: Array, unknowns: int, period_s: float, delay_periods: int) -> tuple[Array, Array]:
+    """``_values`` and their slopes over all unknowns, by central differences."""
     nonlinear = len(modes)
-    slopes = np.zeros((18 + nonlinear // 2, len(covariance)))
-    for n in range(len(covariance)):
-        step = np.zeros(len(covariance))
+    slopes = np.zeros((18 + nonlinear // 2, unknowns))
+    for n in range(unknowns):
+        step = np.zeros(unknowns)
         linear = n - nonlinear
         step[n] = 1e-6 if linear < 0 else 1e-6 * max(1.0, float(np.abs(theta).max()))
         pair = [
@@ -308,7 +312,7 @@ def _propagated(
             for sign in (1.0, -1.0)
         ]
         slopes[:, n] = (pair[0] - pair[1]) / (2.0 * step[n])
-    return _values(modes, theta, period_s, delay_periods), slopes @ covariance @ slopes.T
+    return _values(modes, theta, period_s, delay_periods), slopes
 
 
 def _covariance(modes: Array, theta: Array, columns: Callable[[Array], Array], weight: Array) -> Array:
