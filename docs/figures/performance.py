@@ -20,8 +20,8 @@ PICTURE = Path(__file__).with_suffix(".png")
 RESULTS = ROOT / "benchmarks" / "results.json"
 
 TABLES = {
-    "speed": ("tick", "lockstep.realtime", "lockstep.events", "fast", "study", "spread", "plant", "sil", "operate",
-              "native"),
+    "speed": ("tick", "lockstep.realtime", "lockstep.events", "fast", "batch", "study", "spread", "plant", "sil",
+              "operate", "native"),
     "share": ("lockstep.tick", *(f"lockstep.{part}" for part in
               ("bus_and_node", "driver_and_gate", "cycle", "plant", "recording_and_log"))),
     "parts": ("controller", "driver", "gate", "codec", "wire"),

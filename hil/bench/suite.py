@@ -34,6 +34,7 @@ MEASUREMENTS: dict[str, Measurement] = {
     "plant": plant.plant,
     "lockstep": lanes.lockstep,
     "fast": lanes.fast,
+    "batch": lanes.batch,
     "study": study.study,
     "spread": study.spread,
     "sil": startup.sil,

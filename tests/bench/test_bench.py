@@ -5,26 +5,32 @@ No time is judged here: that would be a test of the machine.
 
 import json
 import math
+import re
 import runpy
 import subprocess
 import sys
+from collections.abc import Sequence
 from pathlib import Path
 
 import numpy as np
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
+from numpy.typing import NDArray
 
-from hil.bench import beside, quality, startup, suite, tick
+from hil.bench import beside, lanes, quality, startup, suite, tick
 from hil.bench.native import within_us
 from hil.bench.rigs.closed_loop import scan
+from hil.lanes import many
+from hil.lanes.setup import Setup
 from hil.runs.scenario import load_scenario
 from pkxyz_ctrl.config.files import ConfigError
 from pkxyz_ctrl.io.clocks import percentile_us
+from sim.plant import Plant
 
 ROOT = Path(__file__).parents[2]
 KEYS = {"name", "value", "unit", "target", "direction", "met", "median", "detail"}
-QUICK = ("tick", "fast", "bus", "limits", "codec", "gate", "wire")
+QUICK = ("tick", "fast", "batch", "bus", "limits", "codec", "gate", "wire")
 drawing = runpy.run_path(str(ROOT / "docs" / "figures" / "performance.py"))
 
 
@@ -112,6 +118,25 @@ def test_a_replay_that_does_less_is_refused() -> None:
     memory = loop.memory.copy()
     with pytest.raises(RuntimeError, match="not the same work"):
         tick._verified(lambda: None, loop, memory)
+
+
+def test_a_batch_in_which_a_device_is_left_in_a_fault_is_refused(monkeypatch: pytest.MonkeyPatch) -> None:
+    def ended(setup: Setup, laws: object, plants: Sequence[Plant]) -> NDArray[np.void]:
+        found = np.zeros(len(plants), many.SCANNED)
+        found["ticks"], found["faulted"][3] = 100, 1
+        return found
+
+    monkeypatch.setattr(many, "scan_errors", ended)
+    with pytest.raises(RuntimeError, match="not the same work"):
+        lanes.batch()
+
+
+def test_every_measurement_is_in_the_table_of_the_benchmarks() -> None:
+    page = (ROOT / "benchmarks" / "README.md").read_text(encoding="utf-8")
+    named = {
+        n for row in page.splitlines() if row.startswith("| `") for n in re.findall("`([a-z]+)`", row.split("|")[1])
+    }
+    assert named == set(suite.MEASUREMENTS)
 
 
 def test_imports_are_summed_by_package() -> None:
