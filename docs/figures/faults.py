@@ -18,6 +18,7 @@ from hil.screen.progress import progress_bar
 from hil.studies.faults.every_law import break_all
 from hil.studies.faults.matrix import CASES
 from hil.studies.faults.outcome import Outcome
+from hil.studies.soaks import decisions_in_words
 from pkxyz_ctrl.config.files import names
 from pkxyz_ctrl.io.realtime import cores
 
@@ -61,13 +62,15 @@ def matrix(found: list[dict[str, Any]]) -> str:
 def soaked(path: Path) -> str:
     """The result of a soak in a sentence."""
     s = json.loads(path.read_text(encoding="utf-8"))
-    reasons = ", ".join(f"{name} {count}" for name, count in list(s["reasons"].items())[:6])
+    reasons = ", ".join(f"{name} {count}" for name, count in list(s["reasons"].items())[:3])
+    early, late = min(s["memory_mb"][1:9]), min(s["memory_mb"][-8:])  # least of eight, as it is judged
+    decided = decisions_in_words(s["faults"], s["undecided"], s["decisions"], s["misled"])
     return (
         f"Measured (seed {s['seed']}, law {s['law']}): {s['ticks']} ticks at {s['realtime_factor']:.1f} times real "
-        f"time, {s['recorded_ticks']} of them read back; {s['faults']} faults, {s['decisions']} decisions, "
-        f"{s['returns']} times back to tracking; memory {s['memory_mb'][1]:.0f} MB after two minutes and "
-        f"{s['memory_mb'][-1]:.0f} MB at the end; damaged: {'yes' if s['damaged'] else 'no'}. The most frequent "
-        f"reasons: {reasons}.\n\n![memory, faults, decisions and returns, minute by minute](../figures/soak.png)"
+        f"time, {s['recorded_ticks']} read back; {decided}, {s['returns']} times back to tracking; memory "
+        f"{early:.0f} MB at first and {late:.0f} MB at last; damaged: "
+        f"{'yes' if s['damaged'] else 'no'}. Most frequent: {reasons}.\n\n"
+        "![memory, faults, decisions and returns, minute by minute](../figures/soak.png)"
     )
 
 

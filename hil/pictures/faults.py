@@ -10,6 +10,7 @@ from matplotlib.patches import Patch, Rectangle
 from hil.pictures.style import BAD, BLUE, FAINT, GOOD, SMALL_PT, TINY_PT, WASH, dress, legend, save, sheet
 from hil.studies.faults.matrix import Case
 from hil.studies.faults.outcome import Outcome
+from hil.studies.soaks import decisions_in_words
 
 if TYPE_CHECKING:
     from hil.studies.soak import Soaked
@@ -74,7 +75,8 @@ def _colour(outcome: Outcome) -> str:
 def draw_soak(soaked: "Soaked", path: Path) -> None:
     """A soak: memory, and what was decided, minute by minute."""
     parts = np.arange(1, len(soaked.memory_mb) + 1)
-    figure = sheet(7.2, 4.2)
+    caption = decisions_in_words(soaked.faults, soaked.undecided, soaked.decisions, soaked.misled)
+    figure = sheet(7.6, 4.4, caption)
     memory, decided = figure.subplots(2, 1, sharex=True)
     memory.plot(parts, soaked.memory_mb, color=BLUE, marker=".")
     memory.set_ylim(0, 1.15 * max(soaked.memory_mb, default=1.0))

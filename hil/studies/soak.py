@@ -60,6 +60,10 @@ class Soaked:
     interrupted: bool = False
     """by the keyboard: the figures are those of the time until then"""
     faults: int = 0
+    faults_by_case: dict[str, int] = field(default_factory=dict)
+    """... of each case of the matrix"""
+    undecided: dict[str, int] = field(default_factory=dict)
+    """those that led to no decision: right where a fault is short or small, or meets what is stopped already"""
     decisions: int = 0
     returns: int = 0
     """how often it was tracking again after a fault decision"""
@@ -72,6 +76,8 @@ class Soaked:
     """most that it rose in a tick while no voltage was allowed"""
     zero_ticks: int = 0
     """longest that a comb was above 0 V after the end of a mode with voltages"""
+    misled: int = 0
+    """decisions later than any fault's own, excused since one had fallen into the homing before"""
     unprovoked: int = 0
     """decisions without a fault that could have led to them"""
     latest_us: int = 0
@@ -143,9 +149,18 @@ def soak(
         soaked.ticks = blocks.done
         soaked.faults = sum(f.at_us < blocks.done * setup.bus.period_us for f in setup.faults)
     log.close()
+    begun = [_case_of(fault) for fault in setup.faults[: soaked.faults]]
+    soaked.faults_by_case = dict(Counter(begun).most_common())
+    soaked.undecided = dict(Counter(case for n, case in enumerate(begun) if n not in log.decided).most_common())
     soaked.realtime_factor = blocks.done * setup.bus.period_s / (time.perf_counter() - begin_s)
     _judge(soaked, setup)
     return soaked
+
+
+def _case_of(fault: Fault) -> str:
+    """As the matrix has it, without its time."""
+    head, _, rest = str(fault).partition("@")
+    return ",".join((head, *rest.split(",")[1:]))
 
 
 class Decided(NamedTuple):
@@ -190,6 +205,8 @@ class _Log:
         self._begins_us = [f.at_us for f in rig.setup.faults]
         self._ends_us = [f.end_us or f.at_us for f in rig.setup.faults]
         self._parts = 0
+        self.decided: set[int] = set()
+        """which of the faults led to a decision"""
 
     def take(self, rows: NDArray[np.void]) -> None:
         if self._writer is None:
@@ -245,15 +262,13 @@ class _Log:
     def _homings_us(
         self, rows: NDArray[np.void], mode: NDArray[np.int64], at: NDArray[np.intp]
     ) -> list[tuple[int, int]]:
-        """When the latest homing before each of these rows of a block began and ended; ``mode`` has one more before."""
+        """When the latest homing before each of these rows of a block began and ended; ``mode`` has one more."""
         skipped = self._skipped + np.cumsum(rows["overrun"])
         t_us = (rows["tick"] + skipped) * self._rig.setup.bus.period_us
         self._skipped = int(skipped[-1])
         is_homing, found = mode == Mode.HOMING, []
-        begun, ended = (
-            np.flatnonzero(is_homing[1:] & ~is_homing[:-1]),
-            np.flatnonzero(~is_homing[1:] & is_homing[:-1]),
-        )
+        begun = np.flatnonzero(is_homing[1:] & ~is_homing[:-1])
+        ended = np.flatnonzero(~is_homing[1:] & is_homing[:-1])
         for row in (*at, len(rows) - 1):
             begin_us, end_us = self._homing_us
             if len(before := begun[begun <= row]):
@@ -271,12 +286,18 @@ class _Log:
         assert self._rig.injection is not None
         t_us = decided.t_us - decided.age_us - self._rig.injection.origin_us
         last = bisect.bisect_right(self._begins_us, t_us) - 1
-        since_us = t_us - self._ends_us[last] if last >= 0 else t_us
+        since_us = t_us - (self._ends_us[last] if last >= 0 else 0)
         self._soaked.latest_us = max(self._soaked.latest_us, since_us)
         in_homing = bisect.bisect_left(self._begins_us, homing_us[1]) - 1
         misled = in_homing >= 0 and self._ends_us[in_homing] + _RINGS_US > homing_us[0]
         misled = misled and t_us <= homing_us[1] + _FIRST_USE_US
-        self._soaked.unprovoked += since_us > AFTER_US and not misled
+        if last >= 0 and since_us <= AFTER_US:
+            self.decided.add(last)
+        elif misled:
+            self._soaked.misled += 1
+            self.decided.add(in_homing)
+        else:
+            self._soaked.unprovoked += 1
 
 
 def _read_again(writer: RecordingWriter, *, as_parquet: bool) -> NDArray[np.int64]:

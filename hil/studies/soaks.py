@@ -1,10 +1,11 @@
 """Many soaks, each with a seed of its own: as many ticks as cores and machines get through, each kept as it ends."""
 
+import dataclasses
 import importlib.metadata
 import shutil
 import tempfile
 from collections import Counter
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -15,7 +16,8 @@ from hil.studies.spread.kept import Kept
 from hil.studies.spread.missing import work_out_missing
 from pkxyz_ctrl.config import files as config
 
-_TOTALS = ("ticks", "recorded_ticks", "faults", "decisions", "returns")
+_TOTALS = ("ticks", "recorded_ticks", "faults", "decisions", "misled", "returns")
+_COUNTS = ("faults_by_case", "undecided", "reasons")
 _LARGEST = ("voltage_max_v", "slew_max_v", "rise_max_v", "zero_ticks")
 Asked = tuple[Scenario, float]
 """What is soaked, and for how many seconds of stage time."""
@@ -29,7 +31,14 @@ class KeptSoaks(Kept[int, Soaked]):
         scenario, duration_s = asked
         version = importlib.metadata.version("pkxyz-ctrl")
         head = {
-            "digest": config.digest({"scenario": resolve(scenario), "duration_s": duration_s, "version": version}),
+            "digest": config.digest(
+                {
+                    "scenario": resolve(scenario),
+                    "duration_s": duration_s,
+                    "version": version,
+                    "counted": [f.name for f in dataclasses.fields(Soaked)],
+                }
+            ),
             "duration_s": duration_s,
         }
         super().__init__(path, head, lambda soaked: soaked.seed, _read, as_json)
@@ -56,16 +65,26 @@ def soak_each(
 
 def totals(soaks: Sequence[Soaked]) -> dict[str, Any]:
     """Sums and largest values of all, and what was wrong with which seed."""
-    reasons: Counter[str] = Counter()
+    counts: dict[str, Counter[str]] = {name: Counter() for name in _COUNTS}
     for soaked in soaks:
-        reasons.update(soaked.reasons)
+        for name, counted in counts.items():
+            counted.update(getattr(soaked, name))
     return {
         "ok": all(soaked.ok for soaked in soaks), "soaks": len(soaks),
         **{name: sum(getattr(soaked, name) for soaked in soaks) for name in _TOTALS},
         **{name: max(getattr(soaked, name) for soaked in soaks) for name in _LARGEST},
-        "damaged": any(soaked.damaged for soaked in soaks), "reasons": dict(reasons.most_common()),
+        "damaged": any(soaked.damaged for soaked in soaks),
+        **{name: dict(counted.most_common()) for name, counted in counts.items()},
         "problems": {soaked.seed: soaked.problems for soaked in soaks if soaked.problems},
     }  # fmt: skip
+
+
+def decisions_in_words(faults: int, undecided: Mapping[str, int], decisions: int, misled: int) -> str:
+    """How many there were of each, and which share of them was not held to the other."""
+    return (
+        f"{faults} faults, {sum(undecided.values())} without a decision; {decisions} decisions, {misled} excused by a "
+        "misled homing"
+    )
 
 
 def _soaked(asked: Asked, seed: int) -> Soaked:

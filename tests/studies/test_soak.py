@@ -15,8 +15,10 @@ from hil.node.amplifier import AmplifierNode
 from hil.node.drive import DriveReceiver
 from hil.recording.recording import Recording
 from hil.runs.scenario import load_scenario
+from hil.studies.faults.matrix import CASES
 from hil.studies.faults.outcome import RISE_V
 from hil.studies.soak import AFTER_US, Soaked, _judge, _Voltages, random_faults, soak, soaked_scenario
+from hil.studies.soaks import decisions_in_words, totals
 from hil.whole_ticks.stretches import Stretches
 from pkxyz_ctrl.loop.row import ROW
 from pkxyz_ctrl.safety.modes import Mode
@@ -42,6 +44,9 @@ def test_nothing_is_lost_and_nothing_breaks(soaked):
     assert 1 <= found.zero_ticks <= 106  # 20 ms where no frame reaches the node
     assert found.unprovoked == 0
     assert 0 <= found.latest_us < AFTER_US
+    assert sum(found.faults_by_case.values()) == found.faults
+    assert set(found.faults_by_case) <= {case.text.replace("0.2e-6", "2e-07") for case in CASES}
+    assert found.decisions - found.misled >= found.faults - sum(found.undecided.values())
     parts = sorted(folder.glob("*.parquet"))
     assert len(parts) == len(found.memory_mb) == 3
     for total, each in (
@@ -141,6 +146,8 @@ SHIFTED = "sense.1:offset@{}+0.01,offset_m=3e-7"
     ("fault", "trips_s", "unprovoked"),
     [
         ("sense.1:off@0.29+0.01", 0.45, 1),
+        ("sense.1:off@0.29+0.01", 0.2, 1),
+        ("sense.1:off@0.29+0.01", 0.04, 1),
         (SHIFTED.format(0.06), 0.14, 1),
         (SHIFTED.format(0.045), 0.14, 0),
         (SHIFTED.format(0.001), 0.14, 0),
@@ -164,9 +171,33 @@ def test_a_decision_without_a_fault_is_found(tmp_path, monkeypatch, fault, trips
     monkeypatch.setattr(Injection, "arm", arm_and_trip)
     monkeypatch.setattr("hil.studies.soak.random_faults", lambda *_: (parse(fault),))
     found = soak(0.6, 1, soaked_scenario("lqg"), tmp_path)
-    assert found.decisions == 1 + (fault == "sense.1:off@0.29+0.01")
+    decided = fault.startswith("sense.1:off@")
+    assert found.decisions == 1 + decided
     assert found.unprovoked == unprovoked
+    assert found.misled == 1 - unprovoked
+    assert sum(found.undecided.values()) == (unprovoked and not decided)  # one that misled led to a decision, too
     assert ("1 decisions without a fault in the 50 ms before" in found.problems) == unprovoked
+
+
+def test_faults_without_a_decision_are_counted_by_their_case(tmp_path, monkeypatch):
+    """Too small; between two SYNCs; decided again as it goes on; and one that meets what is stopped already."""
+    texts = (
+        "sense.1:offset@0.2+0.02,offset_m=2e-7", "bus.sync:drop@0.25005+0.0001",
+        "sense.1:offset@0.3+0.02,offset_m=2e-7", "sense.1:off@0.32+0.06", "amplifier.2:dead@0.39+0.0005",
+    )  # fmt: skip
+    monkeypatch.setattr("hil.studies.soak.random_faults", lambda *_: tuple(map(parse, texts)))
+    found = soak(0.6, 1, soaked_scenario("lqg"), tmp_path)
+    assert found.decisions >= 1
+    assert found.misled == found.unprovoked == 0
+    assert found.faults_by_case == {
+        "sense.1:offset,offset_m=2e-07": 2, "bus.sync:drop": 1, "sense.1:off": 1, "amplifier.2:dead": 1,
+    }  # fmt: skip
+    assert found.undecided == {"sense.1:offset,offset_m=2e-07": 2, "bus.sync:drop": 1, "amplifier.2:dead": 1}
+    words = decisions_in_words(found.faults, found.undecided, found.decisions, found.misled)
+    assert words.startswith("5 faults, 4 without a decision; ")
+    both = totals([found, found])
+    assert both["undecided"] == {case: 2 * count for case, count in found.undecided.items()}
+    assert sum(both["faults_by_case"].values()) == both["faults"] == 10
 
 
 def test_a_defect_within_whole_ticks_is_found(tmp_path, monkeypatch):

@@ -86,19 +86,29 @@ def _soaked(duration_s: float, seed: int, law: str, out: Path | None, keep: bool
 
 
 def _tell(soaked: "Soaked") -> None:
+    from hil.studies.soaks import decisions_in_words
+
     until = " until interrupted" if soaked.interrupted else ""
     say(
-        f"{soaked.ticks} ticks{until}, {soaked.realtime_factor:.1f} times real time; {soaked.faults} faults, "
-        f"{soaked.decisions} decisions, {soaked.returns} times back to tracking",
+        f"{soaked.ticks} ticks{until}, {soaked.realtime_factor:.1f} times real time; "
+        + decisions_in_words(soaked.faults, soaked.undecided, soaked.decisions, soaked.misled)
+        + f", {soaked.returns} times back to tracking",
     )
     say(
         f"{soaked.recorded_ticks} ticks read back from the recordings; memory {soaked.memory_mb[0]:.0f} to "
         f"{soaked.memory_mb[-1]:.0f} MB; at most {soaked.voltage_max_v:.1f} V, and {soaked.slew_max_v:.1f} V up "
         "in a tick",
     )
-    say("reasons: " + ", ".join(f"{name} {count}" for name, count in soaked.reasons.items()))
+    _tell_counts(soaked.reasons, soaked.undecided, soaked.faults_by_case)
     for problem in soaked.problems:
         say(bad(problem))
+
+
+def _tell_counts(reasons: dict[str, int], undecided: dict[str, int], faults: dict[str, int]) -> None:
+    say("reasons: " + ", ".join(f"{name} {count}" for name, count in reasons.items()))
+    if undecided:
+        each = (f"{case} {count} of {faults[case]}" for case, count in undecided.items())
+        say("without a decision: " + "; ".join(each))
 
 
 def _several(
@@ -106,7 +116,7 @@ def _several(
 ) -> NoReturn:
     """Runs that are kept as they come."""
     from hil.studies.soak import soaked_scenario
-    from hil.studies.soaks import KeptSoaks, soak_each, totals
+    from hil.studies.soaks import KeptSoaks, decisions_in_words, soak_each, totals
 
     asked = soaked_scenario(law), duration_s
     folder = folder_to_write(out or Path("soaks"))
@@ -121,10 +131,11 @@ def _several(
     else:
         say(
             f"{found['soaks']} of {len(seeds)} soaks, {found['ticks']} ticks, {found['recorded_ticks']} read back; "
-            f"{found['faults']} faults, {found['decisions']} decisions, {found['returns']} times back to tracking; at "
-            f"most {found['voltage_max_v']:.1f} V, and {found['slew_max_v']:.1f} V up in a tick"
+            + decisions_in_words(*(found[name] for name in ("faults", "undecided", "decisions", "misled")))
+            + f", {found['returns']} times back to tracking; at most {found['voltage_max_v']:.1f} V, and "
+            f"{found['slew_max_v']:.1f} V up in a tick"
         )
-        say("reasons: " + ", ".join(f"{name} {count}" for name, count in found["reasons"].items()))
+        _tell_counts(found["reasons"], found["undecided"], found["faults_by_case"])
         for seed, problems in found["problems"].items():
             say(bad(f"seed {seed}: {'; '.join(problems)}"))
     raise typer.Exit(130 if found["interrupted"] else 0 if found["ok"] else 1)

@@ -1,4 +1,4 @@
-"""Every fault of the matrix under the default law: noticed in time, by its cause, within limits, and recovered from."""
+"""Every fault of the matrix under lqg: noticed in time, by its cause, within limits, and recovered from."""
 
 import dataclasses
 from functools import cache
