@@ -17,6 +17,9 @@ from hil.studies.spread.workers import as_done, worker_pool
 from pkxyz_ctrl.config.files import ConfigError
 
 pytestmark = pytest.mark.at_rate
+needs_openssl = pytest.mark.skipif(shutil.which("openssl") is None, reason="certificates are made with openssl")
+
+PAGE = Path(__file__).parents[3] / "docs" / "do" / "many-plants.md"
 
 
 def openssl(folder, *words):
@@ -43,23 +46,43 @@ def square(n):
     return n * n
 
 
-@pytest.mark.skipif(shutil.which("openssl") is None, reason="certificates are made with openssl")
-def test_work_crosses_encrypted_and_a_stranger_gets_nowhere(tmp_path):
+def encrypted(folder):
+    """A cluster in this process with the certificates of a folder."""
     from distributed import LocalCluster, Security
 
-    ours, stranger = certificates(tmp_path / "ours"), certificates(tmp_path / "stranger")
     roles = ("scheduler", "worker", "client")
-    files = {f"tls_{role}_{kind}": str(ours / f"{kind}.pem") for role in roles for kind in ("cert", "key")}
-    security = Security(require_encryption=True, tls_ca_file=str(ours / "ca.pem"), **files)
-    with LocalCluster(
+    files = {f"tls_{role}_{kind}": str(folder / f"{kind}.pem") for role in roles for kind in ("cert", "key")}
+    security = Security(require_encryption=True, tls_ca_file=str(folder / "ca.pem"), **files)
+    return LocalCluster(
         n_workers=1, threads_per_worker=1, processes=False, dashboard_address=None, protocol="tls://",
         security=security, host="127.0.0.1",
-    ) as cluster:  # fmt: skip
+    )  # fmt: skip
+
+
+@needs_openssl
+def test_work_crosses_encrypted_and_a_stranger_gets_nowhere(tmp_path):
+    ours, stranger = certificates(tmp_path / "ours"), certificates(tmp_path / "stranger")
+    with encrypted(ours) as cluster:
         address = cluster.scheduler_address
         assert address.startswith("tls://")
         with worker_pool(1, cluster_at(address, certificates(tmp_path / "client", ours))) as (pool, width):
             assert dict(as_done(pool, width, square, range(5))) == {n: n * n for n in range(5)}
         with pytest.raises(ConfigError, match="no scheduler answers"), worker_pool(1, cluster_at(address, stranger)):
+            pass
+
+
+@needs_openssl
+def test_the_certificate_that_the_page_makes_is_taken_and_keeps_strangers_out(tmp_path):
+    (line,) = (line for line in PAGE.read_text(encoding="utf-8").splitlines() if line.startswith("openssl "))
+    for name in ("ours", "stranger"):
+        (tmp_path / name).mkdir()
+        subprocess.run(["sh", "-c", line], cwd=tmp_path / name, check=True, capture_output=True)
+    with encrypted(tmp_path / "ours") as cluster:
+        address = cluster.scheduler_address
+        with worker_pool(1, cluster_at(address, tmp_path / "ours")) as (pool, width):
+            assert dict(as_done(pool, width, square, range(5))) == {n: n * n for n in range(5)}
+        stranger = cluster_at(address, tmp_path / "stranger")
+        with pytest.raises(ConfigError, match="no scheduler answers"), worker_pool(1, stranger):
             pass
 
 
