@@ -54,8 +54,8 @@ class Devices:
     """capacitance per stroke over the drawing's (n, 3)"""
     side_gap_m: Array
     """gap (n, 3) that a comb of straight fingers in their middle would have with the same side stiffness per pull"""
-    side_left: Array
-    """share (n, 3) of its spring that a comb's side pull may use before fingers that stand aside snap"""
+    side_offset: Array
+    """how far fingers stand aside of their gaps' middle, in such gaps (n, 3)"""
     overlap_m: float
     film_valid: NDArray[np.bool_]
     """whether the films of air move as the damping's formulas take it"""
@@ -112,7 +112,7 @@ def made(stage: StageConfig, process: Process, size: Mapping[str, Array]) -> Dev
     )  # fmt: skip
     return Devices(
         g.crank_length_m, height, projection, slider, crank, link, lateral, leaf, mass, quality, drive.gain_n_per_v2,
-        drive.ratio, sense.ratio, drive.side_gap_m, drive.side_left, stage.drive_comb.overlap_rest_m, valid,
+        drive.ratio, sense.ratio, drive.side_gap_m, drive.side_offset, stage.drive_comb.overlap_rest_m, valid,
     )  # fmt: skip
 
 
@@ -170,7 +170,7 @@ class _Comb:
         self.ratio = self.gain_n_per_v2 / drawn
         per_gap_cubed = (self.top_m + self.bottom_m) / (2.0 * (self.top_m * self.bottom_m) ** 2)
         self.side_gap_m = np.sqrt(per_gap / per_gap_cubed)
-        self.side_left = side_left(np.abs(size["finger_offset_m"]) / self.side_gap_m)
+        self.side_offset = np.abs(size["finger_offset_m"]) / self.side_gap_m
         self.shear_area_m = 2.0 * comb.finger_count * self.height_m * comb.overlap_rest_m * per_gap
 
 

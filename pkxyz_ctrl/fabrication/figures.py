@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from pkxyz_ctrl.config.stage import StageConfig
-from pkxyz_ctrl.fabrication.devices import Devices
+from pkxyz_ctrl.fabrication.devices import Devices, side_left
 from pkxyz_ctrl.fabrication.statics import pose, pose_of_strokes
 
 Array = NDArray[np.float64]
@@ -88,19 +88,35 @@ def lifting_n_per_m(devices: Devices) -> Array:
 
 
 def pull_in_stroke_m(devices: Devices) -> Array:
-    """``combs.pull_in_stroke_m`` of each chain (n, 3), with fingers that stand aside and gaps that widen."""
-    axial, half = lifting_n_per_m(devices), 0.5 * devices.overlap_m
-    side = devices.side_gap_m**2 * devices.side_left * devices.lateral_n_per_m / (2.0 * axial)
-    return np.asarray(np.sqrt(half**2 + side) - half)
+    """``combs.pull_in_stroke_m`` of each chain (n, 3), with fingers that stand aside and gaps that widen.
+
+    Fingers that stand d aside move on to D as the voltage rises, and pull the more. With u = D / g and a, k of comb and
+    lateral spring the balances are q (y_0 + q) = k g^2 / (2 a) (u - d / g) (1 - u^2) / u, of which the last that a
+    rising voltage reaches is that with the largest V^2, which goes with q (1 - u^2).
+    """
+    half, offset = 0.5 * devices.overlap_m, devices.side_offset
+    side = devices.side_gap_m**2 * devices.lateral_n_per_m / (2.0 * lifting_n_per_m(devices))
+
+    def stroke_m(u: Array) -> Array:
+        share = np.where(offset > 0.0, (u - offset) / np.where(u > 0.0, u, 1.0), 1.0)
+        return np.asarray(np.sqrt(half**2 + side * share * (1.0 - u * u)) - half)
+
+    below, above = offset, np.minimum(np.cbrt(offset) + offset, 1.0)
+    for _ in range(60):
+        u = 0.5 * (below + above)
+        stroke = stroke_m(u)
+        rises = side * (offset + offset * u * u - 2.0 * u**3) * (1.0 - u * u) > 4.0 * u**3 * stroke * (stroke + half)
+        below, above = np.where(rises, u, below), np.where(rises, above, u)
+    return stroke_m(below)
 
 
 def snap_voltage_v(devices: Devices, stroke_m: float) -> Array:
-    """Voltage (n, 3) at which a comb at a stroke snaps sideways: 2 F (y_0 + q) / g^2 reaches what the bent spring
-    holds.
+    """Voltage (n, 3) at which a comb that is held at a stroke snaps sideways: 2 F (y_0 + q) / g^2 reaches what the bent
+    spring holds, with F as of fingers in the middle.
     """
     lateral = devices.lateral_n_per_m / (1.0 + (stroke_m / (_BENT * devices.leaf_m)) ** 2)
-    pull = devices.side_left * lateral * devices.side_gap_m**2 / (2.0 * (devices.overlap_m + stroke_m))
-    return np.asarray(np.sqrt(pull / devices.comb_n_per_v2))
+    pull = side_left(devices.side_offset) * lateral * devices.side_gap_m**2 / (2.0 * (devices.overlap_m + stroke_m))
+    return np.asarray(np.sqrt(pull / (devices.comb_n_per_v2 * (1.0 - devices.side_offset**2))))
 
 
 def needed_voltage_v(devices: Devices, strokes_m: Array) -> Array:

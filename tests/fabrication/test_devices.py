@@ -174,29 +174,101 @@ def test_fingers_that_stand_aside_snap_where_no_balance_is_left(offset):
     assert side_left(np.array([offset])) == pytest.approx([-best.fun], rel=1e-9)
 
 
-def test_pull_in_is_where_side_pull_and_spring_part():
-    """The comb that holds its own stroke: side force and spring over the bending of straight fingers 0.3 um aside."""
-    device = devices(finger_offset_m=0.3e-6)
-    axial, gap, y0 = (
-        figure.lifting_n_per_m(device)[0, 0],
-        STAGE.drive_comb.finger_gap_m,
-        STAGE.drive_comb.overlap_rest_m,
-    )
-    lateral = device.lateral_n_per_m[0, 0]
+OFFSETS = [0.0, 1e-9, 0.05e-6, 0.3e-6, -0.3e-6, 2e-6]
 
-    def room(stroke):
-        """How far the spring stays above the side pull where they come nearest: below 0 there is no balance."""
-        push = 0.5 * axial * stroke * gap * (y0 + stroke)
 
-        def apart(aside):
-            return lateral * (aside - 0.3e-6) - push * (1 / (gap - aside) ** 2 - 1 / (gap + aside) ** 2)
+def unlike_chains(offset):
+    """A device whose chains have springs, gaps and fingers of their own, and the gaps."""
+    bias, wider = np.array([0.2e-6, -0.1e-6, 0.05e-6]), np.array([0.1e-6, 0.0, -0.2e-6])
+    device = devices(
+        etch_bias_m=bias, comb_gap_m=wider, youngs_modulus=[-0.08, 0.06, 0.0], hinge_m=0.4e-6, handle_m=2e-6,
+        layer_1_m=0.7e-6, finger_offset_m=[offset, 0.1e-6, 0.5 * offset],
+    )  # fmt: skip
+    return device, STAGE.drive_comb.finger_gap_m + bias + wider
 
-        best = scipy.optimize.minimize_scalar(lambda a: -apart(a * 1e-6), bounds=(0.3, 4.9), method="bounded",
-                                              options={"xatol": 1e-12})  # fmt: skip
-        return -best.fun
 
-    found = scipy.optimize.brentq(room, 50e-6, 400e-6, xtol=1e-18, rtol=1e-14)
-    assert figure.pull_in_stroke_m(device)[0] == pytest.approx([found] * 3, rel=1e-9)
+@pytest.mark.parametrize("offset", OFFSETS)
+@pytest.mark.parametrize("stroke", [0.0, 25e-6])
+def test_a_comb_snaps_at_the_voltage_at_which_its_fingers_have_no_balance_left(offset, stroke):
+    """Spring and field of one comb, its stroke held: the energy k (D - d)^2 / 2 - C V^2 / 2, C of all gaps in parallel,
+    has a minimum beside d as long as V^2 is below the largest k (D - d) / (dC/dD / 2).
+    """
+    device, gaps = unlike_chains(offset)
+    comb, f = STAGE.drive_comb, STAGE.flexures
+    height = comb.finger_height_m * (1 + 0.7e-6 / f.leaf_height_m)
+    for chain, gap in enumerate(gaps):
+        aside = abs([offset, 0.1e-6, 0.5 * offset][chain]) * 1e6
+        # a leaf straight, 2 E h w / L, in series with one that is bent, 200 E h w^3 / (36 L q^2 / 3)
+        bent = 1.0 + 36.0 * stroke**2 / (100.0 * device.leaf_m[0, chain] ** 2)
+        lateral = device.lateral_n_per_m[0, chain] / bent
+        of = comb.finger_count * EPSILON_0_F_PER_M * height * (comb.overlap_rest_m + stroke)
+
+        def squared_v2(d_um, aside=aside, gap=gap, lateral=lateral, of=of):
+            d = d_um * 1e-6
+            return lateral * (d - aside * 1e-6) / (0.5 * of * (1 / (gap - d) ** 2 - 1 / (gap + d) ** 2))
+
+        if aside == 0.0:
+            most = lateral / (0.5 * of * 4 / gap**3)
+        else:
+            best = scipy.optimize.minimize_scalar(
+                lambda d: -squared_v2(d), bounds=(aside, 0.999e6 * gap), method="bounded", options={"xatol": 1e-11}
+            )
+            most = -best.fun
+        assert figure.snap_voltage_v(device, stroke)[0, chain] == pytest.approx(np.sqrt(most), rel=1e-9)
+
+
+def lifting_of_energy(device):
+    """Force of each comb over the stroke that all three have (3,), in N/m, at rest: of the energy alone."""
+
+    def strokes(x):
+        return np.stack([
+            c * x[0] + s * x[1] - np.sqrt(d**2 + z0**2 - (z0 + x[2]) ** 2) - np.sqrt(l1**2 - (c * x[1] - s * x[0]) ** 2)
+            for c, s, d in zip(np.cos(ways), np.sin(ways), device.projection_m[0] * 1e4, strict=True)
+        ])  # fmt: skip
+
+    ways, l1, z0 = np.radians([90.0, 210.0, 330.0]), device.crank_m * 1e4, device.height_m[0] * 1e4
+    stiffness = hessian(energy_of(device, 0), np.zeros(3), initial_step=0.3, order=10).ddf * 0.1
+    moves = jacobian(strokes, np.zeros(3), initial_step=0.3, order=10).df
+    return np.linalg.solve(moves.T, stiffness @ np.linalg.solve(moves, np.ones(3)))
+
+
+@pytest.mark.parametrize("offset", OFFSETS)
+def test_pull_in_of_unlike_chains_is_where_the_energy_loses_its_minimum(offset):
+    """Stroke q and fingers' way aside D of one comb at a voltage: a q^2 / 2 + k (D - d)^2 / 2 - P (y_0 + q) c(D), with
+    c = 1 / (g - D) + 1 / (g + D) and P that goes with V^2. At the largest P of the balances it is flat in a direction.
+    """
+    device, gaps = unlike_chains(offset)
+    axial, y0 = lifting_of_energy(device), STAGE.drive_comb.overlap_rest_m * 1e6
+    assert figure.lifting_n_per_m(device)[0] == pytest.approx(axial, rel=1e-9)
+    assert np.ptp(axial) > 0.01 * axial[0]
+    for chain, (g, a) in enumerate(zip(gaps * 1e6, axial, strict=True)):
+        d, k = abs([offset, 0.1e-6, 0.5 * offset][chain]) * 1e6, device.lateral_n_per_m[0, chain]
+
+        def derivatives(x, g=g, a=a, k=k, d=d):
+            """Of the energy: by q, by D, and the determinant of the second ones, each over its own size."""
+            q, aside, p = x
+            near, far = 1 / (g - aside), 1 / (g + aside)
+            c, slope, bend = near + far, near**2 - far**2, 2 * (near**3 + far**3)
+            flat = a * (k - p * (y0 + q) * bend) - (p * slope) ** 2
+            return [1 - p * c / (a * q), 1 - p * (y0 + q) * slope / (k * (aside - d)), flat / (a * k)]
+
+        if d == 0.0:  # straight until P (y_0 + q) c'' = k, where P c = a q
+            found = max(np.roots([2 * a / g**2, 2 * a * y0 / g**2, -k]))
+        else:
+            begin = largest_balance(g, a, k, d, y0)
+            found = scipy.optimize.root(derivatives, begin, method="hybr", options={"xtol": 1e-14}).x[0]
+            assert found == pytest.approx(begin[0], rel=1e-2)
+        assert figure.pull_in_stroke_m(device)[0, chain] * 1e6 == pytest.approx(found, rel=1e-9)
+
+
+def largest_balance(g, a, k, d, y0):
+    """q, D and P of the balance with the largest P, of many."""
+    aside = d + (g - d) * np.linspace(0.0, 0.9, 200_001)[1:]
+    near, far = 1 / (g - aside), 1 / (g + aside)
+    turned = k * (aside - d) * (near + far) / (a * (near**2 - far**2))  # q (y_0 + q)
+    q = np.sqrt(0.25 * y0**2 + turned) - 0.5 * y0
+    p = a * q / (near + far)
+    return [v[np.argmax(p)] for v in (q, aside, p)]
 
 
 def test_a_tenth_of_a_um_makes_four_per_cent_of_stiffness():
