@@ -181,7 +181,7 @@ def evaluate(problem: DrawingProblem, choice: Choice) -> Verdict:
         share = float(asked.wafers.columns(range(OWN_WAFERS))["ok"].mean())
         if share < OWN_LEAST:
             return Verdict(beyond, share - 1.0, {"own": share})
-        rows = [asked.device(int(n)) for n in _devices(asked, problem.loops)]
+        rows = [row for some in _devices(asked, problem.loops) for row in asked.devices(some)]
     except (ConfigError, DesignError, LawError) as error:
         return Verdict(beyond, reason=str(error))
     found = {name: np.array([row[name] for row in rows]) for name in rows[0]}
@@ -210,6 +210,6 @@ def least_room(found: Mapping[str, NDArray[np.generic]], bounds: Mapping[str, Bo
     return np.asarray(np.min(rooms, axis=0))
 
 
-def _devices(asked: ClosedLoops, count: int) -> NDArray[np.int64]:
-    parts = [asked.numbers(part) for part in range(-(-count // PART_DEVICES))]
-    return np.concatenate(parts)[:count]
+def _devices(asked: ClosedLoops, count: int) -> list[NDArray[np.int64]]:
+    """Numbers of so many devices, as many at once as in a part of a study."""
+    return [asked.numbers(part)[: count - part * PART_DEVICES] for part in range(-(-count // PART_DEVICES))]

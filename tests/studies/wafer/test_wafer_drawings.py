@@ -9,8 +9,10 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from process_rig import SHIPPED, STAGE, process
 
+from hil.bench.study import short_scan
 from hil.runs.scenario import load_scenario
 from hil.studies.spread.trials import judged
+from hil.studies.wafer.closed_loop import PART_DEVICES, ClosedLoops
 from hil.studies.wafer.drawing import FINGER_M, OPEN, DrawingProblem, evaluate, least_room, working
 from hil.studies.wafer.drawing_search import Confirmed, best, gained, nearest, open_study, search
 from hil.studies.wafer.effects import MEAN, effects, standard_deviation
@@ -73,6 +75,24 @@ def test_what_is_kept_is_valued_by_devices_that_work():
     assert found.figures["works"] in (0.0, 0.5, 1.0)  # of two devices
     assert found.figures["works"] < found.value < found.figures["works"] + 0.5
     assert all(beyond < 0.0 for beyond in found.constraints.values())
+
+
+def test_devices_of_a_choice_are_run_together_to_the_bits_of_each_alone(monkeypatch):
+    """A part and two more."""
+    asked = problem(loops=PART_DEVICES + 2, scenario=short_scan())
+    together, at_once = ClosedLoops.devices, []
+
+    def noted(self, numbers):
+        at_once.append(len(numbers))
+        return together(self, numbers)
+
+    monkeypatch.setattr(ClosedLoops, "devices", noted)
+    found = evaluate(asked, drawn())
+    assert at_once == [PART_DEVICES, 2]
+    monkeypatch.setattr(ClosedLoops, "devices", lambda self, numbers: [together(self, numbers[[n]])[0] for n in
+                                                                      range(len(numbers))])  # fmt: skip
+    assert evaluate(asked, drawn()) == found
+    assert found.figures["room"] != 0.0
 
 
 def test_a_drawing_gets_the_law_that_leaves_it_the_lowest_peak():
