@@ -76,18 +76,11 @@ def calibrate(
     """Fit to what was measured about ``strokes_m`` (3,), true to ``sense``. Gains of the sense combs that were only
     assumed give way to reciprocity, if that contradicts them. Raises ``FitError`` for another device.
     """
-    late = modes.resonances_covariance
-    root = np.linalg.cholesky(modes.gains_covariance if late is None else late)
-    seen = np.concatenate([modes.static_gain.ravel(), modes.acceleration_gain.ravel()])
-    if late is not None:  # a sense chain's pole leaves sudden gains in doubt by per cents, resonances not
-        seen = np.concatenate([seen, modes.frequency_hz[modes.apart]])
+    seen, root = _measured(modes)
 
     def misses(unknown: Array) -> Array:
         stage = Stage(config.model_copy(update={"calibration": _numbers(unknown, sense.gain)}))
-        told = gains(stage, strokes_m, farad_per_count).ravel()
-        if late is not None:
-            told = np.concatenate([told, resonances_hz(stage, strokes_m, modes.apart)])
-        return np.asarray(np.linalg.solve(root, told - seen))
+        return np.asarray(np.linalg.solve(root, _told(stage, strokes_m, farad_per_count, modes) - seen))
 
     def fitted(start: Array) -> tuple[Array, Array, float]:
         fit = scipy.optimize.least_squares(misses, start, x_scale=0.01)
@@ -132,6 +125,25 @@ def calibrate(
     except ValidationError as error:
         wrong = ", ".join(f"{item['loc'][0]} = {item['input']:.3g}" for item in error.errors())
         raise FitError(f"the stage is not this drawing: {wrong} by it; give the right --stage") from None
+
+
+def _measured(modes: ModalFit) -> tuple[Array, Array]:
+    """What is fitted to, (18,), and the root of its covariance; resonances too, (18 + n,), where a sense chain's pole
+    leaves sudden gains in doubt by per cents.
+    """
+    seen = np.concatenate([modes.static_gain.ravel(), modes.acceleration_gain.ravel()])
+    covariance = modes.gains_covariance
+    if modes.resonances_covariance is not None:
+        seen, covariance = np.append(seen, modes.frequency_hz[modes.apart]), modes.resonances_covariance
+    return seen, np.asarray(np.linalg.cholesky(covariance))
+
+
+def _told(stage: Stage, strokes_m: Array, farad_per_count: float, modes: ModalFit) -> Array:
+    """The same by the model."""
+    told = gains(stage, strokes_m, farad_per_count).ravel()
+    if modes.resonances_covariance is None:
+        return told
+    return np.append(told, resonances_hz(stage, strokes_m, modes.apart))
 
 
 def gains(stage: Stage, strokes_m: Array, farad_per_count: float) -> Array:
