@@ -63,3 +63,11 @@ def test_the_default_law_beats_the_open_loop_on_every_device_that_is_not_as_draw
 def test_on_the_stage_as_drawn_it_loses_next_to_nothing(scenario):
     """There no feedback could be better than none, as all that it sees is noise: 0.3 nm at most, worst axis."""
     assert max(errors_nm(scenario, "nominal", "youla")) <= max(errors_nm(scenario, "nominal", "open_loop")) + 0.3
+
+
+@pytest.mark.parametrize("scenario", [m for m in MOTIONS if m != "frames"])
+def test_in_a_hold_on_the_stage_as_drawn_it_loses_what_rejection_costs(scenario):
+    """Two-sided: 0.6 to 0.9 nm, and 1.05 in all, where 0.3 were asked for; docs/understand/margins.md has the trade."""
+    ours, nothing = (max(holds_nm(scenario, "nominal", law)) for law in ("youla", "open_loop"))
+    assert 0.5 < ours - nothing < 0.75
+    assert ours < 1.05
