@@ -1,34 +1,43 @@
-"""Fills in the README's table of what is reached: the default scenario on each shipped plant, with three laws.
+"""Fills in the README's tables of what is reached: the default scenario at each place, with the default law and without
+feedback; and how the loop answers there, as benchmarked.
 
 python docs/tables/readme.py
 """
 
+import json
 from collections.abc import Iterator, Mapping
 from functools import cache
 from pathlib import Path
 
+from hil.bench.rigs.places import setup_at
 from hil.lanes import in_process as lanes
 from hil.lanes.lane import Lane
 from hil.runs.metrics import Metrics, RowFigures
-from hil.runs.scenario import load_scenario
 
 ROOT = Path(__file__).parents[2]
 PAGE = ROOT / "README.md"
-PLANTS = {
-    "nominal": ("raster", "nominal: as the stage file says"),
-    "mild": ("raster_mild", "mild: some per cent of mismatch, 200 ppm of sense gain"),
-    "lab": ("raster_lab", "lab: a good stage on a good table in a real room, 100 us of sense filter"),
-    "harsh": ("raster_harsh", "harsh: 10 % mismatch, strong parasitic mode, charging, drift"),
+RESULTS = ROOT / "benchmarks" / "results.json"
+PLACES = {
+    "nominal": "nominal: as the stage file says",
+    "mild": "mild: some per cent of mismatch, 200 ppm of sense gain",
+    "lab": "lab: a good stage on a good table in a real room, 100 us of sense filter",
+    "lab_identified": "identified",
+    "harsh": "harsh: 10 % mismatch, strong parasitic mode, charging, drift",
 }
-LAWS = ("open_loop", "youla", "lqg")
+ANSWERS = {
+    "move": ("1 um move, within 10 nm", "ms"),
+    "jump": ("1 um jump of the set-point, likewise", "ms"),
+    "sine": ("100 nm at 1262 Hz, twice the first resonance, off by", "dB"),
+    "circle": ("circle of 4 um radius at 100 Hz, rms", "nm"),
+}
 
 
 @cache
-def figures(scenario: str, controller: str) -> RowFigures:
+def figures(place: str, controller: str) -> RowFigures:
     """Figures of a run of the fast lane, in nm by axis; its bits are those of lockstep."""
-    loaded = load_scenario(scenario, controller=controller)
-    metrics = Metrics(loaded.trajectory, loaded.bus.period_us)
-    lanes.run(loaded.setup(), Lane.FAST, on_block=metrics.update)
+    setup = setup_at("raster", place, controller)
+    metrics = Metrics(setup.trajectory, setup.bus.period_us)
+    lanes.run(setup, Lane.FAST, on_block=metrics.update)
     return metrics.figures()
 
 
@@ -42,20 +51,49 @@ def three(values: Mapping[str, float]) -> str:
 
 
 def rows() -> Iterator[str]:
-    """The table's lines."""
-    yield "| plant | without feedback | default law `youla` | law `lqg` | hold noise, `youla` |"
-    yield "| --- | --- | --- | --- | --- |"
-    for scenario, words in PLANTS.values():
-        cells = [three(figures(scenario, law).rms_error_nm) for law in LAWS]
-        noise = f"{max(figures(scenario, 'youla').hold_noise_nm.values()):.1f} nm"
-        yield f"| {words} | {' | '.join(cells)} | {noise} |"
+    """The first table's lines."""
+    yield "| plant | without feedback | default law `youla` | its holds: error, noise |"
+    yield "| --- | --- | --- | --- |"
+    for place, words in PLACES.items():
+        cells = [three(figures(place, law).rms_error_nm) for law in ("open_loop", "youla")]
+        held = figures(place, "youla")
+        worst, noise = (max(of_axes.values()) for of_axes in (held.hold_rms_nm, held.hold_noise_nm))
+        yield f"| {words} | {' | '.join(cells)} | {worst:.1f}, {noise:.1f} nm |"
+
+
+def answers() -> Iterator[str]:
+    """The second table's."""
+    kept = {f["name"]: f for f in json.loads(RESULTS.read_text(encoding="utf-8"))["figures"]}
+    places = [place for place in PLACES if place != "harsh"]
+    yield f"| with the default law (without feedback) | {' | '.join(place.replace('_', ', ') for place in places)} |"
+    yield f"| --- |{' --- |' * len(places)}"
+    for name, (words, unit) in ANSWERS.items():
+        cells = []
+        for place in places:
+            figure = kept[f"beside.{name}_{place}"]
+            ours, _, alone = figure["detail"].partition("; open loop ")
+            cells.append(f"{figure['value']:.1f} ({beside(name, ours, alone)}) {unit}")
+        yield f"| {words} | {' | '.join(cells)} |"
+
+
+def beside(name: str, ours: str, alone: str) -> str:
+    """What the open loop has, in the axis that is told of the law."""
+    if name in ("move", "jump"):
+        return "never" if alone.startswith("not") else alone.removesuffix(" ms")
+    if name == "sine":
+        return f"{max(abs(float(v)) for v in alone.split(', ')):.1f}"
+    axis = "xyz".index(ours.split(", in ")[1][0])
+    value = float(alone.split(" / ")[axis])
+    return f"{value:.1f}" if value < 10.0 else f"{value:.0f}"
 
 
 def filled_in(page: str) -> str:
-    """The page with the current table."""
-    before, _, rest = page.partition("<!-- generated: reached -->\n")
-    after = rest.partition("<!-- end -->")[2]
-    return f"{before}<!-- generated: reached -->\n" + "\n".join(rows()) + f"\n<!-- end -->{after}"
+    """The page with the current tables."""
+    for name, lines in (("reached", rows()), ("answers", answers())):
+        before, _, rest = page.partition(f"<!-- generated: {name} -->\n")
+        after = rest.partition("<!-- end -->")[2]
+        page = f"{before}<!-- generated: {name} -->\n" + "\n".join(lines) + f"\n<!-- end -->{after}"
+    return page
 
 
 if __name__ == "__main__":
