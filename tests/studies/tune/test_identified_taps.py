@@ -25,14 +25,19 @@ def answered(*arguments):
 
 
 @pytest.mark.slow
-def test_a_stage_that_was_identified_is_rejected_on_to_280_hz(tmp_path):
-    """The plant mild, by both commands: |S| < -3 dB to 280 Hz at Ms 2, and Ms 3 where stiffness is off by 3 %; what is
-    designed runs on the device. Two-sided, as an unexplained improvement is an error too.
+@pytest.mark.parametrize(
+    ("plant", "drawn", "hold_nm", "most_nm"),
+    [("mild", "reconstructed", (0.98, 0.99), 3.5), ("lab", "lab", (1.27, 1.22), 4.5)],
+)
+def test_a_stage_that_was_identified_is_rejected_on_to_280_hz(plant, drawn, hold_nm, most_nm, tmp_path):
+    """By both commands: |S| < -3 dB to 280 Hz at Ms 2, and Ms 3 where stiffness is off by 3 %, behind 100 us of sense
+    lag too, where it costs noise; what is designed runs on the device. Two-sided, as an unexplained improvement is an
+    error too.
     """
-    answered("identify", "--plant", "mild", "--out", tmp_path / "found")
+    answered("identify", "--stage", drawn, "--plant", plant, "--out", tmp_path / "found")
     file = tmp_path / "found" / "stage.toml"
     noise_nm = answered("tune", "youla_identified", "--stage", file, "--out", tmp_path)["hold_noise_nm"]
-    assert [noise_nm["plane"], noise_nm["z"]] == pytest.approx([0.98, 0.99], abs=0.03)
+    assert [noise_nm["plane"], noise_nm["z"]] == pytest.approx(hold_nm, abs=0.03)
     taps = tmp_path / "youla_identified_tuned.toml"
     stage = Stage.load(str(file))
     assert stage.config.calibration.comb_gain != (1.0, 1.0, 1.0)
@@ -44,6 +49,6 @@ def test_a_stage_that_was_identified_is_rejected_on_to_280_hz(tmp_path):
     assert 1.9 < max(loop.peak_sensitivity(case) for case in off) <= 3.0
     tolerances = load("tolerances", "identified", Tolerances)
     assert max(loop.peak_sensitivity(tolerances.sample(seed)) for seed in range(1, 41)) <= 3.0
-    run = hil.run(hil.load_scenario("raster_mild", stage=str(file), controller=str(taps)))
+    run = hil.run(hil.load_scenario(f"raster_{plant}", stage=str(file), controller=str(taps)))
     assert run.ok, run.summary
-    assert 1.0 < np.max(list(run.summary["rms_error_nm"].values())) < 3.5
+    assert 1.0 < np.max(list(run.summary["rms_error_nm"].values())) < most_nm
