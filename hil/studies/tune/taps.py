@@ -111,15 +111,18 @@ def _within(search: TapsSearch, asked: TapBounds, which: str, on_progress: Calla
     axes = {}
     for axis, name in ((0, f"x and y{which}"), (2, f"z{which}")):
         try:
-            axes[axis] = _axis_taps(search, asked, axis, lambda line, name=name: on_progress(f"{name}: {line}"))  # type: ignore[misc]
+            axes[axis] = find_axis_taps(search, asked, axis, lambda line, name=name: on_progress(f"{name}: {line}"))  # type: ignore[misc]
         except LawError as error:
             raise ConfigError(f"search {search.name!r}: {name}: {error}") from error
     return FoundTaps(_rounded(axes[0][0]), _rounded(axes[2][0]), (axes[0][1], axes[2][1]))
 
 
-def _axis_taps(
+def find_axis_taps(
     search: TapsSearch, asked: TapBounds, axis: int, on_progress: Callable[[str], None]
 ) -> tuple[Array, float]:
+    """Taps (n,) in N/m of an axis within bounds of its own, and the deviation at hold in m. Raises ``LawError`` where
+    there are none.
+    """
     stage, bus = Stage.load(search.stage), config.load("buses", search.bus, BusConfig)
     controller = config.load("controllers", search.controller, ControllerConfig)
     tolerances = config.load("tolerances", search.tolerances, Tolerances)

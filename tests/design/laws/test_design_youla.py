@@ -1,5 +1,7 @@
 """The law youla against all its goals, on changed and sampled devices, and the cone programmes that found its taps."""
 
+import json
+import runpy
 from pathlib import Path
 
 import numpy as np
@@ -21,6 +23,8 @@ from pkxyz_ctrl.design.margins.tolerances import Case, Tolerances
 from pkxyz_ctrl.design.model.discrete_law import response
 from pkxyz_ctrl.design.model.loop_plant import NOMINAL, Perturbation, loop_plant
 from pkxyz_ctrl.stage import Stage
+
+ROOT = Path(__file__).parents[3]
 
 
 def loop_of(config):
@@ -114,6 +118,29 @@ def test_for_an_identified_stage_slow_disturbances_may_be_rejected_further():
     x, _, z = (f"{1e9 * value:.2f}" for value in hold_noise_m(stage(), bus(), plant, about))
     assert (x, z) == ("1.03", "1.05")
     assert f"{x} nm of noise in x and y, {z} in z" in path.read_text(encoding="utf-8")
+
+
+def test_with_the_changed_plants_slow_disturbances_cost_the_rejection_up_to_202_hz():
+    """As ``docs/tables/rejecting.py`` has kept it: at 202 Hz the programmes never come to taps that concede nothing,
+    at 70 Hz the last ones do. The first of them again.
+    """
+    made = runpy.run_path(str(ROOT / "docs" / "tables" / "rejecting.py"))
+    slow, wide = json.loads(made["KEPT"].read_text(encoding="utf-8"))
+    assert (slow["edge_hz"], wide["edge_hz"]) == made["EDGES_HZ"]
+    assert slow["noise_nm"] == pytest.approx(0.89, abs=0.02)
+    assert slow["conceded"][-1] == 0.0
+    assert (wide["noise_nm"], len(wide["conceded"])) == (None, 16)
+    assert min(wide["conceded"]) > 0.2
+
+    def stop(line):
+        again.append(line)
+        raise InterruptedError
+
+    for kept in (slow, wide):
+        again = []
+        with pytest.raises(InterruptedError):
+            made["found"](kept["edge_hz"], stop)
+        assert f"{kept['conceded'][0]:.3f} conceded" in again[0]
 
 
 def behind_a_slow_filter(config):
