@@ -57,9 +57,11 @@ MOTIONS = {"moves": corner_to_corner, "circles": circles}
 
 
 @cache
-def designed(motion: str, law: str) -> tuple[Study, Setup]:
+def designed(motion: str, law: str, bus: str | None = None) -> tuple[Study, Setup]:
     """The study that samples devices, and a setup with its law designed."""
-    scenario: Scenario = load_scenario("faults" if motion in MOTIONS else motion, controller=law, bus=BUSES.get(law))
+    scenario: Scenario = load_scenario(
+        "faults" if motion in MOTIONS else motion, controller=law, bus=bus or BUSES.get(law)
+    )
     setup = scenario.setup()
     if motion in MOTIONS:
         way = MOTIONS[motion]()

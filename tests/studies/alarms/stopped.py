@@ -1,82 +1,130 @@
-"""Sampled devices that are stopped in the middle of a scan: how often they meet their stops.
+"""Sampled devices that are stopped on their way, led down or at once: which of them meet their mechanical stops.
 
-python tests/studies/alarms/stopped.py circle youla 500 [unix_1k]
+python tests/studies/alarms/stopped.py [LAW ...] [--devices 500] [--motions raster,moves]
+
+A line of docs/tables/stops.jsonl for each law and motion; what has as many devices already is left alone.
 """
 
+import argparse
 import dataclasses
-import sys
-from functools import cache
+import time
+from pathlib import Path
+from typing import Any, NamedTuple
 
 import numpy as np
+from sampled import BEFORE_TICKS, MOTIONS, SCENARIOS, designed, read, write
+from sampled import KEPT as ALARMS
 
 from hil.lanes.fast import runner_of
 from hil.lanes.in_process import instants_us
-from hil.lanes.setup import Setup
-from hil.runs.scenario import load_scenario
-from hil.studies.montecarlo import Study
-from pkxyz_ctrl.config.files import load
-from pkxyz_ctrl.design.margins.tolerances import Tolerances
+from pkxyz_ctrl.config.files import ConfigError
 from pkxyz_ctrl.loop.cycle import new_memory
 from pkxyz_ctrl.loop.reference import reference_rows
 from pkxyz_ctrl.loop.row import ROW
 from pkxyz_ctrl.safety.modes import Mode
 from pkxyz_ctrl.safety.trips import Trip
+from pkxyz_ctrl.trajectory import Trajectory
 
-SPREAD_S, AFTER_S = 0.015, 0.02
-"""The instants lie so close together, a period and a half of the circle; each stop is looked at for so long."""
-
-
-@cache
-def study(scenario: str, law: str, bus: str) -> Study:
-    return Study(load_scenario(scenario, controller=law, bus=bus), load("tolerances", "wide", Tolerances))
+KEPT = ALARMS.with_name("stops.jsonl")
+INSTANTS, AFTER_S = 8, 0.02
+"""Of a device, drawn by its seed; each stop is looked at for so long."""
 
 
-@cache
-def designed(scenario: str, law: str, bus: str) -> Setup:
-    return study(scenario, law, bus).scenario.setup()
+class Stop(NamedTuple):
+    """Of a device, at one instant."""
+
+    hits: int
+    """led down by an operator's stop"""
+    lowest_m: float
+    """... its lowest stroke"""
+    hits_at_once: int
+    """with 0 V at once"""
+    is_beyond: bool
+    """its combs were at their limits before, so it was not where it was to be"""
 
 
-def stopped(
-    scenario: str, law: str, seed: int, trip: Trip, instants: int = 4, bus: str = "fd_5k"
-) -> list[tuple[int, float]]:
-    """Of each stop its hits and the lowest stroke in m; none where the device faults before."""
-    base = designed(scenario, law, bus)
+def way_us(trajectory: Trajectory) -> tuple[int, int]:
+    """From the first scan or jump to the last one's end; of moves, from the one that leaves mid-workspace."""
+    segments = [s for s in trajectory.segments if s.scan_us or s.jumps_us]
+    segments = segments or [s for s in trajectory.segments if s.kind == "move"][1:]
+    return segments[0].t_start_us, segments[-1].t_end_us
+
+
+def stops(motion: str, law: str, seed: int, instants: int = INSTANTS, bus: str | None = None) -> list[Stop]:
+    """Those of the device of a seed; fewer where it faults before."""
+    study, base = designed(motion, law, bus)
+    setup = dataclasses.replace(base, plant=study.sampled(seed).plant, seed=seed)
+    vars(setup)["law"] = base.law
     period_us = base.bus.period_us
-    setup = dataclasses.replace(base, plant=study(scenario, law, bus).sampled(seed).plant, seed=seed)
-    segment = next(s for s in base.trajectory.segments if s.scan_us or s.jumps_us)
-    begin = (segment.t_start_us + 40_000) // period_us
-    at = np.linspace(begin, begin + round(SPREAD_S * 1e6) // period_us, instants).astype(int)
-    rows = np.zeros(4096, ROW)
-    reference = reference_rows(base.trajectory.sample(0, int(at[-1]) + 400, period_us))
+    begin, end = (t_us // period_us for t_us in way_us(base.trajectory))
+    at = np.sort(np.random.default_rng(seed).integers(begin, end, instants))
+    rows = np.zeros(max(20, end), ROW)
+    reference = reference_rows(base.trajectory.sample(0, end + 400, period_us))
     plant, memory = setup.new_plant(), new_memory(Mode.IDLE)
-    run_block = runner_of(base.law)
-    done, found = 0, []
+    run_block, after = runner_of(base.law), round(AFTER_S * 1e6) // period_us
+    done, found, saturated = 0, [], np.zeros(0)
     for target in at:
         while (ahead := int(target) - int(memory["reference_tick"][0])) > 0:
             count = ahead if memory["mode"][0] == Mode.TRACKING else 20
             sample_us = instants_us(setup, done, count)
             run_block(base.law, memory, reference, plant.params, plant.state, sample_us, rows, count)
             done += count
+            saturated = np.concatenate([saturated, rows["saturated"][:count]])[-BEFORE_TICKS:]
             if memory["mode"][0] == Mode.FAULT:
                 return found
-        state, left = plant.state.copy(), memory.copy()
-        left["input"]["trips"] = int(trip)
-        count = round(AFTER_S * 1e6) // period_us
-        sample_us = instants_us(setup, done, count)
-        run_block(base.law, left, reference, plant.params, state, sample_us, rows, count)
-        assert left["mode"][0] == Mode.FAULT
-        hits = int(state["event_count"][0]) - int(plant.state["event_count"][0])
-        found.append((hits, float(rows["stroke_m"][:count].min())))
+        sample_us, hits, lowest_m = instants_us(setup, done, after), [], 0.0
+        for trip in (Trip.GATE_BLOCKED, Trip.OPERATOR):
+            state, left = plant.state.copy(), memory.copy()
+            left["input"]["trips"] = int(trip)
+            run_block(base.law, left, reference, plant.params, state, sample_us, rows, after)
+            assert left["mode"][0] == Mode.FAULT
+            hits.append(int(state["event_count"][0]) - int(plant.state["event_count"][0]))
+            lowest_m = float(rows["stroke_m"][:after].min())
+        found.append(Stop(hits[1], lowest_m, hits[0], bool(saturated.mean() > 0.5)))
     return found
 
 
-def main(scenario: str, law: str, devices: int, bus: str = "fd_5k") -> None:
-    for trip in (Trip.OPERATOR, Trip.GATE_BLOCKED):
-        found = [stop for seed in range(devices) for stop in stopped(scenario, law, seed, trip, 8, bus)]
-        with_hits = sum(hits > 0 for hits, _ in found)
-        lowest_um = min(low for _, low in found) * 1e6
-        print(f"{trip.name}: {len(found)} stops, {with_hits} meet a mechanical stop, lowest stroke {lowest_um:.2f} um")
+def study_of(motion: str, law: str, devices: int) -> dict[str, Any]:
+    """What is kept of a law and motion: devices (by seed) that hit, also from beyond their reach, and those that had
+    faulted before an instant.
+    """
+    found = {seed: stops(motion, law, seed) for seed in range(1, devices + 1)}
+    each = [stop for of_device in found.values() for stop in of_device]
+    return {
+        "motion": motion,
+        "law": law,
+        "devices": devices,
+        "stops": len(each),
+        "hits": [seed for seed, of_device in found.items() if any(s.hits and not s.is_beyond for s in of_device)],
+        "beyond": [seed for seed, of_device in found.items() if any(s.hits and s.is_beyond for s in of_device)],
+        "before": [seed for seed, of_device in found.items() if len(of_device) < INSTANTS],
+        "lowest_um": round(1e6 * min(stop.lowest_m for stop in each), 3),
+        "hits_at_once": sum(stop.hits_at_once > 0 for stop in each),
+    }
+
+
+def main() -> None:
+    """Go through what is missing in the file of results."""
+    parser = argparse.ArgumentParser()
+    parser.add_argument("laws", nargs="*", default=["youla"])
+    parser.add_argument("--devices", type=int, default=500)
+    parser.add_argument("--motions", default=",".join((*MOTIONS, *SCENARIOS)))
+    parser.add_argument("--results", type=Path, default=KEPT)
+    asked = parser.parse_args()
+    known = read(asked.results)
+    for motion in asked.motions.split(","):
+        for law in asked.laws:
+            if known.get((motion, law), {"devices": 0})["devices"] >= asked.devices:
+                continue
+            begin_s = time.process_time()
+            try:
+                known[motion, law] = study_of(motion, law, asked.devices)
+            except ConfigError as error:
+                print(f"{law} in {motion}: {error}", flush=True)
+                continue
+            write(asked.results, known)
+            print(known[motion, law], f"{time.process_time() - begin_s:.0f} s", flush=True)
 
 
 if __name__ == "__main__":
-    main(sys.argv[1], sys.argv[2], int(sys.argv[3]), *sys.argv[4:])
+    main()
