@@ -37,27 +37,34 @@ KEYS: Final[dict[str, tuple[str, str]]] = {
 """Keys of each kind of segment that mend what could not even be held there, and what is too fast."""
 
 
+MOTION_SHARE: Final = 0.9
+"""Of the slew limit, for planned motions. The rest is the feedback's: a loop whose reference takes all of it lags in
+every answer, and from 1 kHz on swings up to a fault where the device is not quite as drawn.
+"""
+
+
 class DriveLimits(NamedTuple):
-    """What the controller allows itself at the combs."""
+    """What a planned motion may ask of the combs."""
 
     voltage_max_v: float
     slew_max_v_per_s: float
-    """most that a commanded voltage may change, as a rate; a period gets its share"""
+    """most that a voltage may change, as a rate; a period gets its share"""
     period_us: int
 
     @classmethod
     def of(cls, controller: ControllerConfig, bus: BusConfig) -> Self:
-        """Those of a controller file, on a bus."""
-        return cls(controller.limits.voltage_max_v, controller.limits.slew_max_v_per_s, bus.period_us)
+        """Those of a controller file, on a bus: of its slew limit, ``MOTION_SHARE``."""
+        limits = controller.limits
+        return cls(limits.voltage_max_v, MOTION_SHARE * limits.slew_max_v_per_s, bus.period_us)
 
 
 def check_against(stage: Stage, trajectory: Trajectory, drive: DriveLimits | None = None) -> None:
     """Raise ``TrajectoryError`` at the first segment that the stage can't follow, naming what is worst in it.
 
     Links close, strokes are in range, and the comb forces that hold, brake and accelerate the platform,
-    B^-T (grad V + C v + m a), are pulls within the voltage limit. With ``drive`` they are also within the controller's,
-    and voltages change by no more than its slew limit from any instant to a period later; announced jumps are left out
-    of that. Looked at where each segment comes to rest, every 100 us or closer, 40 times in a period of the highest
+    B^-T (grad V + C v + m a), are pulls within the voltage limit. With ``drive`` they are also within its own, and
+    voltages change by no more than its slew from any instant to a period later; announced jumps are left out of that.
+    Looked at where each segment comes to rest, every 100 us or closer, 40 times in a period of the highest
     frequency, and at the very end.
     """
     for n, segment in enumerate(trajectory.segments):
@@ -193,7 +200,7 @@ def _too_fast(
         return None
     why = (
         f"the voltage of comb {comb + 1} would have to change by {change[n, comb]:.4g} V within a period of "
-        f"{drive.period_us} us, beyond the slew limit of {share_v:.4g} V ({drive.slew_max_v_per_s:g} V/s)"
+        f"{drive.period_us} us, beyond the slew limit of {share_v:.4g} V ({drive.slew_max_v_per_s:g} V/s) for a motion"
     )
     return _Beyond(_SLEW, float(change[n, comb]), rows[lag:][n, 0:3], why)
 
