@@ -31,14 +31,19 @@ def chosen_law(stage: Stage, controller: ControllerConfig, bus: BusConfig) -> tu
     """The law pi_notch, irc, hinf or linear of a controller, and its margins at the operating strokes.
 
     Raises ``LawError`` where it can't be designed, and ``UnstableLawError`` where it is unstable with the sampled,
-    delayed stage, at full authority or on the way there, or bears less than a quarter of a period more delay.
+    delayed stage, at full authority or on the way there, or bears less than a quarter of a period more delay. A stage
+    file says how much its sense chain lags, and not by what: as a filter and as a delay it has to do.
     """
-    plant = loop_plant(stage, bus, controller.operating_strokes_m)
+    strokes = controller.operating_strokes_m
+    plant, late = loop_plant(stage, bus, strokes), loop_plant(stage, bus, strokes, sense_lag="delay")
     law = _law(stage, controller, bus, plant)
     found = require_robust(law, plant)
+    if stage.sense_delay_s > 0.0:
+        require_robust(law, late)
     unwind = unwinding(law, plant)
     for share in SHARES:
-        radius = spectral_radius(plant, at_authority(law, unwind, share))
+        tried = at_authority(law, unwind, share)
+        radius = max(spectral_radius(plant, tried), spectral_radius(late, tried))
         if radius >= 1.0:
             raise UnstableLawError(
                 f"refused: the loop is stable, but not while its authority fades in (at {share:.0%} the spectral "
@@ -53,7 +58,7 @@ def _law(stage: Stage, controller: ControllerConfig, bus: BusConfig, plant: Loop
     if controller.irc is not None:
         return irc(plant, controller.irc)
     if controller.hinf is not None:
-        weights = controller.hinf
+        weights, plant = controller.hinf, loop_plant(stage, bus, plant.strokes_m, sense_lag="amplifier")
         return hinf(plant, (weights.plane, weights.plane, weights.z), weights.factor).law
     if controller.linear is not None:
         return linear_law(controller.linear, bus.period_s)

@@ -2,17 +2,18 @@
 
 Linear about one point of the workspace, and exactly sampled. With w the force asked for at sample k::
 
-    m x'' + C x' + (K - G) x = f,   tau f' = E w(k - d) - f,   y = x - tau_s x'
+    m x'' + C x' + (K - G) x = f,   tau f' = E w(k - d) - f,   tau_s y' = x - y
 
-d periods lie between sample and action, tau is the amplifier's time constant, tau_s the sense chain's delay. G is the
+d periods lie between sample and action, tau is the amplifier's time constant, tau_s the sense chain's lag. G is the
 part of the stiffness that the held comb forces take away (they turn with the platform), and E the error of the combs.
 
-A device may differ from that in its numbers, in its delay (d need not be whole then), by a pole of its sense chain, and
+A device may differ from that in its numbers, in its delay (d need not be whole then), by a further such pole, and
 by parasitic modes r'' + d r' + w^2 r = share w^2 K^-1 f, which are seen beside x and do not act back on it.
 """
 
 import math
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
+from typing import Literal
 
 import numpy as np
 import scipy.linalg
@@ -23,6 +24,11 @@ from pkxyz_ctrl.design.model.plant_model import amplifier_time_constant_s, linea
 from pkxyz_ctrl.stage import Stage
 
 Array = NDArray[np.float64]
+
+SenseLag = Literal["filter", "delay", "amplifier"]
+"""What the sense chain's lag is taken for: the filter that it mostly is, a delay that weakens nothing, or, for a law
+with as many states as its plant, a part of the amplifier's pole.
+"""
 
 
 @dataclass(frozen=True)
@@ -48,7 +54,7 @@ class Perturbation:
     """more between sample and action than the bus says, or less"""
     amplifier_bandwidth: float = 0.0
     sense_bandwidth_hz: float | None = None
-    """corner of the sense chain; None: far away"""
+    """corner of the sense chain, beside what the stage file says of it; None: far away"""
     parasitic: tuple[ParasiticMode, ...] = ()
 
     def __post_init__(self) -> None:
@@ -94,8 +100,19 @@ class LoopPlant:
         )
 
 
-def loop_plant(stage: Stage, bus: BusConfig, strokes_m: ArrayLike, perturbation: Perturbation = NOMINAL) -> LoopPlant:
+def loop_plant(
+    stage: Stage,
+    bus: BusConfig,
+    strokes_m: ArrayLike,
+    perturbation: Perturbation = NOMINAL,
+    sense_lag: SenseLag = "filter",
+) -> LoopPlant:
     """The plant of a stage on a bus, about the position of ``strokes_m`` (3,), held there by its combs."""
+    lag_s, amplifier_s = stage.sense_delay_s, amplifier_time_constant_s(stage)
+    if sense_lag == "delay":
+        lag_s, perturbation = 0.0, replace(perturbation, delay_s=perturbation.delay_s + lag_s)
+    elif sense_lag == "amplifier":
+        lag_s, amplifier_s = 0.0, amplifier_s + lag_s
     strokes = np.asarray(strokes_m, dtype=np.float64)
     model = linearise(stage, strokes)
     mass = model.mass_kg * (1.0 + perturbation.mass)
@@ -113,9 +130,9 @@ def loop_plant(stage: Stage, bus: BusConfig, strokes_m: ArrayLike, perturbation:
         damping,
         mass,
         comb_error,
-        amplifier_time_constant_s(stage) / (1.0 + perturbation.amplifier_bandwidth),
+        amplifier_s / (1.0 + perturbation.amplifier_bandwidth),
     )
-    a, b, c = device.continuous(stage.sense_delay_s, perturbation)
+    a, b, c = device.continuous(lag_s, perturbation)
     a, b = _sampled(a, b, bus.period_s, bus.delay_periods * bus.period_s + perturbation.delay_s)
     c = np.hstack([c, np.zeros((3, len(a) - c.shape[1]))])
     return LoopPlant(bus.period_s, a, b, c, strokes, stiffness)
@@ -149,28 +166,32 @@ class _Device:
     comb_error: Array
     amplifier_s: float
 
-    def continuous(self, sense_delay_s: float, change: Perturbation) -> tuple[Array, Array, Array]:
-        """A, B (n,3) and C (3,n) of the states x, v, f, the parasitic modes' r and r', and the sense filter's, each of
+    def continuous(self, sense_filter_s: float, change: Perturbation) -> tuple[Array, Array, Array]:
+        """A, B (n,3) and C (3,n) of the states x, v, f, the parasitic modes' r and r', and the sense chain's, each of
         three, for a force asked for as the input.
         """
         eye, modes = np.eye(3), change.parasitic
-        n = 9 + 6 * len(modes) + (0 if change.sense_bandwidth_hz is None else 3)
+        poles = [] if sense_filter_s == 0.0 else [1.0 / sense_filter_s]
+        if change.sense_bandwidth_hz is not None:
+            poles.append(2.0 * math.pi * change.sense_bandwidth_hz)
+        n = 9 + 6 * len(modes) + 3 * len(poles)
         a, b, c = np.zeros((n, n)), np.zeros((n, 3)), np.zeros((3, n))
         a[0:3, 3:6] = eye
         a[3:6, 0:3], a[3:6, 3:6], a[3:6, 6:9] = -self.stiffness / self.mass, -self.damping / self.mass, eye / self.mass
         a[6:9, 6:9], b[6:9] = -eye / self.amplifier_s, self.comb_error / self.amplifier_s
-        c[:, 0:3], c[:, 3:6] = eye, -sense_delay_s * eye
+        c[:, 0:3] = eye
         for k, mode in enumerate(modes):
             r, v = slice(9 + 6 * k, 12 + 6 * k), slice(12 + 6 * k, 15 + 6 * k)
             w = 2.0 * math.pi * mode.frequency_hz
             a[r, v], a[v, r], a[v, v] = eye, -w * w * eye, -w / mode.quality_factor * eye
             a[v, 6:9] = mode.compliance_share * w * w * np.linalg.inv(self.stiffness)
             c[:, r] = eye
-        if change.sense_bandwidth_hz is not None:
-            w = 2.0 * math.pi * change.sense_bandwidth_hz
-            a[n - 3 :, : n - 3], a[n - 3 :, n - 3 :] = w * c[:, : n - 3], -w * eye
+        for k, w in enumerate(poles):
+            seen = slice(9 + 6 * len(modes) + 3 * k, 12 + 6 * len(modes) + 3 * k)
+            a[seen] = w * c
+            a[seen, seen] = -w * eye
             c = np.zeros((3, n))
-            c[:, n - 3 :] = eye
+            c[:, seen] = eye
         return a, b, c
 
 

@@ -150,24 +150,23 @@ def behind_a_slow_filter(config):
 
 
 def test_behind_a_slow_sense_filter_other_taps_bear_every_device():
-    """Those of `pkxyz tune youla_lab`: the lag takes phase that the others reckon with, of which nine of 500 are
-    unstable there.
+    """Those of `pkxyz tune youla_lab`: the lag takes phase that the others reckon with, of which five of 500 are
+    unstable there. README has both figures of the 500.
     """
     config = load("controllers", "youla", ControllerConfig)
     loop = behind_a_slow_filter(config)
     axes = loop.margins(MIDDLE).axes
-    assert 150.0 <= min(axis.bandwidth_hz for axis in axes) < 160.0
+    assert 149.5 <= min(axis.bandwidth_hz for axis in axes) < 150.5
     assert 1.5 < max(axis.peak_s for axis in axes) <= 1.9
     tolerances = load("tolerances", "wide", Tolerances)
     sampled = [loop.peak_sensitivity(tolerances.sample(seed)) for seed in range(1, 501)]
-    assert 2.2 < np.percentile(sampled, 95) <= 2.5
-    assert 3.0 < max(sampled) <= 4.0
+    assert (round(max(sampled), 2), round(np.percentile(sampled, 95), 2)) == (3.41, 2.29)
     plant, about = loop_plant(stage("lab"), bus(), MIDDLE), law_about(stage("lab"), loop.law, MIDDLE)
     assert 0.7 < 1e9 * hold_noise_m(stage("lab"), bus(), plant, about).max() <= 0.85
     fast = config.youla.model_copy(update={"filter": config.youla.filter[:1]})
     other = behind_a_slow_filter(config.model_copy(update={"youla": fast}))
     unstable = [seed for seed in range(1, 101) if np.isinf(other.peak_sensitivity(tolerances.sample(seed)))]
-    assert unstable == [4, 10, 79]
+    assert unstable == [79]
 
 
 @pytest.mark.parametrize(("sense_delay_us", "place"), [(0.0, 0), (65.0, 0), (65.1, 1), (99.5, 1), (2000.0, 1)])
