@@ -26,8 +26,10 @@ from hil.studies.margins.loop import Loop
 from hil.studies.montecarlo import Study
 from pkxyz_ctrl.config.files import ConfigError, load
 from pkxyz_ctrl.design.margins.tolerances import Tolerances
+from pkxyz_ctrl.design.model.loop_plant import Perturbation
 from pkxyz_ctrl.loop.row import ROW
 from pkxyz_ctrl.safety.modes import LOOP_CLOSED
+from pkxyz_ctrl.safety.thresholds import SATURATION_SLACK_N
 from pkxyz_ctrl.stage import Stage
 
 LAWS = (
@@ -74,10 +76,25 @@ class Stopped(NamedTuple):
     """What became of a device that was stopped."""
 
     why: str
-    is_beyond: bool
-    """it could not get where it was to be: it was at a stop of its own, or its combs at their limits"""
+    is_asked_too_much: bool
+    """its combs can't give, at their limits, what the reference takes in the last ticks, whatever the law"""
+    is_at_stop: bool
     has_swung: bool
     """its error grew and grew"""
+
+
+def asks_too_much(stage: Stage, device: Perturbation, rows: np.ndarray, period_s: float) -> bool:
+    """Whether the reference of rows of ``ROW`` takes more force than a device has somewhere, or a push."""
+    if len(rows) < 3:
+        return False
+    way_m = rows["reference_m"]
+    inertia_n = stage.mass_kg * (1.0 + device.mass) * np.diff(way_m, n=2, axis=0) / period_s**2
+    at_m = way_m[1:-1]
+    held_n = (1.0 + device.stiffness) * stage.holding_forces(at_m)
+    pulls = np.swapaxes(stage.pulls(at_m), -1, -2)
+    needed_n = held_n + np.linalg.solve(pulls, inertia_n[..., None])[..., 0]
+    most_n = stage.force_max_n * (1.0 + np.array(device.comb_gain))
+    return bool(np.any((needed_n > most_n) | (needed_n < -SATURATION_SLACK_N)))
 
 
 def swings(rows: np.ndarray) -> bool:
@@ -105,34 +122,40 @@ def stopped(motion: str, law: str, seed: int) -> Stopped | None:
     faults = in_process.run(setup, Lane.FAST, on_block=on_block).faults
     if not faults:
         return None
-    end = last[-BEFORE_TICKS:]
-    strokes = Stage(setup.stage).inverse_kinematics(end["position_m"]) if len(end) else np.zeros((1, 3))
-    at_limits = float(end["saturated"].mean()) > 0.5 if len(end) else False
-    is_beyond = bool(strokes.max() > STOP_M or strokes.min() < 0.0) or at_limits
-    return Stopped(faults[0].splitlines()[0], is_beyond, any(swings(last[-ticks:]) for ticks in spans))
+    end, stage = last[-BEFORE_TICKS:], Stage(setup.stage)
+    strokes_m = stage.inverse_kinematics(end["position_m"]) if len(end) else np.zeros((1, 3))
+    device = study.tolerances.sample(seed).perturbation
+    return Stopped(
+        faults[0].splitlines()[0],
+        asks_too_much(stage, device, end, setup.bus.period_s),
+        bool(strokes_m.max() > STOP_M or strokes_m.min() < 0.0),
+        any(swings(last[-ticks:]) for ticks in spans),
+    )
 
 
 def is_stable(motion: str, law: str, seed: int) -> bool:
     """Whether the linear loop of that device is, where it was sampled and in all of the workspace's corners."""
     study, setup = designed(motion, law)
-    if law == "open_loop":
-        return True
     case, loop = study.tolerances.sample(seed), Loop(Stage(setup.stage), setup.bus, setup.law)
     points = [case.strokes_m, *study.tolerances.points_m().values()]
     return all(math.isfinite(loop.peak_sensitivity(dataclasses.replace(case, strokes_m=p))) for p in points)
 
 
 def judge(motion: str, law: str, seed: int) -> str | None:
-    """``None`` for a device that was not stopped; else whether it could not get there (``beyond``), has a loop that is
-    not stable (``unstable``), or was stopped for nothing (``false``).
+    """``None`` for a device that was not stopped; else whether its loop is not stable (``unstable``), it could not get
+    there (``beyond``), or it was stopped for nothing (``false``).
+
+    That the combs were at their limits is no excuse: a loop that swings ends there, too. What feeds nothing back can't
+    know that its device goes further than the drawing, up to a stop.
     """
     found = stopped(motion, law, seed)
     if found is None:
         return None
-    if found.is_beyond:
-        return "beyond"
-    if found.has_swung or not is_stable(motion, law, seed):
+    feeds_back = law != "open_loop"
+    if feeds_back and (found.has_swung or not is_stable(motion, law, seed)):
         return "unstable"
+    if found.is_asked_too_much or (found.is_at_stop and not feeds_back):
+        return "beyond"
     print(f"  {law} in {motion}, device {seed}: {found.why}", flush=True)
     return "false"
 
