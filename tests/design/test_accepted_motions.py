@@ -24,7 +24,7 @@ from sim.config import PlantConfig
 BUS = {"robust_20k": "local_20k"}
 GENTLE = {"velocity_max_m_per_s": 0.5e-3, "acceleration_max_m_per_s2": 0.05, "jerk_max_m_per_s3": 10.0}
 BRISK = {"velocity_max_m_per_s": 2e-3, "acceleration_max_m_per_s2": 0.5, "jerk_max_m_per_s3": 500.0}
-SEED, EACH = 11, 4
+SEED, EACH = 3, 4
 STARTS_UM, HIGHEST_HZ = (3.0, 21.0), 2000.0
 SHORT = 0.99
 """What is driven is at least this share of what is refused."""
