@@ -113,6 +113,7 @@ STATE = np.dtype(
         ("sense_chain_noise", "f8", 3),  # in deviations
         ("filtered_v", "f8", 3),
         ("aside_m", "f8", 3), ("comb_rise", "f8", 3),  # what fingers bend aside, and what that does to their force
+        ("rise_line", "f8", (3, 3)),  # ... tangent by chain: constant, per V^2, per m of stroke
         # over a call of advance
         ("call_s", "f8"), ("shake_m_per_s2", "f8", (CUBIC, 3)), ("ripple_v", "f8", (CUBIC, 3)),
         ("tone_turn_dt_us", "i8"), ("tone_turn", "f8", (TONES, 2)),

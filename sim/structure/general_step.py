@@ -15,12 +15,13 @@ import math
 import numpy as np
 
 from sim.motion.amplifier import pass_time
-from sim.motion.geometry import E_X, E_Y, N_X, N_Y, leg, lift
+from sim.motion.geometry import E_X, E_Y, N_X, N_Y, leg, lift, strokes
 from sim.motion.integrator import CONTACT_S, LAST, tabulate, times
 from sim.motion.kernel import kernel
 from sim.motion.layout import CUBIC, MODES
 from sim.motion.mechanics import comb_acceleration, undamped_acceleration
 from sim.motion.nystrom import B_RATE, STAGES, A, B, C
+from sim.structure.side import rise_within
 
 
 @kernel
@@ -57,13 +58,18 @@ def _generalise(p: np.void, forces_n: np.ndarray, ax: float, ay: float, az: floa
 
 @kernel
 def accelerations(p: np.void, s: np.void, t: float, volt2: np.ndarray, out: np.ndarray) -> None:
-    """z'' (3 + modes,) without damping at s["z_at"], s["rate_at"], t s into the call, with squared voltages (3,)."""
+    """z'' (3 + modes,) without damping at s["z_at"], s["rate_at"], t s into the call, with squared voltages (3,), which
+    rise by what fingers aside add."""
     z, rate, modes = s["z_at"], s["rate_at"], p["mode_count"]
     x0, x1, x2, v0, v1, v2 = z[0], z[1], z[2], rate[0], rate[1], rate[2]
     for k in range(modes):
         kappa, r, rr = p["mode_table"][k], z[3 + k], rate[3 + k]
         x0, x1, x2 = x0 - kappa[0] * r, x1 - kappa[1] * r, x2 - kappa[2] * r
         v0, v1, v2 = v0 - kappa[0] * rr, v1 - kappa[1] * rr, v2 - kappa[2] * rr
+    if p["misaligned_on"] != 0:
+        s["pose"][0], s["pose"][1], s["pose"][2] = x0, x1, x2
+        strokes(p, s["pose"], s["strokes_m"])
+        rise_within(s, s["strokes_m"], volt2)
     ax, ay, az = undamped_acceleration(p, s, volt2, x0, x1, x2, v0, v1, v2)
     if modes > 0:
         _comb_forces(p, volt2, x0, x1, x2, s["comb_n"])
@@ -138,7 +144,7 @@ def _voltages(s: np.void, t: float, since_s: float, e1: float) -> None:
     for c in range(3):
         volt = s["base_v"][c] - s["charge_v"][c] + s["slope_v_per_s"][c] * t + s["error_v"][c] * e1
         volt += cubic(s["ripple_v"], c, since_s)
-        s["volt2"][c] = volt * volt * s["comb_rise"][c] if s["held"][c] == 0 else 0.0
+        s["volt2"][c] = volt * volt if s["held"][c] == 0 else 0.0
 
 
 @kernel

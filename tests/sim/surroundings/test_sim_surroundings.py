@@ -223,10 +223,11 @@ def sideways(volt, stroke_m, offset_m, softening_m, ratio):
 
 @pytest.mark.parametrize("offset_m", [0.2e-6, 0.8e-6])
 def test_fingers_aside_pull_harder_and_snap_earlier(offset_m):
-    """Slow rise of one comb's voltage: bending as an own solution has it, force by 1 / (1 - (d / g)^2), a snap at the
-    voltage where the own solution finds no balance any more, which is below that of centred fingers."""
+    """Slow rise of one comb's voltage, damped so that nothing rings: bending as an own solution has it, force by
+    1 / (1 - (d / g)^2), a snap at the voltage where the own solution finds no balance any more, which is below that of
+    centred fingers."""
     ratio, softening = 0.012, 20e-6
-    sides = {"pull_in": {"lateral_stiffness_ratio": ratio}, "stops": {}}
+    sides = {"pull_in": {"lateral_stiffness_ratio": ratio}, "stops": {}, "damping": {"quality_factor": 2.0}}
     p = plant(config(**sides, finger_misalignment={"offset_m": (offset_m, 0, 0), "softening_stroke_m": softening}))
     centred = plant(config(**sides))
     seen = []
