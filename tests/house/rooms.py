@@ -111,7 +111,7 @@ HOUSE: Mapping[str, Room] = MappingProxyType({
     )),
     "hil.pictures.wafer": Room(("pkxyz_ctrl.*", "hil.pictures", "hil.studies.wafer")),
     "hil.screen": Room(("pkxyz_ctrl.*", "hil.lanes", "hil.runs", "hil.studies.margins")),
-    "hil.bench.rigs": Room(("sim.motion", "sim", "pkxyz_ctrl.*", "hil.lanes", "hil.runs")),
+    "hil.bench.rigs": Room(("sim.motion", "sim", "pkxyz_ctrl.*", "hil.lanes", "hil.runs", "hil.studies.identify")),
     "hil.bench": Room((
         "pkxyz_ctrl.*", "hil.bus", "hil.plant", "hil.recording", "hil.lanes", "hil.native", "hil.runs",
         "hil.studies.spread", "hil.studies.margins", "hil.studies.identify", "hil.studies.tune", "hil.studies.wafer",
