@@ -114,7 +114,7 @@ HOUSE: Mapping[str, Room] = MappingProxyType({
     "hil.bench.rigs": Room(("sim.motion", "sim", "pkxyz_ctrl.*", "hil.lanes", "hil.runs", "hil.studies.identify")),
     "hil.bench": Room((
         "pkxyz_ctrl.*", "hil.bus", "hil.plant", "hil.recording", "hil.lanes", "hil.native", "hil.runs",
-        "hil.studies.spread", "hil.studies.margins", "hil.studies.identify", "hil.studies.tune", "hil.studies.wafer",
+        "hil.studies.spread", "hil.studies.margins", "hil.studies.tune", "hil.studies.wafer",
         "hil.studies", "hil.operate", "hil.server", "hil.bench.rigs",
     )),
     "hil.api": Room((
