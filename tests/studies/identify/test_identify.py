@@ -339,14 +339,17 @@ def test_the_page_tells_what_is_found():
 
 
 def test_the_page_tells_what_it_is_worth(tmp_path):
-    """True position less reference on the harsh plant, with the stage file as shipped and with the one found."""
+    """What moves of the error on the harsh plant under lqg, with the stage file as shipped and with the one found."""
     write_calibrated_stage(find("stages", "reconstructed"), found(), "test", tmp_path / "stage.toml")
-    for column, file in ((1, "reconstructed"), (2, str(tmp_path / "stage.toml"))):
+    told = []
+    for file in ("reconstructed", str(tmp_path / "stage.toml")):
         scenario = hil.load_scenario("raster_harsh", stage=file, controller="lqg")
         run = hil.run(scenario)
         tick = run["reference_tick"]
         (scan_us,) = [s.scan_us for s in scenario.trajectory.segments if s.scan_us]
         scan = (tick >= 0) & (tick * 200 >= scan_us[0]) & (tick * 200 < scan_us[1])
         error_nm = [(run[f"position_{a}_m"] - run[f"reference_{a}_m"])[scan] * 1e9 for a in "xyz"]
-        assert row_of("harsh", column) == [round(float(np.sqrt(np.mean(e**2))), 1) for e in error_nm]
-        assert row_of("harsh, about its mean", column) == [round(float(np.std(e)), 1) for e in error_nm]
+        told.append(" / ".join(f"{np.std(e):.1f}" for e in error_nm))
+    assert f"the moving part of the raster's error falls from {told[0]} nm to {told[1]} nm" in PAGE.read_text(
+        encoding="utf-8"
+    )
