@@ -33,8 +33,6 @@ SCANNED = np.dtype(
     ],
     align=True,
 )
-WINDOW = np.dtype([("begin_us", "i8"), ("end_us", "i8")])
-"""A scan: from ... to."""
 TICKS_MOST: Final = 100_000
 """The whole reference is held at once."""
 _TRACKING, _FAULT = int(Mode.TRACKING), int(Mode.FAULT)
@@ -55,7 +53,7 @@ def scan_errors(setup: Setup, laws: Records, plants: Sequence[Plant]) -> Records
     memory = np.repeat(new_memory(Mode.IDLE), max(1, len(plants)))
     reference = Handout(setup.trajectory, setup.bus.period_us).rows(memory, setup.ticks)
     windows_us = [s.scan_us for s in setup.trajectory.segments if s.scan_us]
-    windows = np.array(windows_us, WINDOW)
+    windows = np.array(windows_us, dtype=np.int64).reshape(-1, 2)
     found = np.zeros(len(plants), SCANNED)
     if len(plants):
         params, states = (joined(each) for each in zip(*((p.params, p.state) for p in plants), strict=True))
@@ -91,7 +89,7 @@ def _run_together(
     params: Records,
     states: Records,
     at_us: NDArray[np.int64],
-    windows_us: Records,
+    windows_us: NDArray[np.int64],
     found: Records,
 ) -> None:
     each = 1 if len(laws) > 1 else 0
@@ -108,11 +106,11 @@ def _run_together(
         for n in range(count):
             if found[n]["faulted"] == 0:
                 respond(laws[each * n : each * n + 1], memories[n : n + 1])
-                take(memories[n]["row"], laws[0]["period_us"], windows_us, found[n])
+                _take(memories[n]["row"], laws[0]["period_us"], windows_us, found[n])
 
 
 @kernel
-def take(row: np.void, period_us: int, windows_us: Records, found: np.void) -> None:
+def _take(row: np.void, period_us: int, windows_us: NDArray[np.int64], found: np.void) -> None:
     """Whether a tick has ended in a fault, and its error, once for each scan that it lies in."""
     if row["mode"] == _FAULT:
         found["faulted"] = 1
@@ -120,7 +118,7 @@ def take(row: np.void, period_us: int, windows_us: Records, found: np.void) -> N
         return
     t_us = row["reference_tick"] * period_us
     for k in range(len(windows_us)):
-        if windows_us[k]["begin_us"] <= t_us < windows_us[k]["end_us"]:
+        if windows_us[k, 0] <= t_us < windows_us[k, 1]:
             found["ticks"] += 1
             for j in range(3):
                 error = row["position_m"][j] - row["reference_m"][j]
