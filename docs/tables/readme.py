@@ -6,13 +6,9 @@ python docs/tables/readme.py
 
 import json
 from collections.abc import Iterator, Mapping
-from functools import cache
 from pathlib import Path
 
-from hil.bench.rigs.places import setup_at
-from hil.lanes import in_process as lanes
-from hil.lanes.lane import Lane
-from hil.runs.metrics import Metrics, RowFigures
+from hil.bench.rigs.places import followed
 
 ROOT = Path(__file__).parents[2]
 PAGE = ROOT / "README.md"
@@ -32,15 +28,6 @@ ANSWERS = {
 }
 
 
-@cache
-def figures(place: str, controller: str) -> RowFigures:
-    """Figures of a run of the fast lane, in nm by axis; its bits are those of lockstep."""
-    setup = setup_at("raster", place, controller)
-    metrics = Metrics(setup.trajectory, setup.bus.period_us)
-    lanes.run(setup, Lane.FAST, on_block=metrics.update)
-    return metrics.figures()
-
-
 def three(values: Mapping[str, float]) -> str:
     """x / y / z in nm, or in um where all are beyond 100 nm."""
     if min(values.values()) > 100.0:
@@ -55,8 +42,8 @@ def rows() -> Iterator[str]:
     yield "| plant | without feedback | default law `youla` | its holds: error, noise |"
     yield "| --- | --- | --- | --- |"
     for place, words in PLACES.items():
-        cells = [three(figures(place, law).rms_error_nm) for law in ("open_loop", "youla")]
-        held = figures(place, "youla")
+        cells = [three(followed("raster", place, law).rms_error_nm) for law in ("open_loop", "youla")]
+        held = followed("raster", place, "youla")
         worst, noise = (max(of_axes.values()) for of_axes in (held.hold_rms_nm, held.hold_noise_nm))
         yield f"| {words} | {' | '.join(cells)} | {worst:.1f}, {noise:.1f} nm |"
 

@@ -7,10 +7,7 @@ import numpy as np
 
 from hil.bench.rigs.answers import jump_settled, move_settled, sine_response
 from hil.bench.rigs.figure import Figure
-from hil.bench.rigs.places import IDENTIFIED, PLACES, setup_at
-from hil.lanes import in_process as lanes
-from hil.lanes.lane import Lane
-from hil.runs.metrics import Metrics, RowFigures
+from hil.bench.rigs.places import IDENTIFIED, PLACES, followed
 
 LAW, OPEN_LOOP = "youla", "open_loop"
 ALLOWED_NM = {"nominal": 0.3}
@@ -32,7 +29,7 @@ def beside() -> list[Figure]:
 def _scans(place: str) -> list[Figure]:
     figures = []
     for scenario in ("raster", "circle"):
-        law, nothing = _run(scenario, place, None), _run(scenario, place, OPEN_LOOP)
+        law, nothing = followed(scenario, place, None), followed(scenario, place, OPEN_LOOP)
         allowed = ALLOWED_NM.get(place, 0.0)
         what = [(scenario, "rms_error_nm", "while scanning")]
         if scenario == "raster":
@@ -69,17 +66,6 @@ def _answers(place: str) -> list[Figure]:
 
 def _told(ms: float) -> str:
     return f"{ms:.1f} ms" if math.isfinite(ms) else f"not in {WAITED_MS:g} ms"
-
-
-def _run(scenario: str, place: str, controller: str | None) -> RowFigures:
-    """Figures of one run of the fast lane, with the scenario's own law or another.
-    Raises ``RuntimeError`` on a fault."""
-    setup = setup_at(scenario, place, controller)
-    metrics = Metrics(setup.trajectory, setup.bus.period_us)
-    result = lanes.run(setup, Lane.FAST, on_block=metrics.update)
-    if result.faults:
-        raise RuntimeError(f"{scenario} on {place} with {setup.controller.name}: {result.faults[0]}")
-    return metrics.figures()
 
 
 def _axes(values: dict[str, float]) -> str:

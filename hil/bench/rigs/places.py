@@ -6,8 +6,10 @@ from functools import cache
 
 import numpy as np
 
+from hil.lanes import in_process as lanes
 from hil.lanes.lane import Lane
 from hil.lanes.setup import Setup, bare_setup
+from hil.runs.metrics import Metrics, RowFigures
 from hil.runs.scenario import load_scenario
 from hil.studies.identify.calibrated_stage import calibration_of
 from hil.studies.identify.identification import Identification, identify
@@ -34,6 +36,19 @@ def setup_at(scenario: str, place: str, controller: str | None) -> Setup:
         return setup
     measured = calibration_of(_identified(), "bench")
     return dataclasses.replace(setup, stage=setup.stage.model_copy(update={"calibration": measured}))
+
+
+@cache
+def followed(scenario: str, place: str, controller: str | None) -> RowFigures:
+    """Figures of one run of the fast lane there, whose bits are those of lockstep. Raises ``RuntimeError`` on a
+    fault.
+    """
+    setup = setup_at(scenario, place, controller)
+    metrics = Metrics(setup.trajectory, setup.bus.period_us)
+    result = lanes.run(setup, Lane.FAST, on_block=metrics.update)
+    if result.faults:
+        raise RuntimeError(f"{scenario} on {place} with {setup.controller.name}: {result.faults[0]}")
+    return metrics.figures()
 
 
 @cache

@@ -190,14 +190,19 @@ def extend(found: dict[str, Any], devices: int) -> None:
         found["devices"] = seed
 
 
-def main() -> None:
-    """Go through what is missing in the file of results."""
+def options(laws: list[str], results: Path) -> argparse.Namespace:
+    """Which laws and motions, how many devices of each, and where what came of them is kept."""
     parser = argparse.ArgumentParser()
-    parser.add_argument("laws", nargs="*", default=list(LAWS))
+    parser.add_argument("laws", nargs="*", default=laws)
     parser.add_argument("--devices", type=int, default=500)
     parser.add_argument("--motions", default=",".join((*MOTIONS, *SCENARIOS)))
-    parser.add_argument("--results", type=Path, default=KEPT)
-    asked = parser.parse_args()
+    parser.add_argument("--results", type=Path, default=results)
+    return parser.parse_args()
+
+
+def main() -> None:
+    """Go through what is missing in the file of results."""
+    asked = options(list(LAWS), KEPT)
     known = read(asked.results)
     for motion in asked.motions.split(","):
         for law in asked.laws:

@@ -5,14 +5,12 @@ python tests/studies/alarms/stopped.py [LAW ...] [--devices 500] [--motions rast
 A line of docs/tables/stops.jsonl for each law and motion; what has as many devices already is left alone.
 """
 
-import argparse
 import dataclasses
 import time
-from pathlib import Path
 from typing import Any, NamedTuple
 
 import numpy as np
-from sampled import BEFORE_TICKS, MOTIONS, SCENARIOS, designed, read, write
+from sampled import BEFORE_TICKS, designed, options, read, write
 from sampled import KEPT as ALARMS
 
 from hil.lanes.fast import runner_of
@@ -105,12 +103,7 @@ def study_of(motion: str, law: str, devices: int) -> dict[str, Any]:
 
 def main() -> None:
     """Go through what is missing in the file of results."""
-    parser = argparse.ArgumentParser()
-    parser.add_argument("laws", nargs="*", default=["youla"])
-    parser.add_argument("--devices", type=int, default=500)
-    parser.add_argument("--motions", default=",".join((*MOTIONS, *SCENARIOS)))
-    parser.add_argument("--results", type=Path, default=KEPT)
-    asked = parser.parse_args()
+    asked = options(["youla"], KEPT)
     known = read(asked.results)
     for motion in asked.motions.split(","):
         for law in asked.laws:
