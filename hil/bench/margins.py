@@ -18,7 +18,9 @@ from pkxyz_ctrl.config.controller import ControllerConfig
 from pkxyz_ctrl.config.files import load
 from pkxyz_ctrl.design.law import design_law
 from pkxyz_ctrl.design.margins.margins import Margins
+from pkxyz_ctrl.design.margins.rejection_limit import bode_limit_hz, delay_limit_hz
 from pkxyz_ctrl.design.margins.tolerances import Tolerances
+from pkxyz_ctrl.design.model.loop_plant import loop_plant
 from pkxyz_ctrl.stage import Stage
 
 LAW, SAMPLED = "youla", 500
@@ -47,12 +49,17 @@ def margins() -> list[Figure]:
     case, worst = changed.worst
     words = ", ".join(f"{name} {hz:.0f} Hz" for name, hz in reach.items())
     each = "worst of x, y, z and MIMO, law youla, nominal plant"
+    rejected, (bode, delay) = _rejected_hz(found), _limits_hz(stage, loop.bus, middle)
     return [
         Figure("margins.peak_s", _peak_s(found), "Ms", PEAK_S, "at most", detail=each),
         Figure("margins.disk", _disk(found), "disk margin", DISK, "at least", detail=each),
-        Figure("margins.rejection", _rejected_hz(found), "Hz", REJECTED_HZ, "at least",
-               detail=f"S below -3 dB up to; {each}"),
-        Figure("margins.over_baselines", _rejected_hz(found) / max(reach.values()), "times", 1.0, "at least",
+        Figure("margins.rejection", rejected, "Hz", REJECTED_HZ, "at least",
+               detail=f"S below -3 dB up to; {each}; {rejected / delay:.2f} of the delay limit, {rejected / bode:.2f} "
+               "of Bode's, which bear no changed plant"),
+        Figure("margins.delay_limit", delay, "Hz", detail=f"no linear law with Ms {PEAK_S} has S below -3 dB further: "
+               "Bode's integral, delay, sampling zero; an axis of the nominal plant, known exactly, without noise"),
+        Figure("margins.bode_limit", bode, "Hz", detail="the same by Bode's integral alone"),
+        Figure("margins.over_baselines", rejected / max(reach.values()), "times", 1.0, "at least",
                detail=f"as far as the commercial baseline and irc, each tuned to be as robust: {words}"),
         Figure("margins.changed_plants", worst if math.isfinite(worst) else 1e9, "Ms", CHANGED, "at most",
                detail=f"worst of {len(changed.cases)} changed plants at nine points: {case.name}"),
@@ -71,6 +78,12 @@ def margins() -> list[Figure]:
 def _loop(stage: Stage, controller: str, bus: str) -> Loop:
     config, on_bus = load("controllers", controller, ControllerConfig), load("buses", bus, BusConfig)
     return Loop(stage, on_bus, design_law(stage, config, on_bus, autostart=True))
+
+
+def _limits_hz(stage: Stage, bus: BusConfig, strokes_m: NDArray[np.float64]) -> tuple[float, float]:
+    """Bode's limit, and the least of the axes with the delay."""
+    plant = loop_plant(stage, bus, strokes_m)
+    return bode_limit_hz(bus.period_s, PEAK_S), min(delay_limit_hz(plant.axis(i), PEAK_S) for i in range(3))
 
 
 def _finite(value: float) -> float:

@@ -113,6 +113,24 @@ def test_what_is_promised_of_rasters_and_circles_is_what_they_are_held_to() -> N
     assert found["harsh.error_deviation"] == (pytest.approx(3.05, abs=0.10), 4.5)
 
 
+def test_what_control_reaches_stands_beside_no_feedback_and_beside_what_is_possible() -> None:
+    """Where there is a measure without feedback; and the page on margins tells the ratio."""
+    kept = json.loads((ROOT / "benchmarks" / "results.json").read_text(encoding="utf-8"))["figures"]
+    found = {f["name"]: f for f in kept}
+    alone = {"control.step_limit", *(name for name in found if name.startswith("control.mpc_"))}
+    for name, f in found.items():
+        if name.startswith("control.") and name not in alone:
+            assert re.search("open loop|open-loop|without feedback", f["detail"]), name
+    for name in ("control.step_settle", "control.jump_settle"):
+        times = found[name]["value"] / found["control.step_limit"]["value"]
+        assert f"{times:.2f} times the shortest" in found[name]["detail"]
+    rejected = found["margins.rejection"]
+    delay, bode = (rejected["value"] / found[f"margins.{name}_limit"]["value"] for name in ("delay", "bode"))
+    assert f"{delay:.2f} of the delay limit, {bode:.2f} of Bode's" in rejected["detail"]
+    page = (ROOT / "docs" / "understand" / "margins.md").read_text(encoding="utf-8")
+    assert f"reaches {delay:.2f} of it" in page
+
+
 def test_a_replay_that_does_less_is_refused() -> None:
     loop = scan()
     memory = loop.memory.copy()

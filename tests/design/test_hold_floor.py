@@ -4,7 +4,8 @@ import numpy as np
 import pytest
 from loop_rig import MIDDLE, bus, stage
 
-from pkxyz_ctrl.design.hold_floor import hold_floor_m
+from pkxyz_ctrl.design.hold_floor import hold_floor_m, rounding_floor_m
+from pkxyz_ctrl.design.hold_noise import rounding_force_n
 from pkxyz_ctrl.design.laws.estimator_gain import measurement_noise, shaken_covariance
 from pkxyz_ctrl.design.model.loop_plant import loop_plant
 from pkxyz_ctrl.design.model.plant_model import linearise
@@ -48,3 +49,16 @@ def test_the_floor_is_what_the_best_loop_leaves(density):
     assert floor_nm[0] == pytest.approx(floor_nm[1], rel=1e-9)
     if density == 98.1e-6:
         assert floor_nm == pytest.approx([0.595, 0.595, 0.488], abs=2e-3)
+
+
+def test_the_floor_of_rounding_is_the_stage_s_first_sample_and_its_zero_outside_the_circle():
+    """Nothing undoes what a force does before the next can act; a zero z outside the circle makes it |z| times more."""
+    rounded_n = rounding_force_n(stage(), bus(), linearise(stage(), MIDDLE))
+    floor_m = rounding_floor_m(stage(), bus(), MIDDLE)
+    for index in range(3):
+        axis = loop_plant(stage(), bus(), MIDDLE).axis(index)
+        samples = [(axis.c @ np.linalg.matrix_power(axis.a, k) @ axis.b).item() for k in range(len(axis.a))]
+        zeros = np.roots(np.convolve(np.poly(axis.a), samples)[1 : len(axis.a)])
+        first = samples[1] * np.abs(zeros[np.abs(zeros) > 1.0]).prod()
+        assert floor_m[index] == pytest.approx(first * rounded_n[index], rel=1e-4)
+    assert 1e9 * floor_m == pytest.approx([0.147, 0.147, 0.136], abs=1e-3)

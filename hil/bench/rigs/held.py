@@ -1,6 +1,7 @@
 """Holds under what disturbs them, and the shortest step that anything could make: what limits are held against."""
 
 import dataclasses
+from functools import cache
 from typing import Any
 
 import numpy as np
@@ -37,6 +38,7 @@ def held_nm(controller: str, *, quiet: bool = False, shaken_m_per_s2: float = 0.
     return np.sqrt(squares / _HOLDS) * 1e9
 
 
+@cache
 def shortest_step_s(way_m: float, band_m: float) -> float:
     """The shortest time to a band about a point away, the longest of the axes: the fewest periods for which a linear
     programme finds comb forces that get there and stay, within voltage and slew, on the sampled stage with its delay.
