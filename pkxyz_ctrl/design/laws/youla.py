@@ -11,6 +11,9 @@ is affine in the taps: bounds of |S|, |S - 1/2| and |K S| are second-order cones
 |N| <= Ms |D| is not convex; Re(D conj(D') / |D'|) in place of |D|, D' that of the last taps, is, and is stricter. It
 keeps D within a half-plane about D', so D winds about zero as often as D' does, and what was stable stays so. A few
 programmes (Clarabel) in a row, the grids completed about the closed loops' poles, find the taps.
+
+To the Kalman filter, a filter of the sense chain is x - tau v. Behind one the plant as drawn has a G_0, too: its bounds
+are asked as those of the others, and Q / D is linear about the last taps in what noise leaves.
 """
 
 import math
@@ -34,7 +37,7 @@ PROGRAMMES = 16
 _TURN = 0.1
 """Least part of D along what it was, so that it keeps its turns about zero where a bound is conceded."""
 _DEAR = 3.0
-"""Price of a concession of 1 in |S|, in variances as they are without a filter."""
+"""Price of a concession of 1 in |S|, in variances about as they are without a filter."""
 _FAR = 0.5
 """Where |S| of a changed plant has never been more of its bound, the next programme leaves it out; what then passes the
 bound is found by ``_refine``."""
@@ -42,6 +45,8 @@ _CLOSE = 1.005
 """How far beyond its bound a peak between two points of the grid may reach."""
 _SETTLED = 2e-3
 """Change of the noise from one programme to the next that is none any more."""
+_FORESEEN = 1e-9
+"""|G| over the stage's compliance that is rounding alone."""
 
 
 @dataclass(frozen=True)
@@ -122,7 +127,12 @@ class InnovationLoop:
         h, late = self.transfers(frequency_hz), delays(frequency_hz, self.period_s, taps)
         s = 1.0 + h[:, 0, 0]
         by_tap = (h[:, 0, 1] * h[:, 1, 0] - s * h[:, 1, 1])[:, None] * late
-        return (s, by_tap), (np.ones(len(s), np.complex128), -h[:, 1, 1][:, None] * late)
+        return (s, by_tap), (np.ones(len(s), np.complex128), -self.unforeseen(h)[:, None] * late)
+
+    def unforeseen(self, transfers: Complex) -> Complex:
+        """G (m,) of transfers (m, ..., ...) with nu in the second row and f in the second column."""
+        g = transfers[:, 1, 1]
+        return np.where(np.abs(g) * self.stiffness_n_per_m < _FORESEEN, 0.0, g)
 
     def poles_with(self, taps: Array) -> Complex:
         """Poles of the loop with the filter."""
@@ -161,8 +171,7 @@ def youla_taps(
 
     Raises ``LawError`` where no filter keeps the bounds, and where the programmes come to no end.
     """
-    unit = drawn.stiffness_n_per_m
-    quadratic, nyquist_hz = _hold_variance(drawn, noise, taps), 0.5 / drawn.period_s
+    unit, nyquist_hz = drawn.stiffness_n_per_m, 0.5 / drawn.period_s
     few_hz = np.linspace(0.04, 1.0, 70) * nyquist_hz  # lower down no plant has its peak
     many_hz = np.unique(
         np.r_[np.geomspace(2e-3, 0.1, 30) * nyquist_hz, np.linspace(0.05, 1.0, 40) * bounds.edge_hz, few_hz]
@@ -170,17 +179,16 @@ def youla_taps(
     q, last = np.zeros(taps), math.inf
     for number in range(PROGRAMMES):
         cones = _Cones(taps)
-        _ask_as_drawn(cones, drawn, drawn.grid_hz(many_hz), bounds)
+        _ask_as_drawn(cones, drawn, drawn.grid_hz(many_hz), bounds, q)
         for loop in changed:
             _ask_changed(cones, loop, loop.grid_hz(few_hz), q)
-        x, beyond = cones.least(quadratic, unit)
-        variance = float(x @ quadratic[0] @ x + 2.0 * quadratic[1] @ x + quadratic[2])
+        x, beyond = cones.least(_hold_variance(drawn, noise, q), unit)
         found = [
             _refine(drawn, x, bounds.peak_s, many_hz),
             *(_refine(loop, x, loop.peak_s, few_hz) for loop in changed),
         ]
         stable, worst = all(radius < 1.0 for radius, _ in found), max(peak for _, peak in found)
-        value = math.sqrt(max(variance, 0.0))
+        value = hold_deviation_m(drawn, noise, x)
         on_progress(
             f"programme {number + 1}: {1e9 * value:.3f} nm; largest |S| {worst:.3f} of its bound, {beyond:.3f} conceded"
         )
@@ -196,53 +204,71 @@ def youla_taps(
 
 def hold_deviation_m(drawn: InnovationLoop, noise: Noise, taps: Array) -> float:
     """Standard deviation of the position at hold in m, as drawn, for taps (n,) in N/m."""
-    q, g, c = _hold_variance(drawn, noise, len(taps))
-    return math.sqrt(float(taps @ q @ taps + 2.0 * g @ taps + c))
+    q, g, c = _hold_variance(drawn, noise, taps)
+    return math.sqrt(max(float(taps @ q @ taps + 2.0 * g @ taps + c), 0.0))
 
 
-def _hold_variance(drawn: InnovationLoop, noise: Noise, taps: int) -> tuple[Array, Array, float]:
-    """Q, g and c of x^T Q x + 2 g^T x + c, m^2: variance of the position for taps x in N/m; a mean over frequency."""
+def _hold_variance(drawn: InnovationLoop, noise: Noise, about_taps: Array) -> tuple[Array, Array, float]:
+    """Q, g and c of x^T Q x + 2 g^T x + c, m^2: variance of the position for taps x in N/m; a mean over frequency.
+    Q / D is its tangent at ``about_taps``: exact there, and everywhere for G = 0.
+    """
     points = 4096
     f = (np.arange(points) + 0.5) * 0.5 / drawn.period_s / points
-    z, late = np.exp(2j * math.pi * f * drawn.period_s), delays(f, drawn.period_s, taps)
+    z, late = np.exp(2j * math.pi * f * drawn.period_s), delays(f, drawn.period_s, len(about_taps))
     inputs = np.hstack([drawn.b, drawn.rounded, drawn.shaken @ noise.shaken])
     outputs = np.vstack([drawn.position, drawn.c[1]])
     through = np.zeros((2, 5))
     through[1, 0] = 1.0
     h = response(drawn.a, inputs, outputs, through, z)
+    last = late @ about_taps
+    d = 1.0 - drawn.unforeseen(h) * last
+    slope = 1.0 / d**2
+    offset = last / d - last * slope
     shaped = np.abs(1.0 - 1.0 / z) * noise.rounding_n
     sources = ((0, noise.sense_m), (2, shaped), (3, 1.0), (4, 1.0))
-    fixed = np.concatenate([h[:, 0, k] * size for k, size in sources])
-    by_tap = np.concatenate([(h[:, 0, 1] * h[:, 1, k] * size)[:, None] * late for k, size in sources])
+    fixed = np.concatenate([(h[:, 0, k] + h[:, 0, 1] * h[:, 1, k] * offset) * size for k, size in sources])
+    by_tap = np.concatenate([(h[:, 0, 1] * h[:, 1, k] * size * slope)[:, None] * late for k, size in sources])
     quadratic = np.real(by_tap.conj().T @ by_tap) / points
     return quadratic, np.real(by_tap.conj().T @ fixed) / points, float(np.sum(np.abs(fixed) ** 2) / points)
 
 
-def _ask_as_drawn(cones: "_Cones", drawn: InnovationLoop, f: Array, bounds: Bounds) -> None:
-    (s, by_tap), _ = drawn.fraction(f, cones.taps)
+def _ask_as_drawn(cones: "_Cones", drawn: InnovationLoop, f: Array, bounds: Bounds, q: Array) -> None:
+    (s, by_tap), (one, turned) = drawn.fraction(f, cones.taps)
     below = np.where(f <= bounds.edge_hz, bounds.edge * (f / bounds.edge_hz) ** bounds.slope, math.inf)
-    cones.add(np.minimum(below, bounds.peak_s), None, s, by_tap)
+    along = _along(one, turned, q)
+    cones.add(*_times(np.minimum(below, bounds.peak_s), along), s, by_tap)
     if bounds.below:
         hz, most = np.array(bounds.below).T
-        (at, at_by_tap), _ = drawn.fraction(hz, cones.taps)
-        cones.add(most, None, at, at_by_tap)
-    cones.add(np.full(len(f), 1.0 / bounds.disk_margin), None, s - 0.5, by_tap)
+        (at, at_by_tap), there = drawn.fraction(hz, cones.taps)
+        cones.add(*_times(most, _along(*there, q)), at, at_by_tap)
+    disk = np.full(len(f), 1.0 / bounds.disk_margin)
+    cones.add(*_times(disk, along), s - 0.5 * one, by_tap - 0.5 * turned)
     h, late = drawn.transfers(f), delays(f, drawn.period_s, cones.taps)
     k = drawn.stiffness_n_per_m
-    effort = (h[:, 2, 1] * h[:, 1, 0] / k)[:, None] * late
-    cones.add(np.full(len(f), bounds.effort), None, h[:, 2, 0] / k, effort)
+    effort = (h[:, 2, 1] * h[:, 1, 0] / k)[:, None] * late + (h[:, 2, 0] / k)[:, None] * turned
+    cones.add(*_times(np.full(len(f), bounds.effort), along), h[:, 2, 0] / k, effort)
+
+
+def _along(one: Complex, turned: Complex, q: Array) -> tuple[Array, Array]:
+    """Re(D conj(D') / |D'|) as its value (m,) without taps and its derivatives (m, taps) by them, D' with taps q."""
+    last = one + turned @ q
+    towards = np.conj(last) / np.abs(last)
+    return np.real(towards * one), np.real(towards[:, None] * turned)
+
+
+def _times(most: Array, along: tuple[Array, Array]) -> tuple[Array, Array]:
+    return most * along[0], most[:, None] * along[1]
 
 
 def _ask_changed(cones: "_Cones", loop: InnovationLoop, f: Array, q: Array) -> None:
     (s, by_tap), (one, turned) = loop.fraction(f, cones.taps)
-    last = one + turned @ q
-    towards = np.conj(last) / np.abs(last)
-    real, real_by_tap = np.real(towards * one), np.real(towards[:, None] * turned)
-    cones.keep(real - _TURN * np.abs(last), real_by_tap)
-    near = np.abs(s + by_tap @ q) > _FAR * loop.peak_s * np.abs(last)
+    last = np.abs(one + turned @ q)
+    along, along_by_tap = _along(one, turned, q)
+    cones.keep(along - _TURN * last, along_by_tap)
+    near = np.abs(s + by_tap @ q) > _FAR * loop.peak_s * last
     loop.close_hz = np.union1d(loop.close_hz, f[near])
     near = np.isin(f, np.union1d(loop.close_hz, loop.more_hz)) | (not q.any())  # with the first taps everything moves
-    bound, bound_by_tap = loop.peak_s * real[near], loop.peak_s * real_by_tap[near]
+    bound, bound_by_tap = loop.peak_s * along[near], loop.peak_s * along_by_tap[near]
     cones.add(bound, bound_by_tap, s[near], by_tap[near], may_be_conceded=True)
 
 
@@ -276,7 +302,7 @@ class _Cones:
     def add(
         self,
         bound: Array,
-        bound_by_tap: Array | None,
+        bound_by_tap: Array,
         value: Complex,
         by_tap: Complex,
         *,
@@ -284,9 +310,7 @@ class _Cones:
     ) -> None:
         """|value + by_tap x| <= bound + bound_by_tap x at frequencies (m,), and more by the concession."""
         rows = np.zeros((len(bound), 3, self.taps + 1))
-        if bound_by_tap is not None:
-            rows[:, 0, :-1] = -bound_by_tap
-        rows[:, 1, :-1], rows[:, 2, :-1] = -by_tap.real, -by_tap.imag
+        rows[:, 0, :-1], rows[:, 1, :-1], rows[:, 2, :-1] = -bound_by_tap, -by_tap.real, -by_tap.imag
         rows[:, 0, -1] = -1.0 if may_be_conceded else 0.0
         self.cones.append(rows)
         self.cone_at.append(np.stack([bound, value.real, value.imag], axis=1))
