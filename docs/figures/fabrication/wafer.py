@@ -2,22 +2,25 @@
 yield` draws it.
 """
 
+import tempfile
+from dataclasses import replace
 from pathlib import Path
-
-import numpy as np
 
 from hil.pictures.wafer.loops import draw_loops
 from hil.pictures.wafer.overview import draw_wafer
 from hil.runs.scenario import load_scenario
 from hil.studies.wafer.causes import causes
 from hil.studies.wafer.closed_loop import PART_DEVICES, ClosedLoops
+from hil.studies.wafer.loop_causes import LoopCauses
 from hil.studies.wafer.shares import share_of
-from hil.studies.wafer.study import WaferStudy
+from hil.studies.wafer.study import Parts, WaferStudy, run_study
+from hil.studies.wafer.table import Table
 from pkxyz_ctrl.config.files import load
 from pkxyz_ctrl.config.stage import StageConfig
 from pkxyz_ctrl.fabrication.process import Process
+from pkxyz_ctrl.io.realtime import cores
 
-WAFERS, LOOPS = 400, 400
+WAFERS, LOOPS, LOOP_CAUSES = 400, 400, 256
 FOLDER = Path(__file__).parents[1]
 
 
@@ -29,10 +32,22 @@ def main() -> None:
     shares = {name.removeprefix("ok."): share_of(columns[name], columns["wafer"]) for name in study.requirement_columns}
     draw_wafer(process, columns, shares, causes(study, 4096), FOLDER / "wafer.png")
     asked = ClosedLoops(study, load_scenario("raster"), known=True, identified=True)
-    parts = [asked.part(number) for number in range(LOOPS // PART_DEVICES)]
-    rows = {name: np.concatenate([part[name] for part in parts]) for name in parts[0]}
-    shares = {name.removeprefix("ok."): share_of(rows[name], rows["device"]) for name in asked.verdict_columns}
-    draw_loops(asked, rows, shares, FOLDER / "wafer_loops.png")
+    _ = asked.mean_modes  # once here, not in each worker
+    moved = LoopCauses(replace(asked, identified=False))
+    with tempfile.TemporaryDirectory() as folder:
+        rows = worked(asked, LOOPS // PART_DEVICES, Path(folder, "loops")).read(
+            ["wafer", "handle_m", *asked.columns, *asked.verdict_columns], LOOPS
+        )
+        found = moved.found(worked(moved, moved.parts_for(LOOP_CAUSES), Path(folder, "causes")))
+    shares = {name.removeprefix("ok."): share_of(rows[name], rows["wafer"]) for name in asked.verdict_columns}
+    draw_loops(asked, rows, shares, found, FOLDER / "wafer_loops.png")
+
+
+def worked(asked: Parts, parts: int, folder: Path) -> Table:
+    """Its table, on all cores."""
+    table = Table(folder, "")
+    run_study(asked, parts, table, cores())
+    return table
 
 
 if __name__ == "__main__":

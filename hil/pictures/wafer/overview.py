@@ -1,6 +1,6 @@
 """What a process makes of a drawing, at a glance: the wafer, the shares, the spread of the figures, and its causes."""
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -24,7 +24,7 @@ from hil.pictures.style import (
     save,
     sheet,
 )  # fmt: skip
-from hil.studies.wafer.causes import ALL, Causes
+from hil.studies.wafer.causes import ALL, Causes, Indices
 from hil.studies.wafer.shares import Share
 from pkxyz_ctrl.fabrication.process import Process
 
@@ -66,7 +66,7 @@ def draw_wafer(
     if found is not None:
         gained, heat = rows[1].subplots(1, 2, width_ratios=(1.0, 2.0))
         _gains(gained, found)
-        _heat(heat, found)
+        draw_indices(heat, found.indices, [_words(name) for name in found.indices.figures])
     save(figure, path)
 
 
@@ -133,7 +133,8 @@ def _gains(plot: Axes, found: Causes) -> None:
     dress(plot, f"points of the share won ({found.share:.1%} here)", title="if it had no spread", grid="x")
 
 
-def _heat(plot: Axes, found: Causes) -> None:
+def draw_indices(plot: Axes, found: Indices, words: Sequence[str]) -> None:
+    """Causes by figures, which are called by ``words``."""
     plot.imshow(found.total, cmap=_SHADE, vmin=0.0, vmax=1.0, aspect="auto")
     for row in range(len(found.names)):
         for column in range(len(found.figures)):
@@ -142,7 +143,7 @@ def _heat(plot: Axes, found: Causes) -> None:
                 plot.annotate(f"{100 * value:.0f}", (column, row), ha="center", va="center", fontsize=SMALL_PT,
                               color="white" if value > 0.6 else INK)  # fmt: skip
     plot.set_yticks(range(len(found.names)), [_words(name) for name in found.names])
-    plot.set_xticks(range(len(found.figures)), [_words(name) for name in found.figures], rotation=35, ha="right")
+    plot.set_xticks(range(len(found.figures)), words, rotation=35, ha="right")
     dress(plot, title="part of each figure's variance that a cause has a hand in (%, Sobol's total index)", grid="")
     plot.tick_params(labelsize=SMALL_PT)
     plot.title.set_fontsize(LABEL_PT + 1)

@@ -2,10 +2,12 @@
 
 Two answers, on devices of wafers of their own, so that they are independent of each other:
 
-- Sobol's total indices (``scipy.stats.sobol_indices``, Saltelli et al. 2010): the part of a figure's variance that is
+- Sobol's total indices (Jansen: Computer Physics Communications 117 (1999) 35): the part of a figure's variance that is
   left when all but one quantity are known. The quantities are those of the process file, each with all its random
   numbers, and the place on the wafer.
 - The share of devices that work if a quantity had no spread at all and kept its mean: what could be gained at most.
+
+Of devices in a closed loop there are the indices alone (``loop_causes``): a run takes a thousand times as long.
 """
 
 from collections.abc import Callable
@@ -13,7 +15,6 @@ from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
-import scipy.stats
 from numpy.typing import NDArray
 
 from hil.studies.wafer.study import WaferStudy, spread_die
@@ -34,8 +35,8 @@ _FRESH = 1 << 32
 
 
 @dataclass(frozen=True)
-class Causes:
-    """By cause (rows: ``names``) and required figure (columns: ``figures``, the last one whether all are met)."""
+class Indices:
+    """By cause (rows: ``names``) and figure (columns: ``figures``)."""
 
     names: tuple[str, ...]
     figures: tuple[str, ...]
@@ -43,26 +44,41 @@ class Causes:
     """Sobol's total index, 0 to 1; 0 for a figure that does not differ"""
     error: Array
     """its standard error"""
+
+    def as_json(self) -> dict[str, dict[str, list[float]]]:
+        """Plain data: of each figure the index of each cause and its standard error."""
+        return {
+            figure: {name: [float(self.total[i, k]), float(self.error[i, k])] for i, name in enumerate(self.names)}
+            for k, figure in enumerate(self.figures)
+        }
+
+
+@dataclass(frozen=True)
+class Causes:
+    """What is asked of devices without a loop."""
+
+    indices: Indices
+    """of each required figure, and last of whether all are met"""
     share: float
     """that works, of these devices"""
     share_without: dict[str, float]
     """that would work if a quantity had no spread; by quantity"""
 
     def as_json(self) -> dict[str, Any]:
-        """Plain data: of each figure the index of each cause and its standard error."""
-        index = {
-            figure: {name: [float(self.total[i, k]), float(self.error[i, k])] for i, name in enumerate(self.names)}
-            for k, figure in enumerate(self.figures)
+        """Plain data."""
+        return {
+            "share": self.share,
+            "share_without": self.share_without,
+            "total_index_and_error": self.indices.as_json(),
         }
-        return {"share": self.share, "share_without": self.share_without, "total_index_and_error": index}
 
 
 def causes(study: WaferStudy, count: int, on_progress: Callable[[int, int], None] = lambda done, total: None) -> Causes:
     """From ``count`` devices, and as many again for each cause, twice."""
-    spread = tuple(name for name in SOURCES if _spreads(study, name))
-    names = (PLACE, *spread)
+    names = causes_of(study)
+    spread = names[1:]
     wanted = (*study.process.requirements, ALL)
-    a, b = _independent(study, 0, count), _independent(study, count, count)
+    a, b = independent(study, 0, count), independent(study, count, count)
     steps = len(names) + len(spread) + 2
 
     def look(asked: WaferStudy, sampled: Sampled, done: int) -> Array:
@@ -72,15 +88,27 @@ def causes(study: WaferStudy, count: int, on_progress: Callable[[int, int], None
         return np.stack([*(np.nan_to_num(found[name], posinf=_INFINITE) for name in wanted[:-1]), works])
 
     of_a, of_b = look(study, a, 1), look(study, b, 2)
-    mixed = np.stack([look(study, _mixed(a, b, name), 3 + k) for k, name in enumerate(names)])
+    of_mixed = np.stack([look(study, mixed(a, b, name), 3 + k) for k, name in enumerate(names)])
     without = [look(_without(study, name), a, 3 + len(names) + k)[-1].mean() for k, name in enumerate(spread)]
-    sobol = scipy.stats.sobol_indices(func={"f_A": of_a, "f_B": of_b, "f_AB": mixed}, n=count)
-    squares = 0.5 * (of_a - mixed) ** 2
-    variance = np.var(np.concatenate([of_a, of_b], axis=1), axis=1)
-    error = squares.std(axis=2) / np.sqrt(count) / np.where(variance > 0.0, variance, np.inf)
     return Causes(
-        names, wanted, sobol.total_order.T, error, float(of_a[-1].mean()), dict(zip(spread, without, strict=True))
+        indices(names, wanted, of_a, of_b, of_mixed), float(of_a[-1].mean()), dict(zip(spread, without, strict=True))
     )
+
+
+def indices(names: tuple[str, ...], wanted: tuple[str, ...], of_a: Array, of_b: Array, of_mixed: Array) -> Indices:
+    """From figures (figures, n) of two sets of devices, and (causes, figures, n) of the first one's with a cause from
+    the second.
+    """
+    squares = 0.5 * (of_a - of_mixed) ** 2
+    variance = np.var(np.concatenate([of_a, of_b], axis=1), axis=1)
+    scale = np.where(variance > 0.0, variance, np.inf)
+    error = squares.std(axis=2) / np.sqrt(of_a.shape[1]) / scale
+    return Indices(names, wanted, squares.mean(axis=2) / scale, error)
+
+
+def causes_of(study: WaferStudy) -> tuple[str, ...]:
+    """``PLACE``, and all that a process spreads."""
+    return (PLACE, *(name for name in SOURCES if _spreads(study, name)))
 
 
 def _spreads(study: WaferStudy, name: str) -> bool:
@@ -88,8 +116,8 @@ def _spreads(study: WaferStudy, name: str) -> bool:
     return any((s.wafer, s.tilt, s.bowl, s.die, s.chain))
 
 
-def _independent(study: WaferStudy, first: int, count: int) -> Sampled:
-    """Devices of as many wafers, on each another die."""
+def independent(study: WaferStudy, first: int, count: int) -> Sampled:
+    """Devices of as many wafers that no table has, on each another die."""
     dies = dies_per_wafer(study.process)
     found = []
     for begin in range(0, count, 64):
@@ -104,7 +132,7 @@ def _joined(parts: list[Deviates]) -> Deviates:
     return Deviates(*(np.concatenate([vars(p)[f] for p in parts]) for f in ("wafer", "tilt", "die", "chain")))
 
 
-def _mixed(a: Sampled, b: Sampled, name: str) -> Sampled:
+def mixed(a: Sampled, b: Sampled, name: str) -> Sampled:
     """a, with one cause from b."""
     if name == PLACE:
         return replace(a, place_m=b.place_m)

@@ -1,6 +1,7 @@
 """Sampled devices in a closed loop: margins, and the error of a scenario on the fast lane.
 
-Device k of this part lies on wafer k, so that the devices are independent of each other. Each is run under the law as
+Device k of this part lies on wafer k, so that the devices are independent of each other, or with ``per_wafer`` others
+on wafer k // per_wafer, all over it. Each is run under the law as
 shipped, which knows the drawing only, and if asked also under a law designed for
 
 - what `pkxyz identify` finds of it, from inside and with an instrument outside (``identified``);
@@ -34,12 +35,12 @@ from pkxyz_ctrl.config.stage import StageConfig
 from pkxyz_ctrl.design.identification.modal_fit import FitError, ModalFit
 from pkxyz_ctrl.design.law import design_law
 from pkxyz_ctrl.design.law_about import law_in_parts
-from pkxyz_ctrl.design.margins.margins import peak_sensitivity
+from pkxyz_ctrl.design.margins.margins import peak_and_rejection
 from pkxyz_ctrl.design.model.loop_plant import Perturbation, loop_plant
 from pkxyz_ctrl.fabrication.devices import Devices
 from pkxyz_ctrl.fabrication.figures import figures
 from pkxyz_ctrl.fabrication.process import SOURCES, Spread
-from pkxyz_ctrl.fabrication.wafer import dies_per_wafer, sample_devices, sample_numbered, sizes
+from pkxyz_ctrl.fabrication.wafer import Sampled, dies_per_wafer, sample_devices, sample_numbered, sizes
 from pkxyz_ctrl.stage import Stage
 from sim.config import Device, PlantConfig
 
@@ -47,13 +48,18 @@ Array = NDArray[np.float64]
 Triple = tuple[float, float, float]
 
 PART_DEVICES = 16
+PARTS_TOGETHER = 16
 LAWS = ("shipped", "identified", "instrument", "known")
 LOOP_FIGURES: dict[str, str] = {
     "peak_s": "largest singular value of the sensitivity, in the middle of the strokes; infinite: unstable",
+    "rejection_hz": "up to which |S| < -3 dB there; 0: unstable",
     "error_nm": "RMS error of the scenario's scan, of the worst axis; infinite: ended in a fault",
     "error_about_mean_nm": "the same about its own mean, which an offset shifts",
 }
 """Of each law: columns are ``shipped.peak_s`` and so on."""
+_MARGINS = ("peak_s", "rejection_hz")
+NO_LOOP = {name: 0.0 if name == "rejection_hz" else math.inf for name in LOOP_FIGURES}
+"""Of a device for which there is no law."""
 
 
 @dataclass(frozen=True)
@@ -66,8 +72,15 @@ class ClosedLoops:
     """also under a law designed for each device as it is"""
     identified: bool = False
     """also under laws designed for what an identification finds of it, from inside and with an instrument"""
+    per_wafer: int = 1
+    """devices of each wafer"""
 
     def __post_init__(self) -> None:
+        dies = dies_per_wafer(self.wafers.process)
+        if not 1 <= self.per_wafer <= dies:
+            raise ConfigError(
+                f"{self.wafers.process.name}: has {dies} devices a wafer; {self.per_wafer} were asked for"
+            )
         names = [f"{law}.{figure}" for law in LAWS for figure in LOOP_FIGURES]
         unknown = [name for name in self.wafers.process.closed_loop if name not in names]
         if unknown:
@@ -77,9 +90,15 @@ class ClosedLoops:
 
     def digest(self) -> str:
         """Of all that decides about a device's loop, its number apart."""
-        return config.digest(
-            {"wafers": self.wafers.digest(), "scenario": resolve(self.scenario), "laws": list(self.laws)}
-        )
+        return config.digest({
+            "wafers": self.wafers.digest(), "scenario": resolve(self.scenario), "laws": list(self.laws),
+            "per_wafer": self.per_wafer, "figures": list(LOOP_FIGURES),
+        })  # fmt: skip
+
+    @property
+    def together(self) -> int:
+        """Parts that a worker is handed at most: some seconds of work."""
+        return PARTS_TOGETHER
 
     @property
     def columns(self) -> tuple[str, ...]:
@@ -112,26 +131,30 @@ class ClosedLoops:
     def drawn_peak_s(self) -> float:
         """Ms of the drawing as drawn under the law as shipped."""
         drawn = self.wafers.as_drawn
-        return Truth(self.wafers.stage, drawn, drawn).peak_sensitivity(self._as_shipped)
+        return Truth(self.wafers.stage, drawn, drawn).margins(self._as_shipped)[0]
 
     def numbers(self, part: int) -> NDArray[np.int64]:
-        """Numbers of the devices of a part: one on each of its wafers."""
-        wafer = part * PART_DEVICES + np.arange(PART_DEVICES)
+        """Numbers of the devices of a part: ``per_wafer`` on each wafer, evenly over its dies."""
+        wafer, nth = np.divmod(part * PART_DEVICES + np.arange(PART_DEVICES), self.per_wafer)
         dies = dies_per_wafer(self.wafers.process)
-        return np.asarray(wafer * dies + spread_die(wafer, dies))
+        return np.asarray(wafer * dies + (spread_die(wafer, dies) + nth * dies // self.per_wafer) % dies)
 
     def part(self, number: int) -> dict[str, NDArray[Any]]:
         """All that is kept of the devices of a part: ``device`` is k, ``number`` what it has in the wafers' table."""
         numbers = self.numbers(number)
-        rows = self.devices(numbers)
-        found = {name: np.array([row[name] for row in rows], dtype=np.float64) for name in rows[0]}
         first = number * PART_DEVICES
         return {
             "device": np.arange(first, first + PART_DEVICES),
             "number": numbers,
-            **found,
-            **self.verdicts(found),
+            "wafer": numbers // dies_per_wafer(self.wafers.process),
+            **self.judged(sample_numbered(self.wafers.process, self.wafers.seed, numbers)),
         }
+
+    def judged(self, sampled: Sampled) -> dict[str, NDArray[Any]]:
+        """Figures of devices as columns, and of each requirement whether it is met."""
+        rows = self.sampled(sampled)
+        found = {name: np.array([row[name] for row in rows], dtype=np.float64) for name in rows[0]}
+        return {**found, **self.verdicts(found)}
 
     def verdicts(self, found: Mapping[str, Array]) -> dict[str, NDArray[np.bool_]]:
         """``ok.NAME`` for each requirement on the loop whose law was run; ``ok.LAW``: all of a law's and all of the
@@ -150,11 +173,14 @@ class ClosedLoops:
         return self.devices(np.array([number]))[0]
 
     def devices(self, numbers: NDArray[np.int64]) -> list[dict[str, float]]:
-        """Figures of devices by their numbers (n,), their sizes (of the chains, the mean), and whether each meets what
-        is asked of it without a loop (``own``: 1 or 0).
+        """``sampled`` of devices by their numbers (n,)."""
+        return self.sampled(sample_numbered(self.wafers.process, self.wafers.seed, numbers))
+
+    def sampled(self, sampled: Sampled) -> list[dict[str, float]]:
+        """Figures of devices, their sizes (of the chains, the mean), and whether each meets what is asked of it without
+        a loop (``own``: 1 or 0). Their numbers seed what is random in a run.
         """
-        of = self.wafers
-        sampled = sample_numbered(of.process, of.seed, numbers)
+        of, numbers = self.wafers, sampled.device
         size, made = sizes(of.process, sampled), of.made(sampled)
         meets = of.verdicts(figures(of.stage, of.as_drawn, made))["ok"]
         truths = [Truth(of.stage, of.as_drawn, made.take(np.array([n]))) for n in range(len(numbers))]
@@ -201,9 +227,7 @@ class ClosedLoops:
         setups = [self._setup(truth, number, law) for truth, number in zip(truths, numbers, strict=True)]
         errors = iter(scan_errors_nm([setup for setup in setups if setup is not None]))
         return [
-            dict.fromkeys(LOOP_FIGURES, math.inf)
-            if setup is None
-            else {"peak_s": truth.peak_sensitivity(setup), **next(errors)}
+            dict(NO_LOOP) if setup is None else dict(zip(_MARGINS, truth.margins(setup), strict=True)) | next(errors)
             for truth, setup in zip(truths, setups, strict=True)
         ]
 
@@ -294,8 +318,10 @@ class Truth:
         sections = {name: getattr(plant, name).model_copy(update={"on": True, **of}) for name, of in own.items()}
         return plant.model_copy(update=sections)
 
-    def peak_sensitivity(self, setup: Setup) -> float:
-        """Ms of this device under a setup's law, in the middle of the strokes, sensed and pulled as that law has it."""
+    def margins(self, setup: Setup) -> tuple[float, float]:
+        """Ms of this device under a setup's law and how far it rejects, in Hz, in the middle of the strokes, sensed and
+        pulled as that law has it.
+        """
         limits = self._drawing.limits
         strokes = np.full(3, 0.5 * (limits.stroke_min_m + limits.stroke_max_m))
         belief = _stage_of(setup.stage)
@@ -309,7 +335,7 @@ class Truth:
         holds, thinks = (s.holding_forces(s.forward_kinematics(strokes)) for s in (itself, belief))
         # by how much the controller is off about the forces that hold the point
         law = law_in_parts(belief, setup.law, strokes, Perturbation(comb_gain=_triple(pull * thinks / holds - 1.0)))
-        return peak_sensitivity(replace(plant, c=scale @ plant.c), law)
+        return peak_and_rejection(replace(plant, c=scale @ plant.c), law)
 
     def _links(self) -> dict[str, float | None]:
         return {

@@ -28,6 +28,8 @@ Columns = dict[str, NDArray[Any]]
 
 PART_WAFERS = 32
 """Wafers of a part: some seconds of work at most."""
+_RUNS = 4
+"""Of a worker, at least, before parts are handed out together: so that none waits long for the last."""
 
 
 @dataclass(frozen=True)
@@ -49,6 +51,11 @@ class WaferStudy:
                 f"{self.stage.name}: is one measured device, not a drawing; give the stage file it began as"
             )
         _ = self.as_drawn
+
+    @property
+    def together(self) -> int:
+        """Parts that a worker is handed at most."""
+        return 1
 
     @cached_property
     def as_drawn(self) -> Devices:
@@ -119,6 +126,11 @@ def within(values: Array, least: float | None, most: float | None) -> NDArray[np
 class Parts(Protocol):
     """Work in numbered parts, each a table's."""
 
+    @property
+    def together(self) -> int:
+        """Parts that a worker is handed at most."""
+        ...
+
     def part(self, number: int) -> Columns:
         """Columns of a part."""
         ...
@@ -135,14 +147,29 @@ def run_study(
     """Work out those of the first ``parts`` parts that are not in the table yet. Interrupted, it keeps those that are
     done.
     """
-    left = [part for part in range(parts) if part not in table.parts]
+    there = table.parts
+    left = [part for part in range(parts) if part not in there]
     on_progress(parts - len(left), parts)
     if workers == 1 and cluster is None:
-        _keep(((part, study.part(part)) for part in left), table, parts - len(left), parts, on_progress)
+        pieces = _pieces(left, study.together, 1)
+        _keep(((piece, _part(study, piece)) for piece in pieces), table, parts - len(left), parts, on_progress)
     elif left:
         with worker_pool(workers, cluster) as (pool, width):
-            done = as_done(pool, width, with_constant(_part, study), left, ahead=width)
+            pieces = _pieces(left, study.together, width)
+            done = as_done(pool, width, with_constant(_part, study), pieces, ahead=width)
             _keep(done, table, parts - len(left), parts, on_progress)
+
+
+def _pieces(left: list[int], together: int, width: int) -> list[range]:
+    """Parts that are left, in runs: as many together as leave each worker some runs."""
+    most = max(1, min(together, len(left) // (_RUNS * width)))
+    found: list[range] = []
+    for part in left:
+        if found and part == found[-1].stop and len(found[-1]) < most:
+            found[-1] = range(found[-1].start, part + 1)
+        else:
+            found.append(range(part, part + 1))
+    return found
 
 
 def parts_for(process: Process, devices: int) -> int:
@@ -150,8 +177,9 @@ def parts_for(process: Process, devices: int) -> int:
     return -(-devices // (PART_WAFERS * dies_per_wafer(process)))
 
 
-def _part(study: Parts, part: int) -> Columns:
-    return study.part(part)
+def _part(study: Parts, parts: range) -> Columns:
+    found = [study.part(part) for part in parts]
+    return {name: np.concatenate([columns[name] for columns in found]) for name in found[0]}
 
 
 def spread_die(wafer: NDArray[np.int64], dies: int) -> NDArray[np.int64]:
@@ -160,11 +188,12 @@ def spread_die(wafer: NDArray[np.int64], dies: int) -> NDArray[np.int64]:
 
 
 def _keep(
-    done: Iterator[tuple[int, Columns]], table: Table, before: int, parts: int, tell: Callable[[int, int], None]
+    done: Iterator[tuple[range, Columns]], table: Table, before: int, parts: int, tell: Callable[[int, int], None]
 ) -> None:
-    for n, (part, columns) in enumerate(done, start=before + 1):
-        table.add(part, columns)
-        tell(n, parts)
+    for piece, columns in done:
+        table.add(piece, columns)
+        before += len(piece)
+        tell(before, parts)
 
 
 def _told(work: Callable[[], Devices]) -> Devices:

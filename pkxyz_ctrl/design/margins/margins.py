@@ -153,19 +153,37 @@ def peak_sensitivity(plant: LoopPlant, law: DiscreteLaw | TappedLaw) -> float:
     """Ms of the MIMO system alone, as ``margins`` has it to 1e-4 of it; infinite for an unstable loop. For searches
     over many: a filter of taps that is given apart costs a tenth.
     """
+    seen = _seen(plant, law)
+    return math.inf if seen is None else _peak_sensitivity(*seen)
+
+
+def peak_and_rejection(plant: LoopPlant, law: DiscreteLaw | TappedLaw) -> tuple[float, float]:
+    """``peak_sensitivity``, and up to how many Hz the MIMO system's |S| < -3 dB; 0 for an unstable loop."""
+    seen = _seen(plant, law)
+    if seen is None:
+        return math.inf, 0.0
+    grid, size, size_at = seen
+    return _peak_sensitivity(*seen), first_above(grid, size, size_at, HALF_POWER)
+
+
+_Size = tuple[Array, Array, Callable[[Array], Array]]
+
+
+def _seen(plant: LoopPlant, law: DiscreteLaw | TappedLaw) -> _Size | None:
+    """Frequencies (m,), |S| there, and as a function of frequencies; None for an unstable loop."""
     if isinstance(law, TappedLaw):
         tapped = TappedSensitivity(plant, law)
         stable, grid, s = tapped.resolved(_grid_hz([tapped.base_poles], plant.period_s, 200, 6))
-        return _peak_sensitivity(grid, s, tapped) if stable else math.inf
+        return (grid, largest_singular_value(s), lambda f: largest_singular_value(tapped(f))) if stable else None
     sensitivity = Sensitivity(plant, law)
     if not sensitivity.spectral_radius < 1.0:
-        return math.inf
+        return None
     grid = _grid_hz([sensitivity.poles], plant.period_s, 200, 6)
-    return _peak_sensitivity(grid, sensitivity(grid), sensitivity)
+    return grid, largest_singular_value(sensitivity(grid)), lambda f: largest_singular_value(sensitivity(f))
 
 
-def _peak_sensitivity(grid_hz: Array, s: Complex, sensitivity: Callable[[Array], Complex]) -> float:
-    return peak(grid_hz, largest_singular_value(s), lambda f: largest_singular_value(sensitivity(f)), rounds=3)
+def _peak_sensitivity(grid_hz: Array, size: Array, size_at: Callable[[Array], Array]) -> float:
+    return peak(grid_hz, size, size_at, rounds=3)
 
 
 def axis_margins(grid_hz: Array, s: Complex, sensitivity: Callable[[Array], Complex]) -> AxisMargins:

@@ -12,7 +12,7 @@ from pkxyz_ctrl.config.files import load
 from pkxyz_ctrl.design.law import design_law
 from pkxyz_ctrl.design.law_about import law_about, law_in_parts
 from pkxyz_ctrl.design.margins import sensitivity
-from pkxyz_ctrl.design.margins.margins import margins, peak_sensitivity
+from pkxyz_ctrl.design.margins.margins import margins, peak_and_rejection, peak_sensitivity
 from pkxyz_ctrl.design.margins.modal import add_up, split
 from pkxyz_ctrl.design.margins.sensitivity import Transfer
 from pkxyz_ctrl.design.margins.tolerances import Tolerances
@@ -47,6 +47,16 @@ def test_ms_is_that_by_substitution(name, taps, monkeypatch):
     assert found == pytest.approx([peak_sensitivity(*loop) for loop in asked], rel=1e-9)
     if taps > 1.0:
         assert np.isinf(found).any()
+
+
+@pytest.mark.parametrize("name", ["youla", "lqg", "irc"])
+def test_ms_and_rejection_alone_are_those_of_all_margins(name):
+    for (plant, in_parts), (_, about) in zip(loops(name, 12), loops(name, 12, law_about), strict=True):
+        expected = margins(plant, about).mimo
+        assert peak_and_rejection(plant, in_parts) == (
+            peak_sensitivity(plant, in_parts), pytest.approx(expected.bandwidth_hz, rel=1e-6)
+        )  # fmt: skip
+        assert peak_sensitivity(plant, in_parts) == pytest.approx(expected.peak_s, rel=1e-4)
 
 
 @pytest.mark.parametrize("name", ["youla", "lqg", "irc"])

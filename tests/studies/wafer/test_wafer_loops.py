@@ -45,10 +45,8 @@ def test_a_device_as_drawn_runs_and_holds_as_the_scenario_itself():
     setup = SCENARIO.setup()
     metrics = Metrics(setup.trajectory, setup.bus.period_us)
     lanes.run(setup, Lane.FAST, on_block=metrics.update)
-    truth = Truth(STAGE, devices(), devices())
-    assert truth.peak_sensitivity(setup) == pytest.approx(
-        Loop(Stage(setup.stage), setup.bus, setup.law).margins(MIDDLE).mimo.peak_s, rel=1e-3
-    )
+    truth, drawn = Truth(STAGE, devices(), devices()), Loop(Stage(setup.stage), setup.bus, setup.law).margins(MIDDLE)
+    assert truth.margins(setup) == pytest.approx((drawn.mimo.peak_s, drawn.mimo.bandwidth_hz), rel=1e-3)
     found = asked.device(0)
     drawn_nm = max(metrics.figures().rms_error_nm.values())
     for law in ("shipped", "known"):
@@ -106,6 +104,25 @@ def test_a_part_is_its_devices_one_on_each_wafer():
     assert all(part[name][3] == value for name, value in alone.items())
     assert set(asked.verdict_columns) <= part.keys()
     assert part["ok.shipped"].dtype == bool
+
+
+@pytest.mark.parametrize("per_wafer", [2, 3, 76])
+def test_so_many_devices_lie_on_each_wafer_all_over_it(per_wafer):
+    asked = replace(loops(known=False), per_wafer=per_wafer)
+    dies = dies_per_wafer(SHIPPED)
+    numbers = np.concatenate([asked.numbers(part) for part in range(-(-per_wafer * 8 // PART_DEVICES))])
+    numbers = numbers[: per_wafer * 8]
+    assert (numbers // dies).tolist() == np.repeat(np.arange(8), per_wafer).tolist()
+    gaps = np.diff(np.sort((numbers % dies).reshape(8, per_wafer), axis=1), axis=1)
+    assert gaps.min() >= dies // per_wafer  # so each die once at most
+    assert numbers[::per_wafer].tolist() == loops(known=False).numbers(0)[:8].tolist()
+    assert asked.digest() != loops(known=False).digest()
+
+
+@pytest.mark.parametrize("per_wafer", [0, 77])
+def test_more_devices_than_a_wafer_has_are_refused(per_wafer):
+    with pytest.raises(ConfigError, match=f"has 76 devices a wafer; {per_wafer} were asked for"):
+        replace(loops(), per_wafer=per_wafer)
 
 
 def test_devices_at_once_are_the_same_to_the_bit_as_each_alone():

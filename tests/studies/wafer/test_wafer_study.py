@@ -113,12 +113,12 @@ def test_the_causes_of_a_product_share_its_variance_as_their_own():
         requirements={"frequency_low_hz": Bound(min=631.0), "mass": Bound(max=0.5)},
     )  # fmt: skip
     found = causes(study(of), 1024)
-    assert found.names == (PLACE, "layer_2_m", "alignment_x_m", "youngs_modulus")
+    assert found.indices.names == (PLACE, "layer_2_m", "alignment_x_m", "youngs_modulus")
     of_mass = SHIPPED.made_of.mass_layer_2 * 3.0 / 27.0
     expected = np.array([0.0, of_mass**2, 0.0, 0.010**2]) / (of_mass**2 + 0.010**2)
-    assert found.total[:, 0] == pytest.approx(expected, abs=0.03)
-    assert np.all(np.abs(found.total[:, 0] - expected) < 4 * found.error[:, 0] + 5e-4)
-    assert found.total[:, 1] == pytest.approx([0.0, 1.0, 0.0, 0.0], abs=0.1)
+    assert found.indices.total[:, 0] == pytest.approx(expected, abs=0.03)
+    assert np.all(np.abs(found.indices.total[:, 0] - expected) < 4 * found.indices.error[:, 0] + 5e-4)
+    assert found.indices.total[:, 1] == pytest.approx([0.0, 1.0, 0.0, 0.0], abs=0.1)
     # half fails; without the larger cause it is still half: what is won is told only by where the bound lies
     assert found.share == pytest.approx(0.5, abs=0.06)
 
@@ -131,6 +131,41 @@ def test_what_costs_devices_is_what_wins_them_without_its_spread():
     assert found.share_without["hinge_m"] == 1.0
     assert found.share_without["youngs_modulus"] == pytest.approx(found.share, abs=0.02)
     assert json.loads(json.dumps(found.as_json()))["share"] == found.share
+
+
+def test_any_number_of_devices_tells_causes():
+    """One that is no power of 2."""
+    of = process(hinge_m=Spread(wafer=0.5e-6), requirements={"top_v": Bound(max=186.0)})
+    found = causes(study(of), 100).indices
+    assert found.total[1] == pytest.approx(1.0, abs=4.0 * found.error[1, 0])
+
+
+class Counted:
+    """Parts of two rows that say which they are."""
+
+    together = 4
+
+    def part(self, number):
+        return {"device": np.arange(2 * number, 2 * number + 2)}
+
+
+def test_parts_are_handed_out_together_where_many_are_left_and_are_the_same_table(tmp_path):
+    """Those in the middle were there."""
+    table = Table(tmp_path, "asked")
+    table.add(range(5, 7), Counted().part(5) | {"device": np.arange(10, 14)})
+    told = []
+    run_study(Counted(), 20, table, 1, on_progress=lambda done, total: told.append((done, total)))
+    assert told == [(2, 20), (6, 20), (7, 20), (11, 20), (15, 20), (19, 20), (20, 20)]
+    names = sorted(path.name for path in tmp_path.iterdir())
+    assert names[:3] == ["part-000000-000003.parquet", "part-000004.parquet", "part-000005-000006.parquet"]
+    again = Table(tmp_path, "asked")
+    assert again.parts == set(range(20))
+    assert again.read(["device"], 33)["device"].tolist() == list(range(33))
+
+
+def test_a_worker_gets_single_parts_where_few_are_left(tmp_path):
+    run_study(Counted(), 7, Table(tmp_path, "asked"), 1)
+    assert len(list(tmp_path.iterdir())) == 7
 
 
 def test_what_can_not_be_asked_is_refused_in_a_line():
