@@ -6,8 +6,8 @@ from dataclasses import dataclass
 from pathlib import Path
 
 RESULTS = Path(__file__).parents[2] / "benchmarks" / "results.json"
-DEVICES_A_PIECE = 16
-"""Of ``pkxyz yield``, ``PART_DEVICES``."""
+DEVICES_A_PIECE = 256
+"""Of a large ``pkxyz yield``: ``PART_DEVICES`` in each of ``PARTS_TOGETHER``."""
 
 
 @dataclass(frozen=True)
@@ -21,6 +21,10 @@ class Plan:
     piece_s: float
     """of the scheduler's process for one piece of work"""
     worker_bytes: float
+    sent_bytes: float
+    """to a worker with each piece"""
+    back_bytes: float
+    """from it"""
 
     @property
     def core_s(self) -> float:
@@ -48,9 +52,9 @@ class Plan:
         return math.ceil(self.cores / self.fed)
 
     @property
-    def devices_a_piece(self) -> int:
-        """With which one scheduler feeds them all."""
-        return math.ceil(self.piece_s * self.devices / self.time_s)
+    def carried_bytes_per_s(self) -> float:
+        """Through all schedulers, both ways."""
+        return (self.sent_bytes + self.back_bytes) * self.devices / DEVICES_A_PIECE / self.time_s
 
 
 def planned(devices: float, time_s: float) -> Plan:
@@ -58,7 +62,7 @@ def planned(devices: float, time_s: float) -> Plan:
     figures = {f["name"]: f["value"] for f in json.loads(RESULTS.read_text(encoding="utf-8"))["figures"]}
     return Plan(
         devices, time_s, figures["study.device"] * 1e-3, figures["spread.piece"] * 1e-3,
-        figures["spread.worker_memory"] * 1e6,
+        figures["spread.worker_memory"] * 1e6, figures["spread.piece_sent"] * 1e3, figures["spread.piece_back"] * 1e3,
     )  # fmt: skip
 
 
@@ -68,10 +72,12 @@ def rows() -> list[list[str]]:
     return [
         ["a device: margins, and a run with a scan of 0.3 s", "measured", f"{million.device_s * 1e3:.1f} ms of a core"],
         ["a worker's memory", "measured", f"{million.worker_bytes * 1e-6:.0f} MB"],
-        [f"a piece of {DEVICES_A_PIECE} devices", "measured", f"{million.piece_s * 1e3:.1f} ms of the scheduler"],
+        [f"a piece of {DEVICES_A_PIECE} devices", "measured",
+         f"{million.piece_s * 1e3:.1f} ms of the scheduler; {million.sent_bytes * 1e-3:.0f} kB to a worker, "
+         f"{million.back_bytes * 1e-3:.0f} kB back"],
         ["10^6 devices", "calculated", f"{million.core_s / 3600.0:.1f} core-hours"],
         ["one scheduler feeds", "calculated", f"{million.fed} workers"],
         ["10^9 devices in an hour", "calculated",
          f"{billion.cores} cores, {billion.memory_bytes * 1e-12:.1f} TB; {billion.schedulers} schedulers with numbers "
-         f"of their own, or pieces of {billion.devices_a_piece} devices"],
+         f"of their own, {billion.carried_bytes_per_s * 1e-6:.0f} MB/s through them"],
     ]  # fmt: skip

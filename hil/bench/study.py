@@ -3,18 +3,21 @@ montecarlo` and `pkxyz tune` use them; what a device of `pkxyz yield` costs; and
 """
 
 import gc
+import pickle
 import statistics
 import time
 from importlib.util import find_spec
 
+import numpy as np
+
 from hil.bench.rigs.figure import Figure
 from hil.runs.scenario import Scenario, build_scenario, load_scenario
-from hil.studies.montecarlo import PLANTS_AT_ONCE, Study, run_one
+from hil.studies.montecarlo import Study, run_one
 from hil.studies.spread.cluster import Cluster
 from hil.studies.spread.workers import Pool, as_done, with_constant, worker_pool
 from hil.studies.tune.search import evaluate, load_problem
-from hil.studies.wafer.closed_loop import PART_DEVICES, ClosedLoops
-from hil.studies.wafer.study import WaferStudy
+from hil.studies.wafer.closed_loop import PART_DEVICES, PARTS_TOGETHER, ClosedLoops
+from hil.studies.wafer.study import Columns, WaferStudy, work_at
 from pkxyz_ctrl.config.files import load, plain
 from pkxyz_ctrl.design.margins.tolerances import Tolerances
 from pkxyz_ctrl.fabrication.process import Process
@@ -31,8 +34,11 @@ SCAN_LINES, SCAN_LAYERS, SCAN_HOLD_S, SCAN_RUN_S = 9, 2, 0.05, 0.5
 """A scan of 0.3 s at 60 lines/s; the holds before and after it; the run, start-up and the way there included."""
 PARTS = 8
 """Of ``PART_DEVICES`` each."""
-PIECES = 2000
-"""That do nothing."""
+PIECE_DEVICES = PARTS_TOGETHER * PART_DEVICES
+"""Of a large yield."""
+PIECES = 1000
+"""That take no time."""
+HELD_PIECES = 4
 
 
 def study() -> list[Figure]:
@@ -75,8 +81,9 @@ def study() -> list[Figure]:
 
 
 def spread() -> list[Figure]:
-    """What it takes to work in several processes: plants on two against one, a worker's memory, and the time of the
-    process in which a Dask scheduler and its client are, for pieces that do nothing (where distributed is installed).
+    """What it takes to work in several processes: plants on two against one; of a large `pkxyz yield` what a worker
+    holds and what a piece is made of, and the time of the process in which a Dask scheduler and its client are for
+    pieces as large that take no time (where distributed is installed).
     """
     plants = Study(load_scenario("raster", controller="lqg"), load("tolerances", "wide", Tolerances))
     alone: list[float] = []
@@ -90,26 +97,65 @@ def spread() -> list[Figure]:
                 begin = time.perf_counter()
                 list(as_done(pool, width, with_constant(_timed, plants), seeds, ahead=width))
                 walls.append(time.perf_counter() - begin)
-        memory = [mb for _, mb in as_done(one, 1, _memory_mb, range(1))]
+    loops = _loops()
+    with worker_pool(1) as (one, _):
+        held = [mb for _, mb in as_done(one, 1, with_constant(_held_mb, loops), _yield_pieces(HELD_PIECES))]
+    sent, back = _carried_bytes(loops)
     ratios = [a / b for a, b in zip(alone, both, strict=True)]
     found = [
         Figure("spread.two_workers", min(alone) / min(both), "times", 1.8, "at least", statistics.median(ratios),
                f"{SPREAD_PLANTS} plants on two local workers against one, by the clock on the wall, in turn"),
-        Figure("spread.worker_memory", max(memory), "MB", None, None, None,
-               f"most that a worker held, libraries and kernels included, after {ROUNDS * SPREAD_PLANTS} plants"),
+        Figure("spread.worker_memory", max(held), "MB", None, None, None,
+               f"most that a worker held, libraries and kernels included, after {HELD_PIECES} pieces of `pkxyz yield`, "
+               f"{PIECE_DEVICES} devices each"),
+        Figure("spread.piece_sent", sent * 1e-3, "kB", None, None, None,
+               "what goes to a worker with each such piece: the study, and which devices"),
+        Figure("spread.piece_back", back * 1e-3, "kB", None, None, None, "what comes back: all columns of its devices"),
     ]  # fmt: skip
     if find_spec("distributed") is None:
         return found
-    piece_ms = _piece_ms()
+    piece_ms = _piece_ms(loops)
     return [
         *found,
         Figure("spread.piece", min(piece_ms), "ms", None, None, statistics.median(piece_ms),
-               "processor time of a Dask scheduler and its client for one piece of work; a piece has up to "
-               f"{PLANTS_AT_ONCE} plants"),
+               "processor time of a Dask scheduler and its client for a piece that carries as much"),
     ]  # fmt: skip
 
 
-def _piece_ms() -> list[float]:
+def _loops() -> ClosedLoops:
+    """Devices as ``study.device`` has them."""
+    scenario = short_scan()
+    return ClosedLoops(WaferStudy(load("processes", "oreo_drie", Process), scenario.stage, 1), scenario, known=False)
+
+
+def _yield_pieces(count: int) -> list[range]:
+    return [range(first, first + PARTS_TOGETHER) for first in range(0, count * PARTS_TOGETHER, PARTS_TOGETHER)]
+
+
+def _held_mb(loops: ClosedLoops, parts: range) -> float:
+    """Most memory that this process has had, in MB, a piece later."""
+    import resource  # which not every system has
+
+    work_at(loops, parts)
+    return resource.getrusage(resource.RUSAGE_SELF).ru_maxrss * 1024e-6
+
+
+def _carried_bytes(loops: ClosedLoops) -> tuple[int, int]:
+    """Of a piece: to a worker and back."""
+    piece = range(PARTS_TOGETHER)
+    return len(pickle.dumps((with_constant(work_at, loops), piece))), len(pickle.dumps(_as_many(loops.part(0), piece)))
+
+
+def _as_many(columns: Columns, parts: range) -> Columns:
+    """Columns of a part as often as there are parts."""
+    return {name: np.tile(values, len(parts)) for name, values in columns.items()}
+
+
+def _carried(given: tuple[ClosedLoops, Columns], parts: range) -> Columns:
+    return _as_many(given[1], parts)
+
+
+def _piece_ms(loops: ClosedLoops) -> list[float]:
     from distributed import LocalCluster
 
     found = []
@@ -119,18 +165,14 @@ def _piece_ms() -> list[float]:
         ) as cluster,
         worker_pool(1, Cluster(cluster.scheduler_address)) as (pool, width),
     ):
-        list(as_done(pool, width, abs, range(100), ahead=width))
+        work = with_constant(_carried, (loops, loops.part(0)))
+        list(as_done(pool, width, work, _yield_pieces(100), ahead=width))
         for _ in range(ROUNDS):
             begin = time.process_time()
-            list(as_done(pool, width, abs, range(PIECES), ahead=width))
+            for _, columns in as_done(pool, width, work, _yield_pieces(PIECES), ahead=width):
+                assert len(columns["device"]) == PIECE_DEVICES
             found.append((time.process_time() - begin) / PIECES * 1e3)
     return found
-
-
-def _memory_mb(_: int) -> float:
-    import resource  # which not every system has
-
-    return resource.getrusage(resource.RUSAGE_SELF).ru_maxrss * 1024e-6
 
 
 def short_scan() -> Scenario:
@@ -143,9 +185,7 @@ def short_scan() -> Scenario:
 
 
 def _device_ms(pool: Pool, width: int) -> list[float]:
-    scenario = short_scan()
-    loops = ClosedLoops(WaferStudy(load("processes", "oreo_drie", Process), scenario.stage, 1), scenario, known=False)
-    timed = with_constant(_timed_part, loops)
+    timed = with_constant(_timed_part, _loops())
     list(as_done(pool, width, timed, range(2 * WORKERS)))
     return [cpu_s / PART_DEVICES * 1e3 for _, cpu_s in as_done(pool, width, timed, range(4, 4 + PARTS))]
 

@@ -23,6 +23,10 @@ if TYPE_CHECKING:
     from hil.studies.wafer.study import Parts
     from hil.studies.wafer.table import Table
 
+LAW_WORDS = {
+    "shipped": "the drawing", "identified": "what `pkxyz identify` finds from inside",
+    "instrument": "what it finds with an instrument outside", "known": "the device as it is",
+}  # fmt: skip
 _LEAST = 0.02
 """Of an index that is said."""
 Sensitivity = Annotated[
@@ -200,14 +204,11 @@ def _show(data: dict[str, Any]) -> None:
     print_whole(table)
     if data["loops"]:
         devices = next(iter(data["loops"].values()))["devices"]
+        laws = [f"{LAW_WORDS[name]} ({name})" for name in data["loops"] if name in LAW_WORDS]
         say(
-            f"in a closed loop, {devices} devices on {data['loop_wafers']} wafers, each law designed for: the drawing "
-            "(shipped), the device (known)"
+            f"in a closed loop, {devices} devices on {data['loop_wafers']} wafers, each under a law designed for "
+            + ", ".join(laws)
         )
-        if "identified.peak_s" in data["loops"]:
-            say(
-                "or what `pkxyz identify` finds of it from inside (identified), with an instrument outside (instrument)"
-            )
         table = plain_table("requirement", "met", "95 %", left=("95 %",))
         for name, share in data["loops"].items():
             words = name if "." in name else f"{name}, all of them and the device's own"

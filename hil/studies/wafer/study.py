@@ -152,11 +152,11 @@ def run_study(
     on_progress(parts - len(left), parts)
     if workers == 1 and cluster is None:
         pieces = _pieces(left, study.together, 1)
-        _keep(((piece, _part(study, piece)) for piece in pieces), table, parts - len(left), parts, on_progress)
+        _keep(((piece, work_at(study, piece)) for piece in pieces), table, parts - len(left), parts, on_progress)
     elif left:
         with worker_pool(workers, cluster) as (pool, width):
             pieces = _pieces(left, study.together, width)
-            done = as_done(pool, width, with_constant(_part, study), pieces, ahead=width)
+            done = as_done(pool, width, with_constant(work_at, study), pieces, ahead=width)
             _keep(done, table, parts - len(left), parts, on_progress)
 
 
@@ -177,7 +177,8 @@ def parts_for(process: Process, devices: int) -> int:
     return -(-devices // (PART_WAFERS * dies_per_wafer(process)))
 
 
-def _part(study: Parts, parts: range) -> Columns:
+def work_at(study: Parts, parts: range) -> Columns:
+    """Columns of a run of parts."""
     found = [study.part(part) for part in parts]
     return {name: np.concatenate([columns[name] for columns in found]) for name in found[0]}
 
