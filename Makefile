@@ -7,6 +7,7 @@
 # make test-page  a headless Chromium, fetched if there is none, drives the page of pkxyz serve
 # make bench  measure what the docs promise and print it
 # make mutate change one thing at a time in gate, modes, monitors, comb law and codec: does a test notice? SECONDS=1200
+# make both-ways  every case of the fault matrix in whole ticks and event by event, under LAWS on BUSES: the same bits?
 # make prove  every state that shipped controller and node can reach under any law with up to three faults: EXPLORED="one two"
 # make coverage  branches and conditions (MC/DC) of safety, codec, driver, start-up and the node's drive path, met by tests
 # make fuzz   hostile frames and broken documents: FRAMES=1000000 DOCUMENTS=10000
@@ -16,7 +17,7 @@
 PYTHON ?= python3
 BIN := .venv/bin
 
-.PHONY: sil live test test-socketcan test-peers test-firmware test-page bench docs docs-site wheel clean mutate fuzz kills prove coverage
+.PHONY: sil live test test-socketcan test-peers test-firmware test-page bench docs docs-site wheel clean mutate fuzz kills prove coverage both-ways
 
 sil: .venv/.ready
 	$(BIN)/pkxyz sil
@@ -50,6 +51,12 @@ bench: .venv/.ready
 SECONDS ?= 1200
 mutate: .venv/.ready
 	$(BIN)/python tests/mutation/mutate.py --seconds $(SECONDS) --report
+
+LAWS ?= lqg youla
+BUSES ?= fd_5k classic_2k unix_1k
+both-ways: .venv/.ready
+	$(BIN)/python tests/whole_ticks/both_ways.py $(LAWS:%=--law %) $(BUSES:%=--bus %)
+	$(BIN)/python tests/whole_ticks/both_ways.py --lasting $(LAWS:%=--law %) $(BUSES:%=--bus %)
 
 prove: .venv/.ready
 	$(BIN)/python tests/proof/explore.py $(EXPLORED)
