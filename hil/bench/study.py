@@ -3,7 +3,6 @@ montecarlo` and `pkxyz tune` use them; what a device of `pkxyz yield` costs; and
 """
 
 import gc
-import pickle
 import statistics
 import time
 from importlib.util import find_spec
@@ -14,7 +13,7 @@ from hil.bench.rigs.figure import Figure
 from hil.runs.scenario import Scenario, build_scenario, load_scenario
 from hil.studies.montecarlo import Study, run_one
 from hil.studies.spread.cluster import Cluster
-from hil.studies.spread.workers import Pool, as_done, with_constant, worker_pool
+from hil.studies.spread.workers import Pool, as_done, packed_bytes, with_constant, worker_pool
 from hil.studies.tune.search import evaluate, load_problem
 from hil.studies.wafer.closed_loop import PART_DEVICES, PARTS_TOGETHER, ClosedLoops
 from hil.studies.wafer.study import Columns, WaferStudy, work_at
@@ -143,7 +142,7 @@ def _held_mb(loops: ClosedLoops, parts: range) -> float:
 def _carried_bytes(loops: ClosedLoops) -> tuple[int, int]:
     """Of a piece: to a worker and back."""
     piece = range(PARTS_TOGETHER)
-    return len(pickle.dumps((with_constant(work_at, loops), piece))), len(pickle.dumps(_as_many(loops.part(0), piece)))
+    return packed_bytes((with_constant(work_at, loops), piece)), packed_bytes(_as_many(loops.part(0), piece))
 
 
 def _as_many(columns: Columns, parts: range) -> Columns:
@@ -151,8 +150,8 @@ def _as_many(columns: Columns, parts: range) -> Columns:
     return {name: np.tile(values, len(parts)) for name, values in columns.items()}
 
 
-def _carried(given: tuple[ClosedLoops, Columns], parts: range) -> Columns:
-    return _as_many(given[1], parts)
+def _carried(study: tuple[ClosedLoops, Columns], parts: range) -> Columns:
+    return _as_many(study[1], parts)
 
 
 def _piece_ms(loops: ClosedLoops) -> list[float]:

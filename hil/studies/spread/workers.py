@@ -112,6 +112,11 @@ def with_constant(function: Callable[[Any, Item], Result], constant: object) -> 
     return partial(_on_unpacked, function, pickle.dumps(constant))
 
 
+def packed_bytes(carried: object) -> int:
+    """How much crosses to another process, or back."""
+    return len(pickle.dumps(carried))
+
+
 def _on_unpacked(function: Callable[[Any, Item], Result], packed: bytes, item: Item) -> Result:
     return function(_unpacked(packed), item)
 
