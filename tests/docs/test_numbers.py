@@ -222,7 +222,7 @@ def test_how_far_sampled_devices_are_off_in_a_circle() -> None:
     assert run_one(study, kept["max_seed"]).rms_error_nm == pytest.approx(kept["max"], rel=1e-6)
 
 
-def test_how_far_the_laws_reject_and_what_works_of_a_wafer() -> None:
+def test_how_far_the_laws_reject() -> None:
     """As the pictures have it that stand beside."""
     rows = json.loads((ROOT / "docs" / "figures" / "margins.json").read_text(encoding="utf-8"))["rows"]
     hz = {row[0].strip("`"): row[3] for row in rows}
@@ -233,10 +233,33 @@ def test_how_far_the_laws_reject_and_what_works_of_a_wafer() -> None:
     assert f"rejection to {hz['youla']} Hz, 1 um jumps" in own
     assert f"disturbances above {hz['lqg']} Hz matter" in own
     assert f"rejection to {hz['robust']} Hz, stable on all" in own
-    drawings = json.loads((ROOT / "docs/figures/fabrication/for_yield.json").read_text(encoding="utf-8"))["drawings"]
+
+
+def test_what_works_of_drawings_with_the_interval_of_each_and_what_differs_in_a_loop() -> None:
+    """As the pictures have it that stand beside."""
     text = page("docs/do/wafer.md")
-    assert f"Of plain `design`'s devices {100 * drawings['design']['works']:.0f} % work" in text
-    assert f"of the paper's {100 * drawings['reconstructed']['works']:.0f} %;" in text
+    found = json.loads((ROOT / "docs/figures/fabrication/for_yield.json").read_text(encoding="utf-8"))
+    works = {name: row["works"] for name, row in found["drawings"].items()}
+    told = {name: "{:.0f} % ({:.0f} to {:.0f})".format(*(100.0 * s[k] for k in ("value", "low", "high")))
+            for name, s in works.items()}  # fmt: skip
+    assert f"Of {works['design']['devices']} fresh devices {told['design']} of plain `design`'s work" in text
+    assert f"{told['reconstructed']} of the paper's, {told['chosen']} of the best of {found['trials']} trials" in text
+    fails = {name: {n: 1.0 - s["value"] for n, s in row["requirements"].items()}
+             for name, row in found["drawings"].items()}  # fmt: skip
+    assert {n for n, share in fails["design"].items() if share > 0.02} == {"split_hz", "top_v"}
+    loops = json.loads((ROOT / "docs/figures/fabrication/wafer.json").read_text(encoding="utf-8"))
+    of, hand = loops["percentiles_50_95_100"], loops["total_index_and_error"]
+    peak = max(of[f"{law}.peak_s"][2] for law in ("shipped", "known"))
+    assert f"All {loops['devices']} loops are stable: Ms is {peak:.1f} at most" in text.replace("**", "")
+    assert f"rejected to {loops['least_rejection_hz']['shipped']:.0f} Hz at least" in text
+    median_nm, p95_nm, _ = of["shipped.error_nm"]
+    assert f"errors are {median_nm:.0f} nm (median; {p95_nm:.0f} at 95 %)" in text.replace("**", "")
+    most = sorted(hand["shipped.error_nm"], key=lambda name: -hand["shipped.error_nm"][name][0])[:3]
+    assert most == ["etch_bias_m", "sidewall_rad", "comb_gap_m"]
+    assert "etch bias, sidewall and comb gap change gaps" in text
+    left = {name: index for name, (index, _) in hand["known.error_nm"].items() if index > 0.05}
+    assert list(left) == ["handle_m"]
+    assert "With it the handle's thickness is left" in text
 
 
 def test_what_the_page_says_of_the_paper() -> None:

@@ -1,10 +1,13 @@
 """Writes docs/figures/wafer.png and wafer_loops.png: what the shipped process makes of the shipped drawing, as `pkxyz
-yield` draws it.
+yield` draws it, and the loops' figures in wafer.json.
 """
 
+import json
 import tempfile
-from dataclasses import replace
+from dataclasses import asdict, replace
 from pathlib import Path
+
+import numpy as np
 
 from hil.pictures.wafer.loops import draw_loops
 from hil.pictures.wafer.overview import draw_wafer
@@ -20,7 +23,7 @@ from pkxyz_ctrl.config.stage import StageConfig
 from pkxyz_ctrl.fabrication.process import Process
 from pkxyz_ctrl.io.realtime import cores
 
-WAFERS, LOOPS, LOOP_CAUSES = 400, 400, 256
+WAFERS, LOOPS, LOOP_CAUSES = 400, 400, 128
 FOLDER = Path(__file__).parents[1]
 
 
@@ -41,6 +44,14 @@ def main() -> None:
         found = moved.found(worked(moved, moved.parts_for(LOOP_CAUSES), Path(folder, "causes")))
     shares = {name.removeprefix("ok."): share_of(rows[name], rows["wafer"]) for name in asked.verdict_columns}
     draw_loops(asked, rows, shares, found, FOLDER / "wafer_loops.png")
+    kept = {
+        "devices": LOOPS,
+        "shares": {name: asdict(share) for name, share in shares.items()},
+        "percentiles_50_95_100": {name: np.percentile(rows[name], [50, 95, 100]).tolist() for name in asked.columns},
+        "least_rejection_hz": {law: float(rows[f"{law}.rejection_hz"].min()) for law in asked.laws},
+        "total_index_and_error": None if found is None else found.as_json(),
+    }
+    Path(__file__).with_suffix(".json").write_text(json.dumps(kept, indent=1) + "\n", encoding="utf-8")
 
 
 def worked(asked: Parts, parts: int, folder: Path) -> Table:

@@ -1,6 +1,7 @@
 """``pkxyz design --for-yield``: the drawing of which most devices work, beside the one that it began with."""
 
 import json
+import math
 from collections.abc import Callable
 from dataclasses import asdict, dataclass
 from functools import cached_property
@@ -24,6 +25,8 @@ if TYPE_CHECKING:
 LAWS = ("youla", "lqg")
 LOOPS = 12
 CANDIDATES = 3
+OWN_WAFERS = 100
+"""Fresh ones, all devices of which are held to each requirement of their own."""
 _HEAD = "with the largest share of devices that work, of those that were tried"
 
 
@@ -132,16 +135,21 @@ class Asked:
             with progress_bar(f"sources, {name}", quiet=self.quiet) as tell:
                 effect = effects(closed, tell)
             ok = {n: v for n, v in each.columns.items() if n.startswith("ok.")} | {"own": each.columns["own"] > 0.5}
+            shares = {n.removeprefix("ok."): share_of(v, each.columns["device"]) for n, v in ok.items()}
+            own = closed.wafers.columns(range(OWN_WAFERS))
+            asked = {n: share_of(own[f"ok.{n}"], own["wafer"]) for n in problem.process.requirements}
             by, within = gained(found["chosen"], each)
             rows[name] = {
                 "works": asdict(each.share), "law": laws[name].name, "gained": by, "gained_within": within,
-                "shares": {n.removeprefix("ok."): asdict(share_of(v, each.columns["device"])) for n, v in ok.items()},
-                "effects": effect,
+                "shares": {n: asdict(share) for n, share in shares.items()},
+                "requirements": {n: asdict(share) for n, share in asked.items()}, "effects": effect,
+                "error_nm": [round(e, 4) if math.isfinite(e) else None for e in each.columns[ERROR].tolist()],
             }  # fmt: skip
-            drawn.append(DrawingFigures(name, each.share.value, each.columns[ERROR], effect))
+            drawn.append(DrawingFigures(name, {"works": each.share, **shares}, asked, each.columns[ERROR], effect))
         limit = problem.process.closed_loop.get(ERROR)
-        draw_drawings(drawn, None if limit is None else limit.max, self.out / "drawings.png")
-        return {"drawings": rows}
+        limit_nm = None if limit is None else limit.max
+        draw_drawings(drawn, limit_nm, self.out / "drawings.png")
+        return {"drawings": rows, "limit_nm": limit_nm}
 
     def _write(self, order: "list[Choice]") -> None:
         from hil.studies.designed_stage import require_replaceable, write_stage_file

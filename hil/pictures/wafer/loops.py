@@ -19,6 +19,8 @@ from hil.studies.wafer.shares import Share
 Columns = Mapping[str, NDArray[Any]]
 
 _COLOURS = {"shipped": BLUE, "identified": ORANGE, "instrument": VERMILION, "known": GREEN}
+_WIDTHS = {"shipped": 3.5}
+"""Of what lies below another curve for the most part."""
 _LEGEND = {
     "shipped": "law as shipped",
     "identified": "as identified",
@@ -83,13 +85,15 @@ def _short(name: str) -> str:
 def _below(plot: Axes, values: NDArray[np.float64], law: str) -> None:
     order = np.sort(values[np.isfinite(values)])
     share = 100.0 * np.arange(1, len(order) + 1) / len(values)
-    plot.step(order, share, where="post", color=_COLOURS[law], label=_LEGEND[law])
+    plot.step(order, share, where="post", color=_COLOURS[law], label=_LEGEND[law], lw=_WIDTHS.get(law, 1.5))
 
 
 def _over_height(plot: Axes, asked: ClosedLoops, columns: Columns) -> None:
     for law in asked.laws:
         error = columns[f"{law}.error_nm"]
-        plot.plot(1e6 * columns["handle_m"], error, ".", ms=5, color=_COLOURS[law], alpha=0.8)
+        plot.plot(
+            1e6 * columns["handle_m"], error, ".", ms=8 if law == "shipped" else 5, color=_COLOURS[law], alpha=0.8
+        )
     bound(plot, 5.0, "5 nm", float(1e6 * columns["handle_m"].min()))
     plot.set_yscale("log")
     dress(plot, "handle thicker than drawn (µm)", "RMS error (nm)")

@@ -66,7 +66,7 @@ def draw_wafer(
     if found is not None:
         gained, heat = rows[1].subplots(1, 2, width_ratios=(1.0, 2.0))
         _gains(gained, found)
-        draw_indices(heat, found.indices, [_words(name) for name in found.indices.figures])
+        draw_indices(heat, found.indices, [words(name) for name in found.indices.figures])
     save(figure, path)
 
 
@@ -94,7 +94,7 @@ def _bars(plot: Axes, shares: Mapping[str, Share]) -> None:
         colour = GOOD if share.value > 0.99 else BLUE if share.value > 0.9 else BAD
         plot.barh(row, 100.0 * (1.0 - share.value), color=colour, height=0.6)
         plot.plot([100.0 * (1.0 - share.high), 100.0 * (1.0 - share.low)], [row, row], color=INK, lw=1.2)
-    plot.set_yticks(range(len(names)), [_words(name) for name in names])
+    plot.set_yticks(range(len(names)), [words(name) for name in names])
     plot.set_xlim(left=0.0)
     dress(plot, "devices that fail (%), with 95 % interval", title="what fails", grid="x")
 
@@ -119,7 +119,7 @@ def _spreads(plot: Axes, process: Process, columns: Columns) -> None:
                           fontsize=TINY_PT, color=BAD)  # fmt: skip
         plot.annotate(_shown(name, mid), ((mid - begin) / length, row - 0.02), ha="center", va="top",
                       fontsize=TINY_PT, color=MUTED)  # fmt: skip
-    plot.set_yticks(range(len(names)), [_words(name) for name in names])
+    plot.set_yticks(range(len(names)), [words(name) for name in names])
     plot.set_xticks([])
     plot.set_ylim(-0.35, len(names) - 0.2)
     dress(plot, title="figures, their medians, and where they have to lie", grid="")
@@ -128,28 +128,32 @@ def _spreads(plot: Axes, process: Process, columns: Columns) -> None:
 def _gains(plot: Axes, found: Causes) -> None:
     gain = {name: 100.0 * (share - found.share) for name, share in found.share_without.items()}
     order = sorted(gain, key=lambda name: gain[name])
-    plot.barh([_words(name) for name in order], [gain[name] for name in order], color=BLUE, height=0.6)
+    plot.barh([words(name) for name in order], [gain[name] for name in order], color=BLUE, height=0.6)
     plot.axvline(0.0, color=FAINT, lw=0.8)
-    dress(plot, f"points of the share won ({found.share:.1%} here)", title="if it had no spread", grid="x")
+    dress(
+        plot, f"more devices that work (%), of {found.share:.1%} here", title="won if a cause had no spread", grid="x"
+    )
 
 
-def draw_indices(plot: Axes, found: Indices, words: Sequence[str]) -> None:
-    """Causes by figures, which are called by ``words``."""
+def draw_indices(plot: Axes, found: Indices, called: Sequence[str]) -> None:
+    """Causes by figures, which are ``called`` so. What is estimated beyond 1, where no index is, is shown as 1."""
     plot.imshow(found.total, cmap=_SHADE, vmin=0.0, vmax=1.0, aspect="auto")
     for row in range(len(found.names)):
         for column in range(len(found.figures)):
             value = found.total[row, column]
             if value >= 0.005:
-                plot.annotate(f"{100 * value:.0f}", (column, row), ha="center", va="center", fontsize=SMALL_PT,
+                told = f"{100.0 * min(value, 1.0):.0f}"
+                plot.annotate(told, (column, row), ha="center", va="center", fontsize=SMALL_PT,
                               color="white" if value > 0.6 else INK)  # fmt: skip
-    plot.set_yticks(range(len(found.names)), [_words(name) for name in found.names])
-    plot.set_xticks(range(len(found.figures)), words, rotation=35, ha="right")
+    plot.set_yticks(range(len(found.names)), [words(name) for name in found.names])
+    plot.set_xticks(range(len(found.figures)), called, rotation=35, ha="right")
     dress(plot, title="part of each figure's variance that a cause has a hand in (%, Sobol's total index)", grid="")
     plot.tick_params(labelsize=SMALL_PT)
     plot.title.set_fontsize(LABEL_PT + 1)
 
 
-def _words(name: str) -> str:
+def words(name: str) -> str:
+    """What a cause, a figure or a requirement is called."""
     if name in SOURCE_WORDS:
         return SOURCE_WORDS[name]
     return next((name.removesuffix(end) for end in ("_hz", "_m", "_v") if name.endswith(end)), name).replace("_", " ")
