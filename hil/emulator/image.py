@@ -24,8 +24,9 @@ Records = NDArray[np.void]
 TARGET = "cortex-m7"
 EMULATOR, COMPILER = "qemu-system-arm", "arm-none-eabi-gcc"
 _REMEDY = "apt-get install qemu-system-arm gcc-arm-none-eabi"
-_FIRMWARE = Path(exporting.__file__).parent / "firmware"
-_MADE_OF = ("entries.py", "emit.py", "planned.py", "lowering.py", "runtime.py", "targets.py")
+_EXPORT = Path(exporting.__file__).parent
+_FIRMWARE = _EXPORT / "firmware"
+_MADE_OF = tuple(_EXPORT / f"{name}.py" for name in ("entries", "emit", "planned", "lowering", "runtime", "targets"))
 _FLAGS = ("-std=c11", "-O2", "-Wall", "-Wextra", "-fno-strict-aliasing", "-ffp-contract=off")
 
 

@@ -18,6 +18,8 @@ from typing import NamedTuple
 import llvmlite
 import numba
 
+_MADE_OF = tuple(Path(__file__).with_name(name) for name in ("entries.py", "emit.py", "planned.py"))
+
 
 class ExportError(ValueError):
     """What is asked for can't be exported; the message says why and what to do."""
@@ -36,16 +38,16 @@ class Kernels(NamedTuple):
 def kernels(*, is_planned: bool = False) -> Kernels:
     """Those of ``entries_for``, from the folder of compiled kernels if they lie there. Takes a minute if not."""
     name, words = ("export_planned.ll", ("planned",)) if is_planned else ("export.ll", ())
-    text = kept(name, ("entries.py", "emit.py", "planned.py"), lambda: _emitted(words).encode()).decode()
+    text = kept(name, _MADE_OF, lambda: _emitted(words).encode()).decode()
     first, _, ir = text.partition("\n")
     return Kernels(ir, json.loads(first), is_planned)
 
 
-def kept(name: str, sources: Sequence[str], make: Callable[[], bytes]) -> bytes:
+def kept(name: str, sources: Sequence[Path], make: Callable[[], bytes]) -> bytes:
     """What ``make`` gives, or gave before: it lies beside numba's kernels, in a folder of their digest. ``name`` is
-    ``stem.suffix``, ``sources`` are the modules of this room on which it depends besides.
+    ``stem.suffix``, ``sources`` are the modules on which it depends besides.
     """
-    file = _place(name, sources)
+    file = place_of(name, sources)
     if file is not None and file.is_file():
         return file.read_bytes()
     made = make()
@@ -56,13 +58,14 @@ def kept(name: str, sources: Sequence[str], make: Callable[[], bytes]) -> bytes:
     return made
 
 
-def _place(name: str, sources: Sequence[str]) -> Path | None:
+def place_of(name: str, sources: Sequence[Path]) -> Path | None:
+    """Where that is kept, whether it is there or not; None where nothing is kept."""
     folder = os.environ.get("NUMBA_CACHE_DIR")
     if folder is None or not Path(folder).is_dir():
         return None
     digest = hashlib.sha256(f"{numba.__version__} {llvmlite.__version__}".encode())
     for source in sources:
-        digest.update(Path(__file__).with_name(source).read_bytes())
+        digest.update(source.read_bytes())
     stem, _, suffix = name.rpartition(".")
     return Path(folder) / f"{stem}-{digest.hexdigest()[:16]}.{suffix}"
 
