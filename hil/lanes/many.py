@@ -6,7 +6,7 @@ ends in a fault is left there, as nobody clears it in this lane.
 """
 
 from collections.abc import Sequence
-from typing import Final
+from typing import Final, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -33,6 +33,8 @@ SCANNED = np.dtype(
     ],
     align=True,
 )
+WINDOW = np.dtype([("begin_us", "i8"), ("end_us", "i8")])
+"""A scan: from ... to."""
 TICKS_MOST: Final = 100_000
 """The whole reference is held at once."""
 _TRACKING, _FAULT = int(Mode.TRACKING), int(Mode.FAULT)
@@ -46,20 +48,48 @@ def can_run(setup: Setup) -> bool:
     return plain and setup.ticks <= TICKS_MOST and int(setup.law["tick"]["kind"][0]) != PREDICTIVE
 
 
+class Batch(NamedTuple):
+    """Devices at rest, and what they are to follow. ``laws``: (n,) of ``cycle.LAW`` or (1,) for all; ``params``,
+    ``states`` and ``memories`` (n,), ``reference`` and ``at_us`` a row for each tick, ``windows_us`` of the scans,
+    ``found`` (n,) of ``SCANNED``.
+    """
+
+    laws: Records
+    params: Records
+    states: Records
+    memories: Records
+    reference: Records
+    at_us: NDArray[np.int64]
+    windows_us: Records
+    found: Records
+
+    @classmethod
+    def of(cls, setup: Setup, laws: Records, plants: Sequence[Plant]) -> "Batch":
+        """Plants, one at least, in the run of ``setup``."""
+        memories = np.repeat(new_memory(Mode.IDLE), len(plants))
+        params, states = (joined(each) for each in zip(*((p.params, p.state) for p in plants), strict=True))
+        return cls(
+            laws, params, states, memories, Handout(setup.trajectory, setup.bus.period_us).rows(memories, setup.ticks),
+            np.ascontiguousarray(instants_us(setup, 0, setup.ticks), np.int64),
+            np.array([s.scan_us for s in setup.trajectory.segments if s.scan_us], WINDOW),
+            np.zeros(len(plants), SCANNED),
+        )  # fmt: skip
+
+
 def scan_errors(setup: Setup, laws: Records, plants: Sequence[Plant]) -> Records:
     """(n,) of ``SCANNED`` of plants at rest under ``laws``, (n,) of ``cycle.LAW`` or (1,) for all; the rest of the run,
     which ``can_run`` allows, is that of ``setup``.
     """
-    memory = np.repeat(new_memory(Mode.IDLE), max(1, len(plants)))
-    reference = Handout(setup.trajectory, setup.bus.period_us).rows(memory, setup.ticks)
-    windows_us = [s.scan_us for s in setup.trajectory.segments if s.scan_us]
-    windows = np.array(windows_us, dtype=np.int64).reshape(-1, 2)
-    found = np.zeros(len(plants), SCANNED)
-    if len(plants):
-        params, states = (joined(each) for each in zip(*((p.params, p.state) for p in plants), strict=True))
-        at_us = instants_us(setup, 0, setup.ticks)
-        _run_together(laws, memory, reference, params, states, at_us, windows, found)
-    return found
+    if not plants:
+        return np.zeros(0, SCANNED)
+    batch = Batch.of(setup, laws, plants)
+    run_one_after_another(batch)
+    return batch.found
+
+
+def run_one_after_another(batch: Batch) -> None:
+    """All its ticks; state, memory and ``found`` are left as the run leaves them."""
+    _run_together(*batch)
 
 
 def joined(records: Sequence[Records]) -> Records:
@@ -84,12 +114,12 @@ def deviation_m(scanned: Records) -> Array:
 @kernel
 def _run_together(
     laws: Records,
-    memories: Records,
-    reference: Records,
     params: Records,
     states: Records,
+    memories: Records,
+    reference: Records,
     at_us: NDArray[np.int64],
-    windows_us: NDArray[np.int64],
+    windows_us: Records,
     found: Records,
 ) -> None:
     each = 1 if len(laws) > 1 else 0
@@ -106,11 +136,11 @@ def _run_together(
         for n in range(count):
             if found[n]["faulted"] == 0:
                 respond(laws[each * n : each * n + 1], memories[n : n + 1])
-                _take(memories[n]["row"], laws[0]["period_us"], windows_us, found[n])
+                take(memories[n]["row"], laws[0]["period_us"], windows_us, found[n])
 
 
 @kernel
-def _take(row: np.void, period_us: int, windows_us: NDArray[np.int64], found: np.void) -> None:
+def take(row: np.void, period_us: int, windows_us: Records, found: np.void) -> None:
     """Whether a tick has ended in a fault, and its error, once for each scan that it lies in."""
     if row["mode"] == _FAULT:
         found["faulted"] = 1
@@ -118,7 +148,7 @@ def _take(row: np.void, period_us: int, windows_us: NDArray[np.int64], found: np
         return
     t_us = row["reference_tick"] * period_us
     for k in range(len(windows_us)):
-        if windows_us[k, 0] <= t_us < windows_us[k, 1]:
+        if windows_us[k]["begin_us"] <= t_us < windows_us[k]["end_us"]:
             found["ticks"] += 1
             for j in range(3):
                 error = row["position_m"][j] - row["reference_m"][j]
