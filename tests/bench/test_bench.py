@@ -18,6 +18,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 from numpy.typing import NDArray
 
+from hil.abreast import batch
 from hil.bench import beside, lanes, quality, startup, suite, tick
 from hil.bench.native import within_us
 from hil.bench.rigs.closed_loop import scan
@@ -144,7 +145,8 @@ def test_a_batch_in_which_a_device_is_left_in_a_fault_is_refused(monkeypatch: py
         found["ticks"], found["faulted"][3] = 100, 1
         return found
 
-    monkeypatch.setattr(many, "scan_errors", ended)
+    monkeypatch.setattr(batch, "prepare", lambda **_: False)
+    monkeypatch.setattr(batch, "scan_errors", ended)
     with pytest.raises(RuntimeError, match="not the same work"):
         lanes.batch()
 

@@ -82,6 +82,10 @@ HOUSE: Mapping[str, Room] = MappingProxyType({
     "hil.lanes": Room((
         "sim.config", "sim", "pkxyz_ctrl.*", "hil.bus", "hil.node", "hil.plant", "hil.faults", "hil.whole_ticks",
     )),
+    "hil.abreast.widening": Room((), ("re", "llvmlite", "numpy", *VALUES)),
+    "hil.abreast": Room((
+        "sim.motion", "sim", "pkxyz_ctrl.*", "hil.lanes", "hil.abreast.widening",
+    )),
     "hil.emulator": Room(("pkxyz_ctrl.*", "hil.faults", "hil.lanes")),
     "hil.conformance": Room(("sim.config", "sim", "pkxyz_ctrl.*", "hil.bus", "hil.node", "hil.plant", "hil.lanes")),
     "hil.operate": Room(("pkxyz_ctrl.*", "hil.lanes")),
@@ -96,7 +100,8 @@ HOUSE: Mapping[str, Room] = MappingProxyType({
     "hil.studies.margins": Room(("pkxyz_ctrl.*", "hil.lanes")),
     "hil.studies.identify": Room(("pkxyz_ctrl.*", "hil.lanes", "hil.studies.margins")),
     "hil.studies.wafer": Room((
-        "sim.config", "pkxyz_ctrl.*", "hil.lanes", "hil.runs", "hil.studies.spread", "hil.studies.identify",
+        "sim.config", "pkxyz_ctrl.*", "hil.lanes", "hil.abreast", "hil.runs", "hil.studies.spread",
+        "hil.studies.identify",
     )),
     "hil.studies.tune": Room(("pkxyz_ctrl.*", "hil.lanes", "hil.runs", "hil.studies.spread")),
     "hil.studies.faults": Room(("pkxyz_ctrl.*", "hil.faults", "hil.lanes", "hil.runs", "hil.studies.spread")),
@@ -113,7 +118,7 @@ HOUSE: Mapping[str, Room] = MappingProxyType({
     "hil.screen": Room(("pkxyz_ctrl.*", "hil.lanes", "hil.runs", "hil.studies.margins")),
     "hil.bench.rigs": Room(("sim.motion", "sim", "pkxyz_ctrl.*", "hil.lanes", "hil.runs", "hil.studies.identify")),
     "hil.bench": Room((
-        "pkxyz_ctrl.*", "hil.bus", "hil.plant", "hil.recording", "hil.lanes", "hil.native", "hil.runs",
+        "pkxyz_ctrl.*", "hil.bus", "hil.plant", "hil.recording", "hil.lanes", "hil.abreast", "hil.native", "hil.runs",
         "hil.studies.spread", "hil.studies.margins", "hil.studies.tune", "hil.studies.wafer",
         "hil.studies", "hil.operate", "hil.server", "hil.bench.rigs",
     )),

@@ -1,0 +1,4 @@
+"""Many devices side by side: the parts of a tick, each kernel widened to a lane of vectors for each of sixteen devices.
+
+What comes out has the bits of ``hil.lanes.many``, which runs one after another and is what other machines have.
+"""
