@@ -1,7 +1,7 @@
 """Many devices at once: ``hil.lanes.many``'s loop, with sixteen devices in the vectors of a core where it has them."""
 
 import ctypes
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from typing import Any
 
 import numpy as np
@@ -27,11 +27,13 @@ def scan_errors(setup: Setup, laws: Records, plants: Sequence[Plant]) -> Records
     return batch.found
 
 
-def prepare(*, own_laws: bool) -> bool:
-    """Make it, unless it is there: a minute and a half, which some ten thousand devices are worth. False where this
-    machine has no vectors for it, or nowhere to keep it.
+def prepare(*, own_laws: bool, tell: Callable[[str], None] | None = None) -> bool:
+    """Make it, unless it is there: a minute and a half, which ``tell`` is told. False where this machine has no vectors
+    for it, or nowhere to keep it.
     """
-    if machine.can_be_had():
+    if machine.can_be_had() and not machine.is_there(own_laws=own_laws):
+        if tell is not None:
+            tell(f"compiling for {LANES} devices side by side, once: a minute or two")
         machine.code(own_laws=own_laws)
     return machine.is_there(own_laws=own_laws)
 

@@ -10,6 +10,10 @@ from hil.bench.study import short_scan
 from hil.lanes import many
 from hil.lanes.many import Batch
 from hil.runs.scenario import load_scenario
+from hil.studies.wafer.closed_loop import WORTH_MAKING, ClosedLoops
+from hil.studies.wafer.study import WaferStudy
+from pkxyz_ctrl.config.files import load
+from pkxyz_ctrl.fabrication.process import Process
 
 pytestmark = pytest.mark.skipif(not machine.can_be_had(), reason="needs the vectors of AVX-512")
 
@@ -96,3 +100,18 @@ def test_errors_are_the_same_with_and_without(monkeypatch):
 
 def test_without_devices_nothing_is_found():
     assert len(batch.scan_errors(setup_of(), setup_of().law, [])) == 0
+
+
+def test_a_study_of_many_devices_makes_it_and_one_of_few_does_not(monkeypatch):
+    loops = ClosedLoops(WaferStudy(load("processes", "oreo_drie", Process), SCENARIO.stage, 1), SCENARIO, known=True)
+    asked, told = [], []
+    monkeypatch.setattr(machine, "code", lambda **which: asked.append(which["own_laws"]))
+    monkeypatch.setattr(machine, "is_there", lambda **_: False)
+    loops.prepare(100, told.append)
+    assert not asked
+    loops.prepare(WORTH_MAKING, told.append)
+    assert asked == [False, True]
+    assert all("once" in words for words in told)
+    asked.clear()
+    replace(loops, known=False).prepare(WORTH_MAKING, told.append)
+    assert asked == [False]

@@ -13,7 +13,7 @@ from hil.screen.first_run import say_if_compiling
 from hil.screen.options import AsJson, ClusterAddress, ClusterTls, FileInstead, Workers
 from hil.screen.outputs import folder_to_write, writing
 from hil.screen.progress import progress_bar
-from hil.screen.terminal import bad, good, plain_table, print_whole, say
+from hil.screen.terminal import bad, good, note, plain_table, print_whole, say
 
 if TYPE_CHECKING:
     from hil.studies.spread.cluster import Cluster
@@ -130,6 +130,8 @@ class _Asked:
         try:
             self._run("devices", study, parts_for(study.process, self.devices), table)
             if loops is not None:
+                moving = of_loops.parts_for(self.loop_sensitivity) * PART_DEVICES
+                self.closed.prepare(self.loops + moving, _tell_nobody if self.quiet else note)
                 if self.closed.identified:
                     _ = self.closed.mean_modes  # once here, not in each worker
                 self._run("loops", self.closed, -(-self.loops // PART_DEVICES), loops)
@@ -193,6 +195,10 @@ class _Asked:
         }  # fmt: skip
         (self.out / "summary.json").write_text(json.dumps(data, indent=2, allow_nan=False) + "\n", encoding="utf-8")
         return data
+
+
+def _tell_nobody(_words: str) -> None:
+    """Of a call that a program reads."""
 
 
 def _show(data: dict[str, Any]) -> None:

@@ -11,7 +11,7 @@ Links are taken to be alike (their mean), which the plant's mechanism has them.
 """
 
 import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property, lru_cache
 from typing import Any
@@ -19,6 +19,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from hil.abreast import batch
 from hil.lanes import in_process as lanes
 from hil.lanes import many
 from hil.lanes.lane import Lane
@@ -49,6 +50,8 @@ Triple = tuple[float, float, float]
 
 PART_DEVICES = 16
 PARTS_TOGETHER = 16
+WORTH_MAKING = 20_000
+"""Runs that are faster side by side by more than that takes to be compiled."""
 LAWS = ("shipped", "identified", "instrument", "known")
 LOOP_FIGURES: dict[str, str] = {
     "peak_s": "largest singular value of the sensitivity, in the middle of the strokes; infinite: unstable",
@@ -127,6 +130,13 @@ class ClosedLoops:
         setup = truth.setup(self._as_shipped)
         strokes = np.full(3, 0.5 * (of.stage.limits.stroke_min_m + of.stage.limits.stroke_max_m))
         return identify(setup, strokes, Lane.FAST).modes
+
+    def prepare(self, devices: int, tell: Callable[[str], None]) -> None:
+        """What so many devices are worth: code that runs some of them side by side, where the machine has vectors."""
+        if devices * len(self.laws) >= WORTH_MAKING:
+            batch.prepare(own_laws=False, tell=tell)
+            if len(self.laws) > 1:
+                batch.prepare(own_laws=True, tell=tell)
 
     def drawn_peak_s(self) -> float:
         """Ms of the drawing as drawn under the law as shipped."""
@@ -241,7 +251,7 @@ def scan_errors_nm(setups: Sequence[Setup]) -> list[dict[str, float]]:
     alike = all(setup.law is setups[0].law for setup in setups)
     laws = setups[0].law if alike else many.joined([setup.law for setup in setups])
     laws.flags.writeable = False
-    scanned = many.scan_errors(setups[0], laws, [setup.new_plant() for setup in setups])
+    scanned = batch.scan_errors(setups[0], laws, [setup.new_plant() for setup in setups])
     ended = (scanned["faulted"] != 0) | (scanned["ticks"] == 0)
     errors = (many.rms_m(scanned), many.deviation_m(scanned))
     rms_nm, deviation_nm = (np.where(ended, math.inf, 1e9 * e.max(axis=1)) for e in errors)
