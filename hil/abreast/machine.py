@@ -96,11 +96,11 @@ def _emitted() -> bytes:
 def _loop(shared: frozenset[str]) -> str:
     """``run_ticks``: all groups through one part of a tick before any through the next, tick by tick."""
     records = {a.name: a for _, arguments in PARTS.values() for a in arguments if a.dtype is not None}
-    given = ["i64 %ticks", "ptr %at_each_us", "i64 %groups"]
+    handed = ["i64 %ticks", "ptr %at_each_us", "i64 %groups"]
     for argument in records.values():
-        given += [f"ptr %{argument.name}", *([f"i64 %{argument.name}_n"] if argument.many else [])]
+        handed += [f"ptr %{argument.name}", *([f"i64 %{argument.name}_n"] if argument.many else [])]
     lines = [
-        f"define i64 @run_ticks({', '.join([*given, 'ptr %frame'])}) {{", "start:", "  br label %tick", "tick:",
+        f"define i64 @run_ticks({', '.join([*handed, 'ptr %frame'])}) {{", "start:", "  br label %tick", "tick:",
         "  %i = phi i64 [ 0, %start ], [ %i.next, %tick.end ]",
         "  %where = getelementptr i64, ptr %at_each_us, i64 %i",
         "  %at_us = load i64, ptr %where",

@@ -73,12 +73,12 @@ def main(out: Path) -> None:
     """Compile each and write one module. Loops stay as they are: none becomes a call that copies memory."""
     llvm.set_option("", "-disable-loop-idiom-all")
     module, plain = None, []
-    for name, (function, arguments) in PARTS.items():
+    for name, (part_kernel, arguments) in PARTS.items():
         signature = tuple(
             types.int64 if a.dtype is None else types.Array(from_dtype(a.dtype), 1, "C") for a in arguments
         )
-        function.compile(signature)
-        overload = function.overloads[signature]
+        part_kernel.compile(signature)
+        overload = part_kernel.overloads[signature]
         plain.append(_plain(name, overload.fndesc.llvm_func_name, arguments))
         part = llvm.parse_assembly(overload.library.get_llvm_str())
         if module is None:

@@ -176,6 +176,6 @@ def _call(text: str) -> Instruction | None:
     found = re.match(rf"(?:tail )?call ({_TYPE}) @([\w.]+)\((.*)\)(?: #\d+)?$", text)
     if found is None:
         return None
-    given = [words.split() for words in re.sub(r"range\([^)]*\) ", "", found[3]).split(", ")]
-    types, operands = tuple(words[0] for words in given), [words[-1] for words in given]
+    handed = [words.split() for words in re.sub(r"range\([^)]*\) ", "", found[3]).split(", ")]
+    types, operands = tuple(words[0] for words in handed), [words[-1] for words in handed]
     return Instruction(None, "call", found[1], operands, types=types, callee=found[2])

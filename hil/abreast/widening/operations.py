@@ -139,8 +139,8 @@ def _store(block: BlockText, i: Instruction) -> None:
     function, types = f"llvm.masked.scatter.v{LANES}{_short(i.type)}.v{LANES}p0", (many, vector("ptr"), MASK)
     text.declare("void", function, types)
     laned = _laned(block, pointers, i.type)
-    given = f"{many} {wide}, {vector('ptr')}{align(i.type)[1:]} {laned}, {MASK} {block.mask}"
-    text.put(f"call void @{function}({given})")
+    handed = f"{many} {wide}, {vector('ptr')}{align(i.type)[1:]} {laned}, {MASK} {block.mask}"
+    text.put(f"call void @{function}({handed})")
     text.jump(on)
     text.label(on)
 

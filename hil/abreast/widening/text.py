@@ -60,8 +60,8 @@ class Text:
     def call(self, kind: str, function: str, types: Sequence[str], values: Sequence[str]) -> str:
         """The value of a function; attributes of ``types`` are no part of its declaration."""
         self.declare(kind, function, types)
-        given = ", ".join(f"{t} {v}" for t, v in zip(types, values, strict=True))
-        return self.make(f"call {kind} @{function}({given})")
+        handed = ", ".join(f"{t} {v}" for t, v in zip(types, values, strict=True))
+        return self.make(f"call {kind} @{function}({handed})")
 
     def declare(self, kind: str, function: str, types: Sequence[str]) -> None:
         """That there is such a function."""

@@ -53,8 +53,8 @@ class Widened:
         self.text.put(
             f"ret i32 {self.text.call('i32', f'llvm.vector.reduce.or.v{LANES}i32', [vector('i32')], [found])}"
         )
-        given = [f"ptr noalias {name}" if kind == "ptr" else f"{kind} {name}" for kind, name in function.arguments]
-        head = f"define i32 @{function.name}({', '.join([*given, 'ptr noalias %frame'])}) #0 {{\nstart:\n"
+        handed = [f"ptr noalias {name}" if kind == "ptr" else f"{kind} {name}" for kind, name in function.arguments]
+        head = f"define i32 @{function.name}({', '.join([*handed, 'ptr noalias %frame'])}) #0 {{\nstart:\n"
         return head + "\n".join(self.text.lines) + "\n}\n"
 
     def _places(self) -> None:
