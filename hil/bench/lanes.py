@@ -1,5 +1,6 @@
 """How fast the lanes are, and where a tick of the lockstep lane goes."""
 
+import platform
 import tempfile
 from dataclasses import replace
 from functools import partial
@@ -11,6 +12,7 @@ from numpy.typing import NDArray
 from hil.abreast import batch as side_by_side
 from hil.bench.rigs.closed_loop import scan
 from hil.bench.rigs.figure import Figure, once, repeated, times_of
+from hil.bench.rigs.instructions import chain_of_products, clock_hz, instructions_per_tick
 from hil.bench.rigs.played import Played, PlayedPort, drive_counts, recorded_frames
 from hil.bench.tick import ticks_from_python
 from hil.lanes import in_process as lanes
@@ -24,6 +26,8 @@ from hil.runs.scenario import Scenario, load_scenario, resolve
 
 REPEATS = 15
 BATCH_DEVICES = 64
+TAKEN_IN = 6
+"""Instructions a cycle: Intel's Golden Cove renames so many (Optimization Reference Manual, 2.3), AMD's Zen 4 too."""
 
 _PARTS = {
     "bus_and_node": "clock, wire, amplifier node, row: the remainder",
@@ -108,7 +112,23 @@ def fast() -> list[Figure]:
         Figure("fast.realtime_recorded", _factor(setup, recorded.best_s), "times", None, None,
                _factor(setup, recorded.median_s), "with the recording and the figures of the run"),
         Figure("fast.tick", best, "us", None, None, median, "tick.kernel and plant.period make most of it"),
+        *_instructions(setup),
     ]  # fmt: skip
+
+
+def _instructions(setup: Setup) -> list[Figure]:
+    """What no compiler can go below with so many; nothing where they can't be counted."""
+    instructions = instructions_per_tick()
+    if instructions is None or platform.machine() != "x86_64":
+        return []
+    products = repeated({"products": chain_of_products}, REPEATS)["products"]
+    hz = clock_hz(products.best_s)
+    least_s = instructions / (TAKEN_IN * hz)
+    detail = (
+        f"of a tick of one device; a core that takes in {TAKEN_IN} a cycle, at {hz / 1e9:.1f} GHz, needs "
+        f"{least_s * 1e6:.2f} us for them at least, {setup.bus.period_s / least_s:.0f} times real time"
+    )
+    return [Figure("fast.instructions", instructions, "count", None, None, None, detail)]
 
 
 def batch() -> list[Figure]:

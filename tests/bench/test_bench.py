@@ -22,6 +22,7 @@ from hil.abreast import batch
 from hil.bench import beside, lanes, quality, startup, suite, tick
 from hil.bench.native import within_us
 from hil.bench.rigs.closed_loop import scan
+from hil.bench.rigs.instructions import instructions_per_tick
 from hil.lanes import many
 from hil.lanes.setup import Setup
 from hil.runs.scenario import load_scenario
@@ -137,6 +138,15 @@ def test_a_replay_that_does_less_is_refused() -> None:
     memory = loop.memory.copy()
     with pytest.raises(RuntimeError, match="not the same work"):
         tick._verified(lambda: None, loop, memory)
+
+
+def test_a_tick_is_gone_through_instruction_by_instruction() -> None:
+    """Its arithmetic is some thousand operations; ten times as many would be something else than a tick."""
+    found = instructions_per_tick()
+    if found is None:
+        pytest.skip("the system lets no process be gone through")
+    assert 5_000 < found < 50_000
+    assert found == pytest.approx(instructions_per_tick(), rel=0.05)
 
 
 def test_a_batch_in_which_a_device_is_left_in_a_fault_is_refused(monkeypatch: pytest.MonkeyPatch) -> None:

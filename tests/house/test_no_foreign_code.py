@@ -12,6 +12,7 @@ ALLOWED = {
     ("hil/pictures/drawing_process.py", "pickle"): "from this program to that process, by a pipe of their own",
     ("hil/studies/latency.py", "subprocess"): "cyclictest: from PATH, or the path that was given on the command line",
     ("hil/bench/startup.py", "subprocess"): "this program, timed",
+    ("hil/bench/rigs/instructions.py", "subprocess"): "this program, gone through instruction by instruction",
     ("hil/bench/rigs/running.py", "subprocess"): "this program: what it serves, timed, or what is timed beside it",
     ("hil/emulator/image.py", "subprocess"): "the cross compiler, for sources of this package",
     ("hil/emulator/board.py", "subprocess"): "the emulator, with the firmware that was made of them",
