@@ -58,7 +58,8 @@ LAW = np.dtype(
         ("period_us", "i8"),
         ("homing_ticks", "i4"),
         ("feed_hold_ticks", "i4"),  # even: how long the path takes to stop, and to be taken up again
-        ("landing_ticks", "i4"),  # so long a stop leads down to rest
+        ("landing_ticks", "i4"),  # so long a stop leads down to rest ...
+        ("braking_ticks", "i4"),  # ... of which so long it only takes the speed away
         ("autostart", "i4"),  # 1: home, enable and track by itself, as a scenario wants it
         ("quiet_holds", "i4"),  # 1: holds are quiet without being asked for
         ("tick", tick.LAW),  # last, as in it what only some laws have
@@ -250,7 +251,9 @@ def _handle(law: np.void, memory: np.void, event: int) -> None:
 def _go_on_landing(law: np.void, memory: np.void) -> None:
     """A tick of the way down; once the time is over the mode is left, wherever the stage is."""
     memory["landing_age"] += 1
-    memory["tick"]["landing_share"] = landing.share(memory["landing_age"] / law["landing_ticks"])
+    braking = law["braking_ticks"]
+    down = (memory["landing_age"] - braking) / (law["landing_ticks"] - braking)
+    memory["tick"]["landing_share"] = landing.share(down)
     if memory["landing_age"] >= law["landing_ticks"]:
         _handle(law, memory, _LANDED if memory["landed_by"] == 0 else _TRIP)
 

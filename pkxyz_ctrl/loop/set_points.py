@@ -23,8 +23,8 @@ def reference_row(law: np.void, memory: np.void, reference: Records, ahead: int,
     base = reference[0]["tick"]
     if memory["mode"] == _LANDING:
         age = memory["landing_age"] + ahead - law["tick"]["delay_periods"]
-        duration_s = law["landing_ticks"] * law["period_us"] * 1e-6
-        landing.sample(memory["landing_from"], age / law["landing_ticks"], duration_s, out)
+        braking, ticks = law["braking_ticks"], law["landing_ticks"]
+        landing.sample(memory["landing_from"], age, braking, ticks, law["period_us"], out)
     elif memory["feed"] != feed_hold.STEADY:
         covered, speed, change = feed_hold.advance(memory["feed"], memory["feed_age"] + ahead, law["feed_hold_ticks"])
         at = memory["feed_phase"] - base + covered

@@ -42,7 +42,7 @@ def any_law(period_us: int, homing_ticks: int) -> NDArray[np.void]:
     tick["drive"]["noise_shaping"] = 0
     tick["kind"], tick["delay_periods"] = OPEN_LOOP, 1
     record["period_us"], record["homing_ticks"], record["feed_hold_ticks"] = period_us, homing_ticks, 2
-    record["landing_ticks"] = LANDING_TICKS
+    record["braking_ticks"], record["landing_ticks"] = 0, LANDING_TICKS
     for name, value in (FRAME_LIMITS | NODE_LIMITS).items():
         record["limits"][name] = value
     for name in OFF:
@@ -73,5 +73,5 @@ def bend(age: int) -> float:
     """What is left of the acceleration with which a way down began, at a tick of it; its law asks for that alone."""
     begin, row = np.zeros(9), np.empty(9)
     begin[6] = 1.0
-    landing.sample(begin, min(age, LANDING_TICKS - 1) / LANDING_TICKS, 1.0, row)
+    landing.sample(begin, min(age, LANDING_TICKS - 1), 0, LANDING_TICKS, 1_000_000 // LANDING_TICKS, row)
     return float(row[6])

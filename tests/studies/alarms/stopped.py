@@ -25,7 +25,7 @@ from pkxyz_ctrl.trajectory import Trajectory
 
 KEPT = ALARMS.with_name("stops.jsonl")
 INSTANTS, AFTER_S = 8, 0.02
-"""Of a device, drawn by its seed; each stop is looked at for so long."""
+"""Of a device, drawn by its seed; each stop is looked at for so long, and for twice the way down."""
 
 
 class Stop(NamedTuple):
@@ -59,7 +59,8 @@ def stops(motion: str, law: str, seed: int, instants: int = INSTANTS, bus: str |
     rows = np.zeros(max(20, end), ROW)
     reference = reference_rows(base.trajectory.sample(0, end + 400, period_us))
     plant, memory = setup.new_plant(), new_memory(Mode.IDLE)
-    run_block, after = runner_of(base.law), round(AFTER_S * 1e6) // period_us
+    run_block = runner_of(base.law)
+    after = max(round(AFTER_S * 1e6) // period_us, 2 * int(base.law["landing_ticks"][0]))
     done, found, saturated = 0, [], np.zeros(0)
     for target in at:
         while (ahead := int(target) - int(memory["reference_tick"][0])) > 0:
