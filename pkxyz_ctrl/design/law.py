@@ -22,6 +22,7 @@ from pkxyz_ctrl.design.model.loop_plant import held_force_softening, loop_plant
 from pkxyz_ctrl.design.model.plant_model import LinearStage, SampledStage, amplifier_time_constant_s, linearise, sample
 from pkxyz_ctrl.design.noise_shaping import FIRST_ORDER, shaping_between_modes
 from pkxyz_ctrl.loop import cycle
+from pkxyz_ctrl.safety.thresholds import FORCE_CHANGE_SLOW_N
 from pkxyz_ctrl.stage import Stage
 
 Array = NDArray[np.float64]
@@ -30,6 +31,8 @@ KINDS = {"open_loop": OPEN_LOOP, "lqg": STATE_FEEDBACK, "youla": STATE_FEEDBACK,
 """What the tick calls the laws that are not linear ones."""
 RECORDED = ("lqg", "mpc")
 """Laws that keep the bits of their recordings: a filter with K_0 alone, and the ripple of the smooth feed-forward."""
+USUAL_PERIOD_US = 200
+"""Up to which the monitors' thresholds are those of their file."""
 LANDING_TICKS_LEAST = 12
 """A way down in fewer steps shakes the stage: at 1 kHz under lqg 147 of 268 stops of a circle's sampled devices met
 their ends with 5, and 5 of 247 with 10.
@@ -235,6 +238,8 @@ def _fill_drive(law: Any, stage: Stage, controller: ControllerConfig, bus: BusCo
 def _fill_monitors(limits: Any, controller: ControllerConfig, bus: BusConfig) -> None:
     for name, value in controller.monitors.model_dump(exclude={"force_trend_s", "innovation_memory_s"}).items():
         limits[name] = value
+    if bus.period_us > USUAL_PERIOD_US:
+        limits["force_change_max_n"] += FORCE_CHANGE_SLOW_N
     limits["force_forget_share"] = min(1.0, bus.period_s / controller.monitors.innovation_memory_s)
     limits["force_trend_share"] = min(1.0, bus.period_s / controller.monitors.force_trend_s)
     limits["sense_count_min"], limits["sense_count_max"] = -32768, 32767

@@ -43,7 +43,11 @@ FORCE_CHANGE_SHARE: Final = 0.47
 plane lifts, too, by 5 % of the force where a comb pulls up by 68 % of its own: 58 %. In open loop, where a soft device
 goes further than it should, one of 100 passes 47 %; that law's file has 58 %."""
 
-FORCE_CHANGE_MAX_N: Final = 40e-6
-"""What a change of unexplained force may be besides: twice the most that was seen five ticks in a row, 10 uN on
-``harsh`` and 20 uN in ``wide``. It is the weight of the moving mass: a knock of 1 g on the table that lasts five ticks
-is noticed, too."""
+FORCE_CHANGE_MAX_N: Final = 32e-6
+"""What a change of unexplained force may be besides: with 30 uN one of 500 devices sampled about ``harsh`` is stopped
+(under ``pi_notch_robust``), and with more a stuck comb of which little is asked is found later. A knock of two thirds
+of g on the table that lasts five ticks is noticed, too."""
+
+FORCE_CHANGE_SLOW_N: Final = 8e-6
+"""What it may be besides where a period is longer than 200 us, and the filter sees a force later: else four of 500
+devices are stopped in moves at 2 mm/s on a bus of 2 kHz."""

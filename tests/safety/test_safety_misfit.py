@@ -35,7 +35,7 @@ def test_a_change_of_force_trips_where_it_is_out_of_proportion_for_five_ticks(se
     bench, missing, asked = Bench(limits=only("unexplained_force_count", 5)), Trend(), Trend()
     beyond_so_far: list[NDArray[np.bool_]] = []
     for c, f in zip(commanded, lacking, strict=True):
-        beyond_so_far.append(np.abs(missing.change(f)) > 40e-6 + 0.47 * np.abs(asked.change(c)))
+        beyond_so_far.append(np.abs(missing.change(f)) > 32e-6 + 0.47 * np.abs(asked.change(c)))
         expected = np.all(beyond_so_far[-5:], axis=0) & (len(beyond_so_far) >= 5)
         trips = bench.tick({"unexplained_force_n": f, "commanded_force_n": c})
         assert trips == sum(int(Trip.COMB_FORCE_1) << i for i in range(3) if expected[i])
@@ -50,11 +50,11 @@ def test_an_imperfect_device_is_in_proportion_and_a_stuck_comb_is_not() -> None:
 
 
 def test_a_change_that_is_just_in_proportion_is_permitted() -> None:
-    """With a trend that stands still: 40 uN and 47 % of 0.5 mN are 275 uN."""
+    """With a trend that stands still: 32 uN and 47 % of 0.5 mN are 267 uN."""
     limits = only("unexplained_force_count", 1)
     limits["force_trend_share"] = 0.0
     edge = float(limits["force_change_max_n"][0] + limits["force_change_share"][0] * 0.5e-3)
-    assert edge == pytest.approx(275e-6)
+    assert edge == pytest.approx(267e-6)
     for comb in range(3):
         asked = {"commanded_force_n": beyond(comb, -0.5e-3)}
         for value, trips in ((edge, Trip(0)), (math.nextafter(edge, 1.0), Trip(Trip.COMB_FORCE_1 << comb))):

@@ -6,6 +6,7 @@ import struct
 import pytest
 from loop_rig import monitor_limits
 
+from hil.runs.scenario import load_scenario
 from pkxyz_ctrl.can.codec import ProcessCodec
 from pkxyz_ctrl.safety.gate import GateConfig
 from pkxyz_ctrl.safety.gate_rules import PERMITTED, FrameKind
@@ -232,6 +233,11 @@ def test_identifiers_of_a_codec_have_eleven_bits() -> None:
             ProcessCodec(cob_id, True)
 
 
+def limit_of(bus: str) -> float:
+    """What a change of unexplained force may be besides, on a bus."""
+    return float(load_scenario("raster", controller="lqg", bus=bus).setup().law["limits"]["force_change_max_n"][0])
+
+
 def test_limits_of_the_monitors() -> None:
     """They decide when 200 V go off, so nobody changes one by a slip; why they are what they are is told there."""
     assert monitor_limits().shape == (1,)
@@ -245,7 +251,10 @@ def test_limits_of_the_monitors() -> None:
     }  # fmt: skip
     assert limits["safe_cycles"] == 10
     assert (limits["residual_max_m"], limits["unexplained_force_max_n"]) == (0.7e-6, 0.8e-3)
-    assert (limits["force_change_max_n"], limits["force_change_share"]) == (40e-6, 0.47)
+    assert (limits["force_change_max_n"], limits["force_change_share"]) == (32e-6, 0.47)
+    assert {name: limit_of(name) for name in ("local_20k", "unix_5k", "unix_2k", "unix_1k")} == {
+        "local_20k": 32e-6, "unix_5k": 32e-6, "unix_2k": pytest.approx(40e-6), "unix_1k": pytest.approx(40e-6),
+    }  # fmt: skip
     assert limits["innovation_share_m_per_n"] == 1.5e-3
     assert limits["saturation_slack_n"] == 50e-9
     assert limits["force_forget_share"] == pytest.approx(200e-6 / 2e-3, rel=1e-12)

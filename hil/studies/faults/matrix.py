@@ -75,9 +75,9 @@ _MOVED = Trip.INNOVATION_X | Trip.INNOVATION_Y | Trip.INNOVATION_Z
 _SMALL = "no more than an imperfect device shows"
 _THREE_OF_EIGHT = "three wild samples, of which four in five are wild"
 _LAG = "speed times delay, 0.2 um, is no more than an imperfect device shows; noticed if the loop swings over it"
-_ASKED = "nothing to see until the scan asks comb 2 to move: 28 ticks (stuck), 34 (slow), sooner by the feedback"
+_ASKED = "nothing to see until the scan asks comb 2 to move: 25 ticks (stuck), 30 (slow), sooner by the feedback"
 _HARDLY_ASKED = "this scan asks too little of comb 1"
-_FOLLOWS_SLOWLY = "37 ticks likewise: 0.06 V a tick against the 0.2 V that are asked"
+_FOLLOWS_SLOWLY = "34 ticks likewise: 0.06 V a tick against the 0.2 V that are asked"
 _HEARTBEAT = "50 ms after the last heartbeat; counted PDOs come all the while"
 _WHICH = "which of two is right nobody can tell; four in short order are a fault"
 _CHANNEL_2 = Trip.COMB_FORCE_2 | Trip.COMB_MISFIT_2
@@ -95,15 +95,15 @@ CASES: Final[tuple[Case, ...]] = (
     Case("sense.2:wrong_gain,gain=1.02", NOTHING, note=_SMALL, may_go_on=True),
     Case("sense.3:offset", Trip.COMB_MISFIT_3),
     Case("sense.1:offset,offset_m=0.2e-6", NOTHING, note=_SMALL, may_go_on=True),
-    Case("sense.2:slow", _MISFIT | _FORCE, 35, _ASKED, lasts_s=0.04),
+    Case("sense.2:slow", _MISFIT | _FORCE, 33, _ASKED, lasts_s=0.04),
     Case("sense.3:delayed", _MISFIT | _FORCE | _MOVED, 100, _LAG, may_go_on=True),
     Case("sense.1:intermittent", Trip.SENSE_RANGE_1 | Trip.COMB_MISFIT_1, 8, _THREE_OF_EIGHT),
     Case("sense.2:noise_burst", Trip.COMB_MISFIT_2 | Trip.SENSE_RANGE_2, 8, _THREE_OF_EIGHT),
-    Case("amplifier.2:stuck", _CHANNEL_2, 30, _ASKED, (True, False, True)),
+    Case("amplifier.2:stuck", _CHANNEL_2, 28, _ASKED, (True, False, True)),
     Case("amplifier.1:stuck", _CHANNEL_1, 250, _HARDLY_ASKED, (False, True, True), may_go_on=True, lasts_s=0.05),
     Case("amplifier.2:dead", Trip.COMB_FORCE_2 | Trip.COMB_MISFIT_2),
     Case("amplifier.3:offset", Trip.COMB_FORCE_3 | Trip.COMB_MISFIT_3, obeys=(True, True, False)),
-    Case("amplifier.2:slew_collapse", _CHANNEL_2, 40, _FOLLOWS_SLOWLY, (True, False, True), lasts_s=0.04),
+    Case("amplifier.2:slew_collapse", _CHANNEL_2, 37, _FOLLOWS_SLOWLY, (True, False, True), lasts_s=0.04),
     Case("amplifier.2:trip", Trip.NODE_EMERGENCY, 2),
     Case("amplifier.3:saturated", Trip.COMB_FORCE_3 | Trip.COMB_MISFIT_3, obeys=(True, True, False)),
     Case("node:silent", _STALE),

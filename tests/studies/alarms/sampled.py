@@ -106,9 +106,9 @@ def swings(rows: np.ndarray) -> bool:
     return bool(np.all(sizes[1:] >= SWING_GROWTH * sizes[:-1]) and sizes[-1] > SWING_LEAST_M)
 
 
-def stopped(motion: str, law: str, seed: int) -> Stopped | None:
+def stopped(motion: str, law: str, seed: int, bus: str | None = None) -> Stopped | None:
     """What became of the device of a seed. None if it was not stopped."""
-    study, base = designed(motion, law)
+    study, base = designed(motion, law, bus)
     setup = dataclasses.replace(base, plant=study.sampled(seed).plant, seed=seed)
     vars(setup)["law"] = base.law
     spans = [round(span_s / setup.bus.period_s) for span_s in SWINGS_S]

@@ -5,7 +5,19 @@ nowhere, and is what the devices do today.
 import numpy as np
 import pytest
 from loop_rig import bus, stage
-from sampled import KEPT, LAWS, MOTIONS, SCENARIOS, SWING_LEAST_M, asks_too_much, is_stable, judge, read, swings
+from sampled import (
+    KEPT,
+    LAWS,
+    MOTIONS,
+    SCENARIOS,
+    SWING_LEAST_M,
+    asks_too_much,
+    is_stable,
+    judge,
+    read,
+    stopped,
+    swings,
+)
 
 from pkxyz_ctrl.config.files import names
 from pkxyz_ctrl.design.model.loop_plant import Perturbation
@@ -43,6 +55,12 @@ def test_only_what_asks_too_much_of_the_combs_is_out_of_reach():
     assert not asks_too_much(stage(), Perturbation(), rows, bus().period_s)
     rows["reference_m"][:, 2] = middle[2] - 50e-6 * np.array([0.0, 0.1, 0.4, 0.5, 0.5])
     assert asks_too_much(stage(), Perturbation(), rows, bus().period_s)
+
+
+@pytest.mark.parametrize("seed", [230, 391, 460])
+def test_a_slow_bus_leaves_more_room_for_forces_that_are_seen_late(seed):
+    """With the 32 uN of a fast one they were stopped, at 2 kHz, and nothing is wrong with them."""
+    assert stopped("moves", "youla", seed, "classic_2k") is None
 
 
 def test_behind_the_labs_chain_who_is_stopped_has_no_stable_loop():
