@@ -65,8 +65,8 @@ HOUSE: Mapping[str, Room] = MappingProxyType({
         ("pkxyz_ctrl.config", "pkxyz_ctrl", "pkxyz_ctrl.design.model", "pkxyz_ctrl.design.margins")
     ),
     "pkxyz_ctrl.design": Room((
-        "pkxyz_ctrl.config", "pkxyz_ctrl.core", "pkxyz_ctrl.loop", "pkxyz_ctrl", "pkxyz_ctrl.design.model",
-        "pkxyz_ctrl.design.margins", "pkxyz_ctrl.design.laws",
+        "pkxyz_ctrl.safety", "pkxyz_ctrl.config", "pkxyz_ctrl.core", "pkxyz_ctrl.loop", "pkxyz_ctrl",
+        "pkxyz_ctrl.design.model", "pkxyz_ctrl.design.margins", "pkxyz_ctrl.design.laws",
     )),
     # the harness: what the controller meets
     "hil.bus": Room(("pkxyz_ctrl.can", "pkxyz_ctrl.compiled", "pkxyz_ctrl.io", "pkxyz_ctrl")),
