@@ -20,11 +20,19 @@ Records = NDArray[np.void]
 
 def scan_errors(setup: Setup, laws: Records, plants: Sequence[Plant]) -> Records:
     """``many.scan_errors``, side by side if that has been made for this machine (``prepare``); the same bits."""
-    if not plants or not machine.is_there(own_laws=len(laws) > 1):
+    if not plants:
         return many.scan_errors(setup, laws, plants)
     batch = Batch.of(setup, laws, plants)
-    run_side_by_side(batch)
+    run(batch)
     return batch.found
+
+
+def run(batch: Batch) -> None:
+    """All its ticks, side by side if that has been made, else one after another."""
+    if machine.is_there(own_laws=len(batch.laws) > 1):
+        run_side_by_side(batch)
+    else:
+        many.run_one_after_another(batch)
 
 
 def prepare(*, own_laws: bool, tell: Callable[[str], None] | None = None) -> bool:
@@ -50,8 +58,8 @@ def run_side_by_side(batch: Batch) -> None:
     laws = side_by_side(batch.laws[which]) if own_laws else batch.laws
     made = machine.code(own_laws=own_laws)
     room = np.zeros(made.frame + 64, np.uint8)
-    run = ctypes.CFUNCTYPE(ctypes.c_int64, *[ctypes.c_void_p] * 13)(made.run)
-    run(
+    run_ticks = ctypes.CFUNCTYPE(ctypes.c_int64, *[ctypes.c_void_p] * 13)(made.run)
+    run_ticks(
         len(batch.at_us), _at(batch.at_us), len(which) // LANES, _at(params), _at(states), _at(laws), _at(memories),
         _at(found), _at(batch.reference), len(batch.reference), _at(batch.windows_us), len(batch.windows_us),
         _at(room[-room.ctypes.data % 64 :]),

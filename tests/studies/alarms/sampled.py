@@ -18,8 +18,10 @@ from typing import Any, NamedTuple
 import numpy as np
 from test_false_alarms import circles, corner_to_corner
 
-from hil.lanes import in_process
+from hil.abreast import batch
+from hil.lanes import in_process, many
 from hil.lanes.lane import Lane
+from hil.lanes.many import Batch
 from hil.lanes.setup import Setup
 from hil.runs.scenario import Scenario, load_scenario
 from hil.studies.margins.loop import Loop
@@ -28,7 +30,7 @@ from pkxyz_ctrl.config.files import ConfigError, load
 from pkxyz_ctrl.design.margins.tolerances import Tolerances
 from pkxyz_ctrl.design.model.loop_plant import Perturbation
 from pkxyz_ctrl.loop.row import ROW
-from pkxyz_ctrl.safety.modes import LOOP_CLOSED
+from pkxyz_ctrl.safety.modes import LOOP_CLOSED, Mode
 from pkxyz_ctrl.safety.thresholds import SATURATION_SLACK_N
 from pkxyz_ctrl.stage import Stage
 
@@ -133,6 +135,20 @@ def stopped(motion: str, law: str, seed: int, bus: str | None = None) -> Stopped
     )
 
 
+def who_may_be_stopped(motion: str, law: str, seeds: range) -> list[int]:
+    """Seeds of devices that end in a fault or are led down, all of them run side by side; all seeds where that can't
+    be, as the law plans or something is learnt from period to period.
+    """
+    study, base = designed(motion, law)
+    if not many.can_run(base):
+        return list(seeds)
+    setups = [dataclasses.replace(base, plant=study.sampled(seed).plant, seed=seed) for seed in seeds]
+    devices = Batch.of(base, base.law, [setup.new_plant() for setup in setups])
+    batch.run(devices)
+    is_stopped = (devices.found["faulted"] != 0) | (devices.memories["mode"] == int(Mode.LANDING))
+    return [seed for seed, is_one in zip(seeds, is_stopped, strict=True) if is_one]
+
+
 def is_stable(motion: str, law: str, seed: int) -> bool:
     """Whether the linear loop of that device is, where it was sampled and in all of the workspace's corners."""
     study, setup = designed(motion, law)
@@ -183,11 +199,11 @@ def extend(found: dict[str, Any], devices: int) -> None:
     except ConfigError as error:
         found["refused"] = str(error)
         return
-    for seed in range(found["devices"] + 1, devices + 1):
+    for seed in who_may_be_stopped(motion, law, range(found["devices"] + 1, devices + 1)):
         verdict = judge(motion, law, seed)
         if verdict is not None:
             found[verdict].append(seed)
-        found["devices"] = seed
+    found["devices"] = devices
 
 
 def options(laws: list[str], results: Path) -> argparse.Namespace:
@@ -204,6 +220,7 @@ def main() -> None:
     """Go through what is missing in the file of results."""
     asked = options(list(LAWS), KEPT)
     known = read(asked.results)
+    batch.prepare(own_laws=False)
     for motion in asked.motions.split(","):
         for law in asked.laws:
             fresh = {"motion": motion, "law": law, "devices": 0, "beyond": [], "unstable": [], "false": []}

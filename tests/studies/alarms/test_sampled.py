@@ -17,6 +17,7 @@ from sampled import (
     read,
     stopped,
     swings,
+    who_may_be_stopped,
 )
 
 from pkxyz_ctrl.config.files import names
@@ -101,3 +102,10 @@ def test_devices_fare_today_as_is_kept(motion, law):
     calm = [seed for seed in range(1, kept["devices"] + 1) if seed not in known]
     for seed in [*sorted(known)[:3], *calm[:3]]:
         assert judge(motion, law, seed) == known.get(seed)
+
+
+@pytest.mark.parametrize(("motion", "law"), [("raster_harsh", "open_loop"), ("moves", "hinf")])
+def test_who_is_stopped_beside_others_is_stopped_alone(motion, law):
+    seeds = range(1, 25)
+    among = who_may_be_stopped(motion, law, seeds)
+    assert among == [seed for seed in seeds if stopped(motion, law, seed) is not None]
