@@ -17,12 +17,15 @@ from patience import patient_bus, patient_law
 from hil.bus.unix_bus import UnixBus
 from hil.lanes.wall_plant import TRUTH
 from hil.recording.recording import Recording
+from pkxyz_ctrl.design.law import way_down_ticks
 from pkxyz_ctrl.safety.modes import Mode
 
 ROOT = Path(__file__).parents[2]
 DRIVE, EMCY, HEARTBEAT = 0x30A, 0x08A, 0x70A
 CRC = 4
 PERIOD_US, DRIVE_TIMEOUT_US = 1000, 20_000
+END_TICKS = way_down_ticks(0.005, PERIOD_US)[1] + 8
+"""In which a run ends that is led down: the way, and some before and behind it."""
 SCENARIO = """
 name = "to_and_fro"
 duration_s = 1.8
@@ -245,7 +248,7 @@ def assert_skipped_whole_ticks(recording):
     """And went on tracking until somebody ended it."""
     at = int(np.argmax(recording["overrun"]))
     assert recording["overrun"][at] >= 35
-    assert (recording["mode"][at:-20] == Mode.TRACKING).all()
+    assert (recording["mode"][at:-END_TICKS] == Mode.TRACKING).all()
     assert recording.ticks - at > 100
 
 
@@ -256,7 +259,7 @@ def assert_led_down_from_outside(folder, out):
     assert summary["interrupted"]
     assert summary["faults"] == []
     modes = Recording.open(folder / "recording.parquet")["mode"]
-    assert set(modes[-20:]) == {Mode.TRACKING, Mode.LANDING, Mode.IDLE}  # not dropped
+    assert set(modes[-END_TICKS:]) == {Mode.TRACKING, Mode.LANDING, Mode.IDLE}  # not dropped
 
 
 def assert_damage_was_a_fault(folder, out):
