@@ -11,7 +11,7 @@ from hil.abreast import machine
 from hil.abreast.widening.records import one_by_one, side_by_side
 from hil.abreast.widening.text import LANES
 from hil.lanes import many
-from hil.lanes.many import Batch
+from hil.lanes.many import SCANNED, Batch
 from hil.lanes.setup import Setup
 from sim.plant import Plant
 
@@ -19,16 +19,20 @@ Records = NDArray[np.void]
 
 
 def scan_errors(setup: Setup, laws: Records, plants: Sequence[Plant]) -> Records:
-    """``many.scan_errors``, side by side if that has been made for this machine (``prepare``); the same bits."""
+    """(n,) of ``SCANNED`` of plants at rest under ``laws``, (n,) of ``cycle.LAW`` or (1,) for all; the rest of the run,
+    which ``many.can_run`` allows, is that of ``setup``.
+    """
     if not plants:
-        return many.scan_errors(setup, laws, plants)
+        return np.zeros(0, SCANNED)
     batch = Batch.of(setup, laws, plants)
     run(batch)
     return batch.found
 
 
 def run(batch: Batch) -> None:
-    """All its ticks, side by side if that has been made, else one after another."""
+    """All its ticks, side by side if that has been made for this machine (``prepare``), else one after another: the
+    same bits.
+    """
     if machine.is_there(own_laws=len(batch.laws) > 1):
         run_side_by_side(batch)
     else:

@@ -1,10 +1,6 @@
 """The widened kernels as this machine's code: made once, in a minute and a half, and kept beside numba's."""
 
 import hashlib
-import os
-import subprocess
-import sys
-import tempfile
 from functools import cache
 from pathlib import Path
 
@@ -14,7 +10,7 @@ import hil.abreast.widening as widening
 from hil.abreast.parts import PARTS
 from hil.abreast.widening.text import LANES
 from hil.abreast.widening.widened import widened
-from pkxyz_ctrl.export.kernels import kept, place_of
+from pkxyz_ctrl.export.kernels import emitted, kept, place_of
 
 ALIKE = frozenset({"reference", "windows_us"})
 """Arguments that are one for all devices of a batch; laws besides, or one for each."""
@@ -64,7 +60,7 @@ def _name(own_laws: bool) -> str:
 
 def _made(own_laws: bool) -> bytes:
     """Bytes of the frame, and the object file below."""
-    ir = kept("abreast.ll", _MADE_OF, _emitted).decode()
+    ir = kept("abreast.ll", _MADE_OF, lambda: emitted("hil.abreast.parts").encode()).decode()
     shared = ALIKE if own_laws else ALIKE | {"laws"}
     text, frame = widened(ir, shared)
     machine = llvm.Target.from_default_triple().create_target_machine(
@@ -77,20 +73,6 @@ def _made(own_laws: bool) -> bytes:
     passes.add_simplify_cfg_pass()
     passes.run(module, llvm.create_pass_builder(machine, options))
     return f"{frame}\n".encode() + machine.emit_object(module)
-
-
-def _emitted() -> bytes:
-    """What ``parts`` writes."""
-    with tempfile.TemporaryDirectory(prefix="pkxyz-abreast-") as folder:
-        out = Path(folder) / "parts.ll"
-        env = {
-            **os.environ, "NUMBA_OPT": "0", "NUMBA_CPU_NAME": "generic", "NUMBA_CPU_FEATURES": "",
-            "NUMBA_CACHE_DIR": folder, "NUMBA_DISABLE_JIT": "0",
-            "PYTHONPATH": os.pathsep.join(path for path in sys.path if path),
-        }  # fmt: skip
-        words = [sys.executable, "-W", "ignore", "-m", "hil.abreast.parts", str(out)]
-        subprocess.run(words, env=env, check=True, capture_output=True)
-        return out.read_bytes()
 
 
 def _loop(shared: frozenset[str]) -> str:

@@ -76,17 +76,6 @@ class Batch(NamedTuple):
         )  # fmt: skip
 
 
-def scan_errors(setup: Setup, laws: Records, plants: Sequence[Plant]) -> Records:
-    """(n,) of ``SCANNED`` of plants at rest under ``laws``, (n,) of ``cycle.LAW`` or (1,) for all; the rest of the run,
-    which ``can_run`` allows, is that of ``setup``.
-    """
-    if not plants:
-        return np.zeros(0, SCANNED)
-    batch = Batch.of(setup, laws, plants)
-    run_one_after_another(batch)
-    return batch.found
-
-
 def run_one_after_another(batch: Batch) -> None:
     """All its ticks; state, memory and ``found`` are left as the run leaves them."""
     _run_together(*batch)

@@ -18,6 +18,8 @@ from typing import NamedTuple
 import llvmlite
 import numba
 
+from pkxyz_ctrl.compiled.kernel_cache import digest_of_kernels
+
 _MADE_OF = tuple(Path(__file__).with_name(name) for name in ("entries.py", "emit.py", "planned.py"))
 
 
@@ -38,13 +40,13 @@ class Kernels(NamedTuple):
 def kernels(*, is_planned: bool = False) -> Kernels:
     """Those of ``entries_for``, from the folder of compiled kernels if they lie there. Takes a minute if not."""
     name, words = ("export_planned.ll", ("planned",)) if is_planned else ("export.ll", ())
-    text = kept(name, _MADE_OF, lambda: _emitted(words).encode()).decode()
+    text = kept(name, _MADE_OF, lambda: emitted("pkxyz_ctrl.export.emit", *words).encode()).decode()
     first, _, ir = text.partition("\n")
     return Kernels(ir, json.loads(first), is_planned)
 
 
 def kept(name: str, sources: Sequence[Path], make: Callable[[], bytes]) -> bytes:
-    """What ``make`` gives, or gave before: it lies beside numba's kernels, in a folder of their digest. ``name`` is
+    """What ``make`` gives, or gave before, of the kernels as they are: it lies beside numba's. ``name`` is
     ``stem.suffix``, ``sources`` are the modules on which it depends besides.
     """
     file = place_of(name, sources)
@@ -63,14 +65,17 @@ def place_of(name: str, sources: Sequence[Path]) -> Path | None:
     folder = os.environ.get("NUMBA_CACHE_DIR")
     if folder is None or not Path(folder).is_dir():
         return None
-    digest = hashlib.sha256(f"{numba.__version__} {llvmlite.__version__}".encode())
+    digest = hashlib.sha256(f"{numba.__version__} {llvmlite.__version__} {digest_of_kernels()}".encode())
     for source in sources:
         digest.update(source.read_bytes())
     stem, _, suffix = name.rpartition(".")
     return Path(folder) / f"{stem}-{digest.hexdigest()[:16]}.{suffix}"
 
 
-def _emitted(more: tuple[str, ...]) -> str:
+def emitted(module: str, *more: str) -> str:
+    """What a module writes to the file that it is handed, run by itself where numba optimises nothing. Raises
+    ``ExportError``.
+    """
     with tempfile.TemporaryDirectory(prefix="pkxyz-export-") as folder:
         out = Path(folder) / "kernels.ll"
         env = {
@@ -82,9 +87,9 @@ def _emitted(more: tuple[str, ...]) -> str:
             "NUMBA_DISABLE_JIT": "0",
             "PYTHONPATH": os.pathsep.join(path for path in sys.path if path),
         }
-        words = [sys.executable, "-W", "ignore", "-m", "pkxyz_ctrl.export.emit", str(out), *more]
+        words = [sys.executable, "-W", "ignore", "-m", module, str(out), *more]
         done = subprocess.run(words, env=env, check=False, capture_output=True, text=True)
         if done.returncode != 0:
             last = (done.stderr.strip().splitlines() or ["it said nothing"])[-1]
-            raise ExportError(f"the kernels could not be compiled for export: {last}")
+            raise ExportError(f"the kernels could not be compiled by {module}: {last}")
         return out.read_text(encoding="utf-8")

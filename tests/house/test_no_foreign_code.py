@@ -19,7 +19,6 @@ ALLOWED = {
     ("hil/native/program.py", "subprocess"): "the C compiler, for sources of this package",
     ("hil/native/loop_process.py", "subprocess"): "the program that it made of them",
     ("hil/server/beside.py", "subprocess"): "this program: the loop and the plant, in processes of their own",
-    ("hil/abreast/machine.py", "subprocess"): "this program, where numba leaves what it compiles unoptimised",
     ("hil/abreast/parts.py", "compile"): "numba's, of kernels of that file",
     ("pkxyz_ctrl/export/kernels.py", "subprocess"): "this program, where numba leaves what it compiles unoptimised",
 }

@@ -32,6 +32,12 @@ def setups(controller="youla"):
             device(6, (0.0, 0.0, 0.0))]  # fmt: skip
 
 
+def scan_errors(setup, laws, plants):
+    batch = many.Batch.of(setup, laws, plants)
+    many.run_one_after_another(batch)
+    return batch.found
+
+
 def by_rows(setup):
     """Faults, RMS error and its deviation (3,) in m, as the recording's rows have them."""
     metrics = Metrics(setup.trajectory, setup.bus.period_us)
@@ -43,7 +49,7 @@ def by_rows(setup):
 @pytest.mark.parametrize("controller", ["youla", "lqg", "irc"])
 def test_errors_are_those_of_the_rows(controller):
     asked = setups(controller)
-    found = many.scan_errors(asked[0], asked[0].law, [setup.new_plant() for setup in asked])
+    found = scan_errors(asked[0], asked[0].law, [setup.new_plant() for setup in asked])
     ended = []
     for setup, one, rms, deviation in zip(asked, found, many.rms_m(found), many.deviation_m(found), strict=True):
         faulted, rms_nm, deviation_nm = by_rows(setup)
@@ -57,12 +63,12 @@ def test_errors_are_those_of_the_rows(controller):
 
 def test_who_is_run_beside_whom_changes_no_bit():
     asked = setups()
-    together = many.scan_errors(asked[0], asked[0].law, [setup.new_plant() for setup in asked])
+    together = scan_errors(asked[0], asked[0].law, [setup.new_plant() for setup in asked])
     own_laws = many.joined([setup.law for setup in asked])
     own_laws.flags.writeable = False
-    assert np.array_equal(together, many.scan_errors(asked[0], own_laws, [setup.new_plant() for setup in asked]))
+    assert np.array_equal(together, scan_errors(asked[0], own_laws, [setup.new_plant() for setup in asked]))
     for n, setup in enumerate(asked):
-        assert np.array_equal(together[n : n + 1], many.scan_errors(setup, setup.law, [setup.new_plant()])), n
+        assert np.array_equal(together[n : n + 1], scan_errors(setup, setup.law, [setup.new_plant()])), n
 
 
 def test_what_it_has_no_room_for_is_told():

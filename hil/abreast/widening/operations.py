@@ -24,27 +24,6 @@ _IN_VECTORS = frozenset(
 _SAME = {"sqrt": "llvm.sqrt.f64"}
 
 
-def write(block: BlockText, instruction: Instruction) -> None:
-    """Write an instruction to a block."""
-    operation = instruction.operation
-    if operation == "store":
-        _store(block, instruction)
-    elif operation == "zero":
-        _zero(block, instruction)
-    elif operation == "load":
-        _load(block, instruction)
-    elif operation == "getelementptr":
-        _element(block, instruction)
-    elif operation == "call":
-        _call(block, instruction)
-    elif operation == "select":
-        _select(block, instruction)
-    elif operation in ARITHMETIC or operation in CASTS or operation in ("icmp", "fcmp", "fneg", "freeze"):
-        _arithmetic(block, instruction)
-    else:
-        raise IrError(f"{operation} is not known")
-
-
 def _varies(block: BlockText, instruction: Instruction) -> bool:
     return instruction.result in block.shape.varying.values
 
@@ -183,3 +162,14 @@ def _laned(block: BlockText, pointers: str, kind: str) -> str:
 
 def _short(kind: str) -> str:
     return "f64" if kind == "double" else kind
+
+
+_WRITERS = {
+    "store": _store, "zero": _zero, "load": _load, "getelementptr": _element, "call": _call, "select": _select,
+    **dict.fromkeys([*ARITHMETIC, *CASTS, "icmp", "fcmp", "fneg", "freeze"], _arithmetic),
+}  # fmt: skip
+
+
+def write(block: BlockText, instruction: Instruction) -> None:
+    """Write an instruction to a block."""
+    _WRITERS[instruction.operation](block, instruction)

@@ -9,7 +9,6 @@ import os
 import signal
 import subprocess
 import sys
-from itertools import count
 from typing import Final
 
 from hil.lanes import many
@@ -55,23 +54,23 @@ def _steps(ticks: int) -> int | None:
     words = [sys.executable, "-W", "ignore", "-m", "hil.bench.rigs.instructions", str(ticks)]
     process = subprocess.Popen(words, stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL)
     try:
-        if not _goes_on_until_it_stops(process.pid, _CONTINUE):
+        if not _stops_itself(process.pid):
             return None
-        for taken in count():
-            if not _goes_on(process.pid, _STEP):
-                return None
+        taken = -1
+        while _goes_on(process.pid, _STEP):
+            taken += 1
             _, status = os.waitpid(process.pid, 0)
             if not os.WIFSTOPPED(status):
                 return None
             if os.WSTOPSIG(status) == signal.SIGSTOP:
                 return taken
+        return None
     finally:
         process.kill()
         process.wait()
-    return None
 
 
-def _goes_on_until_it_stops(pid: int, request: int) -> bool:
+def _stops_itself(pid: int) -> bool:
     """From the start; other signals than the one that it sends itself are let go."""
     while True:
         _, status = os.waitpid(pid, 0)
@@ -79,7 +78,7 @@ def _goes_on_until_it_stops(pid: int, request: int) -> bool:
             return False
         if os.WSTOPSIG(status) == signal.SIGSTOP:
             return True
-        if not _goes_on(pid, request):
+        if not _goes_on(pid, _CONTINUE):
             return False
 
 
