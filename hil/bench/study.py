@@ -9,6 +9,7 @@ from importlib.util import find_spec
 
 import numpy as np
 
+from hil.abreast import batch
 from hil.bench.rigs.figure import Figure
 from hil.runs.scenario import Scenario, build_scenario, load_scenario
 from hil.studies.montecarlo import Study, run_one
@@ -44,6 +45,7 @@ def study() -> list[Figure]:
     """Plants of a Monte Carlo study, from drawing one to its figures and its Ms; starting the two processes and the
     first plant of each are left out. Beside it a trial of a tuning, in the same processes.
     """
+    batch.prepare(own_laws=False)  # as a yield of so many devices has it
     plants = Study(load_scenario("raster", controller="lqg"), load("tolerances", "wide", Tolerances))
     stage_s = plants.scenario.config.duration_s
     walls, busy = [], []

@@ -38,6 +38,7 @@ from hil.recording.recording import Recording
 from hil.runs.replay import replay
 from hil.runs.scenario import load_scenario
 from pkxyz_ctrl.config.files import CONFIG_DIR
+from pkxyz_ctrl.design.law import way_down_ticks
 from pkxyz_ctrl.safety.modes import Mode
 
 PERIOD_US = 10_000
@@ -297,7 +298,7 @@ def test_start_up_and_scan(bench, plant):
     assert result.differences == []
     assert result.ticks == recording.ticks
     frames = list(can.LogReader(bench / "scan" / "frames.log"))
-    way_down = 12 + 2  # ticks that lead the stage down, and those that begin and end them: no part of the scenario
+    way_down = way_down_ticks(0.005, PERIOD_US)[1] + 2  # those that begin and end them beside
     assert sum(frame.arbitration_id == SYNC for frame in frames) == recording.ticks + way_down
 
 

@@ -36,6 +36,7 @@ from hil.lanes.wall_plant import TRUTH
 from hil.native.program import kept
 from hil.recording.recording import Recording
 from hil.runs.replay import replay
+from pkxyz_ctrl.design.law import way_down_ticks
 from pkxyz_ctrl.safety.modes import Mode
 
 __all__ = ["bench", "plant"]
@@ -81,7 +82,7 @@ def test_start_up_and_scan(bench, plant):
     result = replay(bench / "scan" / "recording.parquet")
     assert result.differences == []
     frames = list(can.LogReader(bench / "scan" / "frames.log"))
-    way_down = 12 + 2  # ticks that lead the stage down, and those that begin and end them
+    way_down = way_down_ticks(0.005, PERIOD_US)[1] + 2  # those that begin and end them beside
     assert sum(frame.arbitration_id == SYNC for frame in frames) == recording.ticks + way_down
     assert any(frame.arbitration_id == SENSE and frame.is_fd == is_fd(bench) for frame in frames)
 

@@ -1,8 +1,8 @@
 """Sampled devices in a closed loop: margins, and the error of a scenario on the fast lane.
 
 Device k of this part lies on wafer k, so that the devices are independent of each other, or with ``per_wafer`` others
-on wafer k // per_wafer, all over it. Each is run under the law as
-shipped, which knows the drawing only, and if asked also under a law designed for
+on wafer k // per_wafer, all over it. Each is run under the law as shipped, which knows the drawing only, and if asked
+also under a law designed for
 
 - what `pkxyz identify` finds of it, from inside and with an instrument outside (``identified``);
 - what an identification without error would find: springs, combs, sense combs and damping, by the drawing's mass.
