@@ -38,7 +38,7 @@ from pkxyz_ctrl.safety.modes import Mode
 
 _ROW_BYTES: Final = ROW.itemsize
 _TRUTH_AT: Final = ROW.itemsize - TRUTH_BYTES
-_FEW_MOST: Final = 8  # ticks until whole ones are tried again
+_FEW_MOST: Final = 4  # ticks until whole ones are tried again
 
 
 class WirePort:

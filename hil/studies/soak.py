@@ -9,7 +9,7 @@ import bisect
 import dataclasses
 import random
 import time
-from collections import Counter
+from collections import Counter, deque
 from collections.abc import Callable
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -44,8 +44,8 @@ _LASTS_S = (0.0005, 0.06)
 _QUIET_S = 0.05  # at the end, so that the last one is not cut off
 _LEFT_OUT = ("controller:killed", "bus.drive:forged")  # would end the run; has a voltage of its own
 _ROWS_EACH = 300_000  # of one recording: a minute at 5 kHz
-_PIECE_ROWS = 16_384  # of a journal, read at once
-_PARQUET_EACH = 8  # one in so many recordings that are not kept; its memory is given back later
+_PIECE_ROWS = 2048  # of a journal, read at once: a megabyte, which the cache holds
+_PARQUET_EACH = 16  # one in so many recordings that are not kept; its memory is given back later
 
 
 @dataclass
@@ -323,7 +323,9 @@ class _Voltages:
         self._period_us = setup.bus.period_us
         disobedient = [f for f in setup.faults if f.family == "amplifier" and f.kind != "trip"]
         after_us = self._AFTER * self._period_us
-        self._disobedient = [(f.at_us - self._period_us, (f.end_us or 0) + after_us, f.channel) for f in disobedient]
+        self._disobedient = deque(
+            (f.at_us - self._period_us, (f.end_us or 0) + after_us, f.channel) for f in disobedient
+        )  # in the order of their beginnings; those that are over are taken away
         self._volts: NDArray[np.float64] = np.zeros((3, 3))  # the last ticks of the block before
         self._obeys: NDArray[np.bool_] = np.ones((3, 3), bool)
         self._forbidden: NDArray[np.bool_] = np.ones(3, bool)
@@ -339,11 +341,9 @@ class _Voltages:
         obeys = np.concatenate([self._obeys, self._obedience(rows["tick"] + skipped)])
         forbidden = np.concatenate([self._forbidden, MAY_ENERGISE[rows["mode"]] == 0])
         soaked.voltage_max_v = max(soaked.voltage_max_v, float(volts[obeys].max(initial=0.0)))
-        for comb in range(3):
-            asked = volts[:, comb : comb + 1].copy()
-            asked[~obeys[:, comb]] = np.nan  # and so are the steps to and from there: none
-            soaked.slew_max_v = max(soaked.slew_max_v, largest_step_v(asked[:-1], asked[-1]))
-            soaked.rise_max_v = max(soaked.rise_max_v, largest_rise_v(asked, forbidden))
+        asked = np.where(obeys, volts, np.nan)  # and so are the steps to and from there: none
+        soaked.slew_max_v = max(soaked.slew_max_v, largest_step_v(asked[:-1], asked[-1]))
+        soaked.rise_max_v = max(soaked.rise_max_v, largest_rise_v(asked, forbidden))
         ticks = np.arange(1, len(forbidden) - 2)
         allowed = np.maximum.accumulate(np.where(forbidden[3:], -self._forbidden_for, ticks))
         lasted = np.where(forbidden[3:], ticks - allowed, 0)  # so long none has been allowed
@@ -356,9 +356,12 @@ class _Voltages:
         """(n, 3), for ticks of the bus's time."""
         obeys = np.ones((len(ticks), 3), bool)
         t_us = ticks * self._period_us
+        while self._disobedient and self._disobedient[0][1] < t_us[0]:
+            self._disobedient.popleft()
         for begin_us, end_us, channel in self._disobedient:
-            if begin_us <= t_us[-1] and end_us >= t_us[0]:
-                obeys[(begin_us <= t_us) & (t_us <= end_us), channel] = False
+            if begin_us > t_us[-1]:
+                break
+            obeys[(begin_us <= t_us) & (t_us <= end_us), channel] = False
         return obeys
 
 
