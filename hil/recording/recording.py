@@ -39,7 +39,7 @@ class RecordingWriter:
         """``metadata``: plain data that goes along. Replaces an existing recording. Raises ``RecordingError``."""
         self.path = Path(path)
         self._buffer = np.zeros(_BATCH_ROWS, ROW)
-        self._bytes = self._buffer.view(np.uint8)
+        self._bytes = self._buffer.view(np.uint8).reshape(_BATCH_ROWS, -1)  # a copy of fields takes five times longer
         self._filled = 0
         self._closed = False
         self._failed = False
@@ -58,11 +58,10 @@ class RecordingWriter:
         """Add the rows of a block (n,) of ``ROW``; they are copied. Raises ``RecordingError``."""
         if self._closed:
             raise RecordingError(f"{self.path}: is closed, nothing can be added")
-        done, size = 0, ROW.itemsize
-        added = np.ascontiguousarray(block, ROW).view(np.uint8)  # row by row, field by field numpy takes five times longer
+        done, added = 0, np.ascontiguousarray(block, ROW).view(np.uint8).reshape(-1, ROW.itemsize)
         while done < len(block):
             count = min(len(block) - done, _BATCH_ROWS - self._filled)
-            self._bytes[self._filled * size : (self._filled + count) * size] = added[done * size : (done + count) * size]
+            self._bytes[self._filled : self._filled + count] = added[done : done + count]
             self._filled += count
             done += count
             if self._filled == _BATCH_ROWS:

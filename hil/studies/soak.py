@@ -255,7 +255,7 @@ class _Log:
         soaked.reasons = dict(self._reasons.most_common())
         self._voltages.look_at(rows)
         state = self._rig.plant.plant.state[0]
-        soaked.damaged = soaked.damaged or bool(state["broken"] or state["held"].any())
+        soaked.damaged |= bool(state["broken"] or state["held"].any())
         self._rig.controller.faults.clear()  # counted; the words of a thousand faults are of no use
         self._last_mode = int(mode[-1])
 
@@ -319,13 +319,11 @@ class _Voltages:
     _AFTER = 4  # ticks: the rest of a release that a fault has held up
 
     def __init__(self, soaked: Soaked, setup: Setup) -> None:
-        self._soaked = soaked
-        self._period_us = setup.bus.period_us
+        self._soaked, self._period_us = soaked, setup.bus.period_us
         disobedient = [f for f in setup.faults if f.family == "amplifier" and f.kind != "trip"]
         after_us = self._AFTER * self._period_us
-        self._disobedient = deque(
-            (f.at_us - self._period_us, (f.end_us or 0) + after_us, f.channel) for f in disobedient
-        )  # in the order of their beginnings; those that are over are taken away
+        times = [(f.at_us - self._period_us, (f.end_us or 0) + after_us, f.channel) for f in disobedient]
+        self._disobedient = deque(times)  # in the order of their beginnings, less those that are over
         self._volts: NDArray[np.float64] = np.zeros((3, 3))  # the last ticks of the block before
         self._obeys: NDArray[np.bool_] = np.ones((3, 3), bool)
         self._forbidden: NDArray[np.bool_] = np.ones(3, bool)
@@ -354,8 +352,7 @@ class _Voltages:
 
     def _obedience(self, ticks: NDArray[np.int64]) -> NDArray[np.bool_]:
         """(n, 3), for ticks of the bus's time."""
-        obeys = np.ones((len(ticks), 3), bool)
-        t_us = ticks * self._period_us
+        obeys, t_us = np.ones((len(ticks), 3), bool), ticks * self._period_us
         while self._disobedient and self._disobedient[0][1] < t_us[0]:
             self._disobedient.popleft()
         for begin_us, end_us, channel in self._disobedient:
