@@ -1,9 +1,10 @@
 """Draws the matrix of faults, and keeps what came of each for docs/lookup/faults.md. The matrix takes a minute or two.
 
-    python docs/figures/faults.py [SOAK.JSON]
+    python docs/figures/faults.py [SOAK.JSON [MANY.JSON]]
 
-The soak's line and picture are taken over only where the result of ``pkxyz soak
---out`` is given: that takes ten minutes.
+The soak's line and picture are taken over only where the result of ``pkxyz soak --out`` is given: that takes some
+minutes. Likewise that of ``pkxyz soak --minutes 33.334 --runs 100 --out``, 10^9 ticks, which is kept in docs/tables: an
+hour.
 """
 
 import json
@@ -27,6 +28,8 @@ PAGE = HERE.parent / "lookup" / "faults.md"
 FOUND = HERE / "faults.json"
 """Of the law of the page; the site's table is made of it."""
 LAW = "lqg"
+MANY = HERE.parent / "tables" / "soak.json"
+"""10^9 ticks, with what came of each kind of fault."""
 
 
 def plain(outcomes: list[Outcome]) -> list[dict[str, Any]]:
@@ -62,15 +65,24 @@ def matrix(found: list[dict[str, Any]]) -> str:
 def soaked(path: Path) -> str:
     """The result of a soak in a sentence."""
     s = json.loads(path.read_text(encoding="utf-8"))
-    reasons = ", ".join(f"{name} {count}" for name, count in list(s["reasons"].items())[:3])
     early, late = min(s["memory_mb"][1:9]), min(s["memory_mb"][-8:])  # least of eight, as it is judged
     decided = decisions_in_words(s["faults"], s["undecided"], s["decisions"], s["misled"])
     return (
         f"Measured (seed {s['seed']}, law {s['law']}): {s['ticks']} ticks at {s['realtime_factor']:.1f} times real "
         f"time, {s['recorded_ticks']} read back; {decided}, {s['returns']} times back to tracking; memory "
-        f"{early:.0f} MB at first and {late:.0f} MB at last; damaged: "
-        f"{'yes' if s['damaged'] else 'no'}. Most frequent: {reasons}.\n\n"
+        f"{early:.0f} MB at first and {late:.0f} MB at last.\n\n"
+        f"{many_soaked()}\n\n"
         "![memory, faults, decisions and returns, minute by minute](../figures/soak.png)"
+    )
+
+
+def many_soaked() -> str:
+    """Likewise of the many that are kept."""
+    s = json.loads(MANY.read_text(encoding="utf-8"))
+    violations = sum(len(problems) for problems in s["problems"].values())
+    return (
+        f"Seeds 1 to {s['soaks']}, {s['core_minutes']:.0f} core-minutes: {s['ticks']} ticks, {s['faults']} faults, "
+        f"{s['decisions']} decisions, {violations} violations."
     )
 
 
@@ -89,6 +101,8 @@ def main() -> None:
     draw(found, CASES, HERE / "faults.png")
     kept = plain([o for o in found if o.law == LAW])
     FOUND.write_text(json.dumps(kept, indent=1) + "\n", encoding="utf-8")
+    if len(sys.argv) > 2:
+        shutil.copy(sys.argv[2], MANY)
     if len(sys.argv) > 1:
         page = filled_in(PAGE.read_text(encoding="utf-8"), "soak", soaked(Path(sys.argv[1])))
         shutil.copy(Path(sys.argv[1]).with_name("soak.png"), HERE / "soak.png")

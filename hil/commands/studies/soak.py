@@ -124,13 +124,17 @@ def _several(
     say_if_compiling(quiet=as_json)
     with progress_bar("soaks", quiet=as_json) as tell:
         soaks = soak_each(asked, seeds, workers or cores(), kept, cluster, tell)
-    found = totals(soaks) | {"law": law, "minutes_each": duration_s / 60.0, "interrupted": len(soaks) < len(seeds)}
+    found = totals(soaks) | {
+        "law": law, "minutes_each": duration_s / 60.0, "interrupted": len(soaks) < len(seeds),
+        "core_minutes": sum(duration_s / soaked.realtime_factor for soaked in soaks) / 60.0,
+    }  # fmt: skip
     (folder / "soak.json").write_text(json.dumps(found, indent=1) + "\n", encoding="utf-8")
     if as_json:
         print(json.dumps(found))
     else:
         say(
-            f"{found['soaks']} of {len(seeds)} soaks, {found['ticks']} ticks, {found['recorded_ticks']} read back; "
+            f"{found['soaks']} of {len(seeds)} soaks, {found['ticks']} ticks in {found['core_minutes']:.1f} minutes of "
+            f"a core, {found['recorded_ticks']} read back; "
             + decisions_in_words(*(found[name] for name in ("faults", "undecided", "decisions", "misled")))
             + f", {found['returns']} times back to tracking; at most {found['voltage_max_v']:.1f} V, and "
             f"{found['slew_max_v']:.1f} V up in a tick"
