@@ -11,7 +11,7 @@ from typing import Final
 
 import numpy as np
 
-from pkxyz_ctrl.can import cob_id, driver_rules, sdo, start_plan
+from pkxyz_ctrl.can import cob_id, driver_rules, sdo, sense_input, start_plan
 from pkxyz_ctrl.can.cob_id import NmtCommand, NmtState
 from pkxyz_ctrl.can.driver_rules import (
     CONFIGURING,
@@ -130,6 +130,7 @@ def _enter(config: np.void, memory: np.void, was: int, t_us: int) -> None:
         return
     driver_rules.fall_silent(memory)
     if state == STARTING:
+        sense_input.reset(memory["sense"])  # what waited for a crowded bus is of the life before
         memory["heartbeat_next_us"] = t_us + config["heartbeat_period_us"]
     elif state == RUNNING:
         memory["heartbeat_next_us"] = t_us + FIRST_HEARTBEAT_US

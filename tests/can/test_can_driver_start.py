@@ -203,3 +203,20 @@ def test_start_is_possible_from_a_failure():
     assert driver.sense.take() == (1, 2, 3, 0)
     assert (driver.failure, driver.node_events, driver.state) == ("", 0, DriverState.RESETTING)
     assert run_dialogue(driver, ObedientServer(), driver.receive(heartbeat(BOOT_UP), 30)) == [OUR_HEARTBEAT, START]
+
+
+def test_a_sense_frame_of_the_life_before_shifts_none_of_the_new_one():
+    """It waited for a crowded bus, and came between our reset and the boot-up message."""
+    driver, codec = AmplifierDriver(DriverConfig()), ProcessCodec(0x28A, protected=True)
+
+    def came(counter: int) -> None:
+        driver.receive(Frame(0x28A, codec.encode((counter, 0, 0), counter)), 5000)
+
+    driver.start(0)
+    driver.sync(500)
+    came(240)
+    assert run_dialogue(driver, ObedientServer(), driver.receive(heartbeat(BOOT_UP), 1000)) == [OUR_HEARTBEAT, START]
+    for counter in range(3):
+        driver.sync(2000)
+        came(counter)
+        assert driver.sense.take() == (counter, 0, 0, 0)
