@@ -19,7 +19,6 @@ SENSE_LENGTH = 8  # a sense PDO of a wrong length came, and was not used
 SENSE_DUPLICATE = 16  # more than one valid sense PDO since the last SYNC
 
 SYNCS_UNCOUNTABLE: Final = 255  # from here on an 8-bit counter says nothing about what was lost
-COUNTERS_AHEAD: Final = 128  # of a counter modulo 256 what is further ahead is behind
 
 SENSE = np.dtype([("pdo", PDO, (1,)), ("syncs_uncountable", "i4")], align=True)
 
@@ -28,7 +27,6 @@ SENSE_MEMORY = np.dtype(
         ("count", "i4", (3,)),  # that were believed last
         ("counter", "i4"),  # of the last PDO that was; -1: none
         ("syncs", "i4"),  # since then
-        ("is_in_step", "i4"),  # 1: two in succession came, a SYNC apart; a first one may have been late
         ("flags", "i4"),  # what went wrong since it was looked at
         ("fresh", "i4"),  # 1: this SYNC's sample is here
     ],
@@ -43,7 +41,7 @@ def reset(memory_array: Records) -> None:
     for i in range(3):
         memory["count"][i] = 0
     memory["counter"] = -1
-    memory["syncs"] = memory["is_in_step"] = memory["flags"] = memory["fresh"] = 0
+    memory["syncs"] = memory["flags"] = memory["fresh"] = 0
 
 
 @kernel
@@ -77,31 +75,21 @@ def receive(config_array: Records, memory_array: Records, length: int, word: int
 
 @kernel
 def _believe(config: np.void, memory: np.void, counter: int) -> bool:
+    ahead = counter - memory["counter"] & 0xFF
     if memory["fresh"] != 0:
         return False  # this SYNC's sample is here: what else comes is repeated, or not yet due
-    if memory["counter"] >= 0 and not _is_due(config, memory, counter - memory["counter"] & 0xFF):
-        return False
+    if (ahead != 1 or memory["syncs"] != 1) and memory["counter"] >= 0:
+        memory["flags"] |= SENSE_COUNTER
+        if memory["syncs"] < config["syncs_uncountable"]:
+            if not 1 <= ahead <= memory["syncs"]:
+                return False
+            if ahead < memory["syncs"]:  # the sample of an earlier SYNC
+                memory["counter"] = counter
+                memory["syncs"] -= ahead
+                return False
     memory["counter"] = counter
     memory["syncs"] = 0
     return True
-
-
-@kernel
-def _is_due(config: np.void, memory: np.void, ahead: int) -> bool:
-    """Whether a frame whose counter is so far ahead of the last one's is the sample of this SYNC."""
-    syncs = memory["syncs"]
-    if ahead == 1 and syncs == 1:
-        memory["is_in_step"] = 1
-        return True
-    memory["flags"] |= SENSE_COUNTER
-    if syncs >= config["syncs_uncountable"]:
-        memory["is_in_step"] = 0
-        return True
-    if 1 <= ahead < syncs:  # of an earlier one
-        memory["counter"] = memory["counter"] + ahead & 0xFF
-        memory["syncs"] -= ahead
-        return False
-    return bool(ahead == syncs or (memory["is_in_step"] == 0 and syncs < ahead < COUNTERS_AHEAD))
 
 
 @kernel
@@ -121,9 +109,6 @@ class SenseInput:
     they are counted, and no more, so that a frame that came after its tick gave up does not shift the later ones. An
     old frame that is played again is never used, and after a loss the next good frame is. After ``syncs_uncountable``
     SYNCs of silence any counter is taken. Counter and CRC are not looked at in plain PDOs.
-
-    The first frame of a node may have waited for a crowded bus, and be an earlier SYNC's. Until two have come in
-    succession, a SYNC apart, one that is further ahead than there were SYNCs tells so, and is counted from.
 
     The rules are compiled: ``record`` (1,) of ``SENSE`` is what they go by, ``memory`` (1,) of ``SENSE_MEMORY`` all
     that is remembered.
