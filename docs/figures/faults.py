@@ -71,18 +71,20 @@ def soaked(path: Path) -> str:
         f"Measured (seed {s['seed']}, law {s['law']}): {s['ticks']} ticks at {s['realtime_factor']:.1f} times real "
         f"time, {s['recorded_ticks']} read back; {decided}, {s['returns']} times back to tracking; memory "
         f"{early:.0f} MB at first and {late:.0f} MB at last.\n\n"
-        f"{many_soaked()}\n\n"
+        f"{many_soaked()}"
         "![memory, faults, decisions and returns, minute by minute](../figures/soak.png)"
     )
 
 
 def many_soaked() -> str:
-    """Likewise of the many that are kept."""
+    """Likewise of the many that are kept; nothing where none are."""
+    if not MANY.is_file():
+        return ""
     s = json.loads(MANY.read_text(encoding="utf-8"))
     violations = sum(len(problems) for problems in s["problems"].values())
     return (
         f"Seeds 1 to {s['soaks']}, {s['core_minutes']:.0f} core-minutes: {s['ticks']} ticks, {s['faults']} faults, "
-        f"{s['decisions']} decisions, {violations} violations."
+        f"{s['decisions']} decisions, {violations} violations.\n\n"
     )
 
 

@@ -2,8 +2,8 @@
 
 python docs/tables/many_devices.py FOLDER
 
-FOLDER takes what both find, some GB; they have the machine to themselves for some minutes each. Without it nothing
-happens, so that ``make docs`` does not wait.
+FOLDER, which must not be there yet, takes what both find, some GB; they have the machine to themselves for some minutes
+each. Without it nothing happens, so that ``make docs`` does not wait.
 """
 
 import json
@@ -40,5 +40,7 @@ def kept_of(told: dict[str, Any], seconds: float) -> dict[str, Any]:
 
 
 if __name__ == "__main__" and len(sys.argv) > 1:
-    both = [kept_of(*drawn(seed, Path(sys.argv[1]))) for seed in SEEDS]
+    place = Path(sys.argv[1])
+    place.mkdir(parents=True)  # what went on with an earlier one would have taken no time
+    both = [kept_of(*drawn(seed, place)) for seed in SEEDS]
     KEPT.write_text(json.dumps(both, indent=1) + "\n", encoding="utf-8")

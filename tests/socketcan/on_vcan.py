@@ -298,7 +298,7 @@ def test_start_up_and_scan(bench, plant):
     assert result.differences == []
     assert result.ticks == recording.ticks
     frames = list(can.LogReader(bench / "scan" / "frames.log"))
-    way_down = way_down_ticks(0.005, PERIOD_US)[1] + 2  # those that begin and end them beside
+    way_down = way_down_ticks(0.005, PERIOD_US)[1] + 2  # and the ticks that begin and end it
     assert sum(frame.arbitration_id == SYNC for frame in frames) == recording.ticks + way_down
 
 
