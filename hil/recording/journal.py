@@ -81,6 +81,12 @@ class JournalReader:
         count = min(end, self.ticks) - begin
         return np.fromfile(self._path, ROW, count, offset=self._begin + begin * ROW.itemsize)
 
+    def mapped(self) -> NDArray[np.void]:
+        """All rows (n,) as they lie in the file, which nobody may cut meanwhile. Raises ``OSError``."""
+        if self.ticks == 0:  # nothing can't be mapped
+            return np.zeros(0, ROW)
+        return np.memmap(self._path, ROW, "r", self._begin, (self.ticks,))
+
 
 def _layout() -> str:
     """How a row lies in memory: whoever reads a journal must mean the same."""

@@ -42,7 +42,7 @@ class RecordingWriter:
         self._bytes = self._buffer.view(np.uint8).reshape(_BATCH_ROWS, -1)  # a copy of fields takes five times longer
         self._filled = 0
         self._closed = False
-        self._failed = False
+        self._failure: str | None = None
         try:
             self.path.unlink(missing_ok=True)
             self._journal = JournalWriter(journal_of(self.path), metadata)
@@ -55,12 +55,17 @@ class RecordingWriter:
         return self._journal.ticks
 
     def write(self, block: NDArray[np.void]) -> None:
-        """Add the rows of a block (n,) of ``ROW``; they are copied. Raises ``RecordingError``."""
+        """Add the rows of a block (n,) of ``ROW``; they are copied, or safe at once. Raises ``RecordingError``."""
         if self._closed:
             raise RecordingError(f"{self.path}: is closed, nothing can be added")
-        done, added = 0, np.ascontiguousarray(block, ROW).view(np.uint8).reshape(-1, ROW.itemsize)
-        while done < len(block):
-            count = min(len(block) - done, _BATCH_ROWS - self._filled)
+        rows = np.ascontiguousarray(block, ROW)
+        if len(rows) >= _BATCH_ROWS:
+            self.flush()
+            self._append(rows)
+            return
+        done, added = 0, rows.view(np.uint8).reshape(-1, ROW.itemsize)
+        while done < len(rows):
+            count = min(len(rows) - done, _BATCH_ROWS - self._filled)
             self._bytes[self._filled : self._filled + count] = added[done : done + count]
             self._filled += count
             done += count
@@ -69,17 +74,21 @@ class RecordingWriter:
 
     def flush(self) -> None:
         """Hand all rows to the operating system. Raises ``RecordingError``."""
-        if self._filled == 0 or self._failed:
-            return
-        try:
-            self._journal.append(self._buffer[: self._filled])
-        except OSError as error:
-            self._failed = True
-            raise RecordingError(
-                f"{self.path}: cannot go on recording: {_reason(error)}; the first {self.ticks} ticks are kept in "
-                f"{journal_of(self.path).name} and open as before"
-            ) from None
-        self._filled = 0
+        filled, self._filled = self._filled, 0
+        if filled > 0:
+            self._append(self._buffer[:filled])
+
+    def _append(self, rows: NDArray[np.void]) -> None:
+        if self._failure is None:
+            try:
+                self._journal.append(rows)
+                return
+            except OSError as error:
+                self._failure = (
+                    f"{self.path}: cannot go on recording: {_reason(error)}; the first {self.ticks} ticks are kept in "
+                    f"{journal_of(self.path).name} and open as before"
+                )
+        raise RecordingError(self._failure)
 
     def close(self, *, whole: bool = True) -> None:
         """Write what is buffered, turn the journal into Parquet; ``whole``: nothing is missing at its end.
@@ -89,7 +98,7 @@ class RecordingWriter:
         if self._closed:
             return
         self.leave()
-        if not self._failed:
+        if self._failure is None:
             recover(self.path, whole=whole)
 
     def leave(self) -> None:
@@ -101,7 +110,8 @@ class RecordingWriter:
             return
         self._closed = True
         try:
-            self.flush()
+            if self._failure is None:
+                self.flush()
         finally:
             self._journal.close()
 

@@ -44,8 +44,8 @@ _LASTS_S = (0.0005, 0.06)
 _QUIET_S = 0.05  # at the end, so that the last one is not cut off
 _LEFT_OUT = ("controller:killed", "bus.drive:forged")  # would end the run; has a voltage of its own
 _ROWS_EACH = 300_000  # of one recording: a minute at 5 kHz
-_PIECE_ROWS = 2048  # of a journal, read at once: a megabyte, which the cache holds
-_PARQUET_EACH = 16  # one in so many recordings that are not kept; its memory is given back later
+_PARQUET_EACH = 64  # one in so many recordings that are not kept, the first of each soak
+_MEMORY_OF = 16  # recordings at either end: what Parquet takes is given back later
 
 
 @dataclass
@@ -306,9 +306,7 @@ def _read_again(writer: RecordingWriter, *, as_parquet: bool) -> NDArray[np.int6
         writer.close()
         return Recording.open(writer.path)["tick"]
     writer.leave()
-    journal = JournalReader(journal_of(writer.path))
-    pieces = range(0, journal.ticks, _PIECE_ROWS)
-    return np.concatenate([journal.rows(begin, begin + _PIECE_ROWS)["tick"] for begin in pieces])
+    return JournalReader(journal_of(writer.path)).mapped()["tick"].copy()
 
 
 class _Voltages:
@@ -383,7 +381,7 @@ def _judge(soaked: Soaked, setup: Setup) -> None:
     if soaked.decisions == 0 or soaked.returns == 0:
         problems.append("no fault was decided, or none recovered from")
     if len(soaked.memory_mb) > 4:
-        some = min(_PARQUET_EACH, len(soaked.memory_mb) // 2)
+        some = min(_MEMORY_OF, len(soaked.memory_mb) // 2)
         early, late = min(soaked.memory_mb[1 : 1 + some]), min(soaked.memory_mb[-some:])
         if late > early + 20.0:
             problems.append(f"memory grew from {early:.0f} to {late:.0f} MB")

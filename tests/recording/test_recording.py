@@ -149,6 +149,7 @@ def test_a_journal_counts_the_rows_that_the_system_has(tmp_path):
     assert (reader.ticks, reader.metadata) == (703, {"seed": 1})
     assert reader.rows(1, 3).tobytes() == random_rows(2).tobytes()
     assert len(reader.rows(700, 9_999)) == 3
+    assert reader.mapped().tobytes() == reader.rows(0, reader.ticks).tobytes()
 
 
 def test_each_row_is_the_systems_as_soon_as_it_was_handed_over(tmp_path):
@@ -231,11 +232,20 @@ def test_a_disk_that_fills_up_during_the_run_keeps_what_fits(tmp_path):
                     writer.write(random_rows(2048))
         except RecordingError as error:
             print(error)
+        writer = RecordingWriter({str(tmp_path / "again.parquet")!r}, {{}})
+        for _ in range(10):
+            try:
+                writer.write(random_rows(1500))
+            except RecordingError as error:
+                print("again", error)
     """
     done = subprocess.run(
-        [sys.executable, "-c", textwrap.dedent(program)], check=True, capture_output=True, text=True
+        [sys.executable, "-c", textwrap.dedent(program)], check=True, capture_output=True, text=True, timeout=60
     )  # fmt: skip
-    assert done.stdout.count("\n") == 1
+    first, *again = done.stdout.splitlines()
+    assert len(set(again)) == 1 < len(again)  # the same at each further batch
+    assert again[0].startswith("again")
+    assert not first.startswith("again")
     assert "cannot go on recording: file too large" in done.stdout
     recording = Recording.open(path)
     head = journal_of(path).read_bytes().index(b"\n") + 1
