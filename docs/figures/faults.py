@@ -65,7 +65,7 @@ def matrix(found: list[dict[str, Any]]) -> str:
 def soaked(path: Path) -> str:
     """The result of a soak in a sentence."""
     s = json.loads(path.read_text(encoding="utf-8"))
-    early, late = min(s["memory_mb"][1:9]), min(s["memory_mb"][-8:])  # least of eight, as it is judged
+    early, late = min(s["memory_mb"][1:17]), min(s["memory_mb"][-16:])  # least of sixteen, as it is judged
     decided = decisions_in_words(s["faults"], s["undecided"], s["decisions"], s["misled"])
     return (
         f"Measured (seed {s['seed']}, law {s['law']}): {s['ticks']} ticks at {s['realtime_factor']:.1f} times real "
