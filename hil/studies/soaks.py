@@ -2,6 +2,7 @@
 
 import dataclasses
 import importlib.metadata
+import os
 import shutil
 import tempfile
 from collections import Counter
@@ -55,11 +56,15 @@ def soak_each(
     """Soak with those seeds that are not kept yet; all, in the order of seeds. Interrupted, it keeps those that are
     through, and tells of them. Raises ``ConfigError`` for a cluster that can't be had.
     """
+    scratch = f"pkxyz-soak-{os.getpid()}-"
     try:
-        work_out_missing(_soaked, asked, seeds, kept, workers, cluster, on_progress, at_once=1)
+        work_out_missing(_soaked, (asked, scratch), seeds, kept, workers, cluster, on_progress, at_once=1)
     except KeyboardInterrupt:
         if not kept.found:
             raise
+    finally:  # a process that is ended leaves what it was at
+        for folder in Path(tempfile.gettempdir()).glob(scratch + "*"):
+            shutil.rmtree(folder, ignore_errors=True)
     return [kept.found[seed] for seed in seeds if seed in kept.found]
 
 
@@ -87,9 +92,9 @@ def decisions_in_words(faults: int, undecided: Mapping[str, int], decisions: int
     )
 
 
-def _soaked(asked: Asked, seed: int) -> Soaked:
-    scenario, duration_s = asked
-    folder = Path(tempfile.mkdtemp(prefix="pkxyz-soak-"))
+def _soaked(asked: tuple[Asked, str], seed: int) -> Soaked:
+    (scenario, duration_s), scratch = asked
+    folder = Path(tempfile.mkdtemp(prefix=scratch))
     try:
         return soak(duration_s, seed, scenario, folder)
     finally:

@@ -5,6 +5,7 @@ import os
 import signal
 import subprocess
 import sys
+import tempfile
 import time
 
 import pytest
@@ -131,6 +132,28 @@ def test_soaks_are_those_of_their_seeds_wherever_they_ran(tmp_path):
     assert all_of_them["voltage_max_v"] == max(soaked.voltage_max_v for soaked in found) < 200.0
     with pytest.raises(ConfigError, match="holds results of another study"):
         KeptSoaks(tmp_path / "soaks.jsonl", (asked[0], 2 * SHORT_S))
+
+
+def test_interrupted_soaks_leave_nothing_but_what_is_through(tmp_path, monkeypatch):
+    """Ctrl-C as the first is through: the processes are in the midst of others, and are ended."""
+    scratch = tmp_path / "scratch"
+    scratch.mkdir()
+    monkeypatch.setenv("TMPDIR", str(scratch))  # of the processes, and of this one:
+    monkeypatch.setattr(tempfile, "tempdir", None)
+    at_work = []
+
+    def interrupt(done, total):
+        if done > 0:
+            at_work.extend(scratch.iterdir())
+            raise KeyboardInterrupt
+
+    asked = soaked_scenario("lqg"), 60.0
+    found = soak_each(
+        asked, range(1, 6), WORKERS, KeptSoaks(tmp_path / "soaks.jsonl", asked), on_progress=interrupt
+    )  # fmt: skip
+    assert len(found) == 1
+    assert at_work != []
+    assert list(scratch.iterdir()) == []
 
 
 def test_problems_of_a_soak_are_told_with_its_seed(tmp_path):
