@@ -168,7 +168,8 @@ def test_one_altered_gain_is_named_by_the_first_signal_that_it_moves(run, tmp_pa
 def test_a_recording_that_was_cut_off_replays_as_far_as_it_goes(run, tmp_path):
     _, rows, metadata = run
     writer = RecordingWriter(tmp_path / "recording.parquet", metadata)
-    writer.write(rows)
+    for piece in (rows[:2000], rows[2000:]):  # a batch is full in the second, and handed on
+        writer.write(piece)
     assert journal_of(tmp_path / "recording.parquet").is_file()  # never closed, as if killed
     result = replay(tmp_path / "recording.parquet")
     assert result.identical
