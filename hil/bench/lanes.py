@@ -97,18 +97,25 @@ def lockstep() -> list[Figure]:
 
 
 def fast() -> list[Figure]:
-    """The default scenario in the fast lane: as a study runs it, without a file, and as `pkxyz sil` does, recorded."""
+    """The default scenario in the fast lane: as a study runs it, without a file, and as `pkxyz sil` does, recorded;
+    and with a law that learns nothing meanwhile.
+    """
     scenario = load_scenario("raster")
     setup = scenario.setup()
-    run = partial(lanes.run, setup, Lane.FAST, on_block=_forget)
+    fixed = replace(setup, controller=setup.controller.model_copy(update={"learn": "off"}))
+    run, run_fixed = (partial(lanes.run, each, Lane.FAST, on_block=_forget) for each in (setup, fixed))
     run()
-    bare = repeated({"fast": run}, 15)["fast"]
+    run_fixed()
+    taken = repeated({"bare": run, "fixed": run_fixed}, REPEATS)
+    bare = taken["bare"]
     best, median = bare.per(setup.ticks)
     with tempfile.TemporaryDirectory() as folder:
         recorded = times_of([_recorded_run(scenario, setup, Path(folder), Lane.FAST)[0] for _ in range(REPEATS)])
     return [
         Figure("fast.realtime", _factor(setup, bare.best_s), "times", 200.0, "at least", _factor(setup, bare.median_s),
                "trajectory, cycle and plant, rows handed on"),
+        Figure("fast.realtime_fixed", _factor(setup, taken["fixed"].best_s), "times", None, None,
+               _factor(setup, taken["fixed"].median_s), 'the same with learn = "off"'),
         Figure("fast.realtime_recorded", _factor(setup, recorded.best_s), "times", None, None,
                _factor(setup, recorded.median_s), "with the recording and the figures of the run"),
         Figure("fast.tick", best, "us", None, None, median, "tick.kernel and plant.period make most of it"),
