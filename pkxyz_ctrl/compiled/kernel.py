@@ -6,4 +6,8 @@ and a kernel that takes memory does not compile.
 
 from numba import njit
 
+from pkxyz_ctrl.compiled.whole_program import optimise_whole_programs
+
+optimise_whole_programs()
+
 kernel = njit(cache=True, error_model="numpy", _nrt=False)

