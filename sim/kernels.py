@@ -7,6 +7,7 @@ import math
 import numpy as np
 
 from sim.motion.amplifier import charge, drive, plan, snap, snapped
+from sim.motion.collocation import regular_step
 from sim.motion.integrator import step
 from sim.motion.kernel import kernel
 from sim.motion.layout import BROKEN, BROWNIAN_STREAM, DRIFT_STREAM, EVENTS, PULLED_IN, STOP
@@ -84,7 +85,7 @@ def _move(p: np.void, s: np.void, total_s: float) -> None:
                 parasitic_step(p, s, h)
             if p["general_on"] != 0:
                 _general(p, s, h, remaining - (k + 1) * h)
-            elif s["broken"] == 0:
+            elif s["broken"] == 0 and (h != p["regular_s"] or not regular_step(p, s)):
                 step(p, s, h)
             if s["broken"] != 0 or not _whole(s["motion"]):
                 _break(s)

@@ -7,6 +7,7 @@ import numpy as np
 from sim.config import Device, PlantConfig
 from sim.motion import layout
 from sim.motion.geometry import strokes
+from sim.motion.integrator import LONGEST_S
 from sim.motion.kernel import kernel
 from sim.motion.layout import PARAMS, STATE
 from sim.motion.mechanics import acceleration, stiffness
@@ -41,6 +42,9 @@ def build_parameters(
     _drive_combs(p, config, device)
     _amplifier(p, config, drive_v_per_count)
     _transient_response(p, stiff)
+    step_s = period_us * 1e-6
+    p["stiff_per_s2"] = stiff / p["mass_kg"]
+    p["regular_s"] = step_s / math.ceil(step_s / LONGEST_S)
     _modes_and_forces(p, config, stiff)
     _sense_chain(p, config, device, period_us, sense_f_per_count, sense_zero_f)
     build_flexible_modes(p, config.flexible_modes, stiff)

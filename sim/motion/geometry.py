@@ -15,7 +15,7 @@ import math
 
 import numpy as np
 
-from sim.motion.kernel import kernel
+from sim.motion.kernel import inlined, kernel
 
 HALF_ROOT3 = math.sqrt(3.0) / 2.0
 E_X = (0.0, -HALF_ROOT3, HALF_ROOT3)
@@ -27,7 +27,7 @@ STRAIGHT = 0.01
 """A link or crank is never taken shorter than this share of itself across its line: keeps numbers finite in a wreck."""
 
 
-@kernel
+@inlined
 def leg(length_m: float, across_m: float) -> float:
     """Length of the other leg of a right triangle with hypotenuse ``length_m``."""
     return math.sqrt(max(length_m * length_m - across_m * across_m, (STRAIGHT * length_m) ** 2))
@@ -39,6 +39,15 @@ def lift(p: np.void, z_m: float) -> tuple[float, float, float]:
     height_m = p["height_rest_m"] + z_m
     projection_m = leg(p["link_m"], height_m)
     return height_m, projection_m, p["projection_rest_m"] - projection_m
+
+
+@inlined
+def chain(i: int, crank_m: float, x_m: float, y_m: float, drawn_m: float) -> tuple[float, float, float]:
+    """Chain i for a table at (x, y) whose links have drawn the pins outward by ``drawn_m``: its stroke q, m, how far
+    across its line the pin is, w, m, and 1 / c, 1/m."""
+    w = N_X[i] * x_m + N_Y[i] * y_m
+    c = leg(crank_m, w)
+    return E_X[i] * x_m + E_Y[i] * y_m + drawn_m + (crank_m - c), w, 1.0 / c
 
 
 @kernel

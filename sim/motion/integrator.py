@@ -79,7 +79,7 @@ def times(m: np.ndarray, x: float, y: float, z: float) -> tuple[float, float, fl
 
 
 @kernel
-def _transient(p: np.void, s: np.void) -> None:
+def transient(p: np.void, s: np.void) -> None:
     """Amplitudes (3,) of a transient at the pose where the step starts: of xi, s["fast_1_m"] and s["fast_2_m"], and of
     -(xi'' + D xi'), s["fast_1_m_per_s2"] and s["fast_2_m_per_s2"]. Zero if no channel is in one."""
     one, two = s["fast_1_m"], s["fast_2_m"]
@@ -117,7 +117,7 @@ def _weighted(slopes: np.ndarray, weights: np.ndarray, n: int) -> tuple[float, f
 def _step(p: np.void, s: np.void, h: float) -> None:
     """Integrate motion and voltages over h s, without a look at stops."""
     tabulate(p, s, h)
-    _transient(p, s)
+    transient(p, s)
     motion, slopes, volt2, decay = s["motion"], s["slopes"], s["volt2"], s["decay"]
     k, h2 = 1.0 / p["amplifier_s"] if p["amplifier_s"] > 0.0 else 0.0, h * h
     x1, y1, z1 = s["fast_1_m"][0], s["fast_1_m"][1], s["fast_1_m"][2]

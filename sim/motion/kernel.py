@@ -6,3 +6,6 @@ Without numba's runtime nothing counts references to arrays; and a kernel that t
 from numba import njit
 
 kernel = njit(cache=True, error_model="numpy", _nrt=False)
+
+inlined = njit(cache=True, error_model="numpy", _nrt=False, forceinline=True)
+"""Of what is called in a loop over instants: LLVM makes vectors of one only if no call is in it."""

@@ -18,6 +18,8 @@ TONES = 72
 """Lines of floor and mains at most."""
 FLICKERS = 8
 """Relaxations that make up 1/f noise."""
+INSTANTS = 4
+"""Of a step of the usual length, at which forces are looked at: as many as a processor's vectors hold."""
 CUBIC = 4
 """Coefficients over a call of ``advance``, of t^0 to t^3."""
 EVENTS = 64
@@ -57,6 +59,8 @@ PARAMS = np.dtype(
         ("response_1_s2", "f8", (3, 3)), ("response_2_s2", "f8", (3, 3)),  # of the table to a transient
         ("response_1", "f8", (3, 3)), ("response_2", "f8", (3, 3)),  # ... what of its acceleration that answers
         ("volt_per_count", "f8", 3), ("amplifier_offset_v", "f8", 3), ("dac_step", "i8"),
+        # a step of the usual length: sim.motion.collocation
+        ("regular_s", "f8"), ("stiff_per_s2", "f8", (3, 3)),  # K / m at rest
         # parasitic mode
         ("parasitic_on", "i8"), ("parasitic_rad_per_s", "f8"), ("parasitic_damping_per_s", "f8"), ("parasitic_per_kg",
         "f8"), ("parasitic_comb", "f8", 3), ("parasitic_table", "f8", 3),
@@ -122,6 +126,13 @@ STATE = np.dtype(
         ("base_v", "f8", 3), ("slope_v_per_s", "f8", 3), ("error_v", "f8", 3), ("volt2", "f8", 3),
         ("error_volt2", "f8", 3), ("fast_1_m", "f8", 3), ("fast_2_m", "f8", 3), ("fast_1_m_per_s2", "f8", 3),
         ("fast_2_m_per_s2", "f8", 3), ("slopes", "f8", (STAGES, 3)), ("start", "f8", 6),
+        # ... of the usual length; instants stand last, in the record that is written: of these LLVM makes vectors
+        ("flow_h_s", "f8"), ("instant_decay", "f8", INSTANTS), ("flow", "f8", (6, 6, INSTANTS)), ("steady", "f8", (3, 6,
+        INSTANTS)), ("answer", "f8", (INSTANTS, 3, 6, INSTANTS)), ("smooth", "f8", 6), ("free_m", "f8", (3, INSTANTS)),
+        ("instant_volt2", "f8", (3, INSTANTS)), ("fast_m", "f8", (3, INSTANTS)), ("fast_m_per_s2", "f8", (3, INSTANTS)),
+        ("left_m_per_s2", "f8", (3, INSTANTS)), ("near", "f8", INSTANTS),
+        ("ended_m", "f8", 3), ("ended_m_per_s2", "f8", 3),  # pose and acceleration where the last one ended
+        # ... of any other
         ("tabulated_h_s", "f8"), ("decay", "f8", STAGES), ("shrink", "f8", (STAGES, 3, 3)), ("swell", "f8", (STAGES, 3,
         3)), ("contact", "i8"), ("touched", "i8", 3),
         ("z", "f8", SIZE), ("rate", "f8", SIZE), ("z_at", "f8", SIZE), ("rate_at", "f8", SIZE),

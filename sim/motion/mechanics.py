@@ -9,18 +9,26 @@ The record keeps leaf = 4 K1, crank_hinge = 4 K2 and link_hinge = 4 c K3, so eac
 energy is half of that times the square."""
 
 import math
+from typing import NamedTuple
 
 import numpy as np
 
-from sim.motion.geometry import E_X, E_Y, N_X, N_Y, leg, lift
-from sim.motion.kernel import kernel
+from sim.motion.geometry import E_X, E_Y, N_X, N_Y, chain, leg, lift
+from sim.motion.kernel import inlined, kernel
+
+NEAR = 0.1
+"""The sine of an angle up to which its series is exact to rounding."""
 
 
 @kernel
 def arcsine(y: float) -> float:
-    """asin(y); near zero by its series, which is exact to rounding below 0.1 and cheaper than the library."""
-    if abs(y) > 0.1:
-        return math.asin(max(-1.0, min(1.0, y)))
+    """asin(y); near zero by its series, which is cheaper than the library."""
+    return near_arcsine(y) if abs(y) <= NEAR else math.asin(max(-1.0, min(1.0, y)))
+
+
+@inlined
+def near_arcsine(y: float) -> float:
+    """asin(y) of at most ``NEAR``, by its series."""
     s = y * y
     tail = 105.0 / 3456.0 + s * (945.0 / 42240.0 + s * (10395.0 / 599040.0))
     return y * (1.0 + s * (1.0 / 6.0 + s * (3.0 / 40.0 + s * (15.0 / 336.0 + s * tail))))
@@ -74,10 +82,7 @@ def undamped_acceleration(
     per_crank = p["per_crank"]
     fx, fy, pulls, combs = s["force_n"][0], s["force_n"][1], 0.0, 0.0
     for i in range(3):
-        w = N_X[i] * x + N_Y[i] * y
-        c = leg(crank_m, w)
-        inverse_c = 1.0 / c
-        q = E_X[i] * x + E_Y[i] * y + drawn_m + (crank_m - c)
+        q, w, inverse_c = chain(i, crank_m, x, y, drawn_m)
         tangent = w * inverse_c
         comb = p["force_gain_n_per_v2"][i] * (1.0 + fringe * q) * volt2[i]
         pull = comb - p["leaf_n_per_m"][i] * q
@@ -97,6 +102,74 @@ def undamped_acceleration(
     fz = s["force_n"][2] + pulls * steep - hinge + p["levitation"] * combs
     per_kg = p["per_kg"]
     return fx * per_kg, fy * per_kg, fz * per_kg
+
+
+class Constants(NamedTuple):
+    """What ``near_acceleration`` takes of the parameters, as values: what a loop writes can't change them. Names and
+    units as there; (3,) by chain or axis."""
+
+    crank_m: float
+    per_crank: float
+    link_m: float
+    per_link2: float
+    height_rest_m: float
+    projection_rest_m: float
+    leaf: tuple[float, float, float]
+    crank_hinge: tuple[float, float, float]
+    link_hinge: float
+    comb: tuple[float, float, float]
+    fringe_per_m: float
+    levitation: float
+    stop_low_m: float
+    stop_high_m: float
+    force_n: tuple[float, float, float]
+    per_kg: float
+
+
+@inlined
+def constants(p: np.void, s: np.void) -> Constants:
+    """With the constant force s["force_n"]."""
+    leaf, hinge, comb, force = p["leaf_n_per_m"], p["crank_hinge_nm"], p["force_gain_n_per_v2"], s["force_n"]
+    return Constants(
+        p["crank_m"], p["per_crank"], p["link_m"], p["per_link2"], p["height_rest_m"], p["projection_rest_m"],
+        (leaf[0], leaf[1], leaf[2]), (hinge[0], hinge[1], hinge[2]), p["link_hinge_nm"], (comb[0], comb[1], comb[2]),
+        p["fringe_per_m"], p["levitation"], p["stop_low_m"], p["stop_high_m"], (force[0], force[1], force[2]),
+        p["per_kg"],
+    )  # fmt: skip
+
+
+@inlined
+def near_acceleration(
+    m: Constants, volt2: tuple[float, float, float], x: float, y: float, z: float
+) -> tuple[float, float, float, float]:
+    """``undamped_acceleration`` without a branch, and 1.0; or anything, and 0.0, where a slider meets a stop or an
+    angle is beyond ``NEAR``. Held sliders are not looked for."""
+    height_m = m.height_rest_m + z
+    projection_m = leg(m.link_m, height_m)
+    drawn_m, per_projection = m.projection_rest_m - projection_m, 1.0 / projection_m
+    steep = height_m * per_projection
+    x1, y1, pull1, comb1, near1 = _near_pull(m, 0, volt2[0], x, y, drawn_m)
+    x2, y2, pull2, comb2, near2 = _near_pull(m, 1, volt2[1], x, y, drawn_m)
+    x3, y3, pull3, comb3, near3 = _near_pull(m, 2, volt2[2], x, y, drawn_m)
+    change = (height_m * m.projection_rest_m - projection_m * m.height_rest_m) * m.per_link2
+    hinge = m.link_hinge * near_arcsine(change) * per_projection
+    fx, fy = m.force_n[0] + (x1 + x2 + x3), m.force_n[1] + (y1 + y2 + y3)
+    fz = m.force_n[2] + (pull1 + pull2 + pull3) * steep - hinge + m.levitation * (comb1 + comb2 + comb3)
+    near = near1 * near2 * near3 if abs(change) <= NEAR else 0.0
+    return fx * m.per_kg, fy * m.per_kg, fz * m.per_kg, near
+
+
+@inlined
+def _near_pull(
+    m: Constants, i: int, volt2: float, x: float, y: float, drawn_m: float
+) -> tuple[float, float, float, float, float]:
+    """Chain i's part: its force in the plane, N, its pull, N, the comb's in that, and whether it is near."""
+    q, w, inverse_c = chain(i, m.crank_m, x, y, drawn_m)
+    comb = m.comb[i] * (1.0 + m.fringe_per_m * q) * volt2
+    pull, lean = comb - m.leaf[i] * q, w * m.per_crank
+    turn = pull * (w * inverse_c) - m.crank_hinge[i] * near_arcsine(lean) * inverse_c
+    near = 1.0 if (q >= m.stop_low_m) & (q <= m.stop_high_m) & (abs(lean) <= NEAR) else 0.0
+    return pull * E_X[i] + turn * N_X[i], pull * E_Y[i] + turn * N_Y[i], pull, comb, near
 
 
 @kernel

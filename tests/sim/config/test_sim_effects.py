@@ -73,6 +73,7 @@ MOVES_NOTHING = {
     "crosstalk",
     "sense_flicker",
 }
+TAKES_THE_GENERAL_STEP = {"sense_flicker"}  # ... of what moves nothing
 
 
 def run(cfg: PlantConfig) -> tuple[np.ndarray, np.ndarray]:
@@ -103,7 +104,10 @@ def test_a_switch_acts_where_it_should_and_nowhere_else(name):
     x0, c0 = run(config())
     x, c = run(with_effect(name, True))
     assert (c != c0).any() == (name not in SEEN_BY_NO_COMB)
-    assert (x == x0).all() == (name in MOVES_NOTHING)
+    if name in TAKES_THE_GENERAL_STEP:
+        np.testing.assert_allclose(x, x0, rtol=0, atol=50e-12)  # jumps of 100 V, which either step errs in
+    else:
+        assert (x == x0).all() == (name in MOVES_NOTHING)
     if name == "damping":
         return  # off means none, not the stage file's
     x, c = run(with_effect(name, False))

@@ -1,0 +1,71 @@
+"""Where the stage as a linear one is led within a step of the usual length: tables of its exact motion.
+
+    x'' + D x' + K x / m = n
+
+with the stiffness K of the rest pose, the mass m and the damping D. Position and velocity at four instants are linear
+in those at the start, in a steady n, and in the values at the instants of an n that is a cubic; each by its Taylor
+series in time."""
+
+import math
+
+import numpy as np
+from numpy.polynomial.polynomial import polyfromroots
+
+from sim.motion.integrator import times
+from sim.motion.kernel import kernel
+from sim.motion.layout import INSTANTS
+
+AT = np.array([0.08858795951270395, 0.4094668644407347, 0.7876594617608471, 1.0])
+"""The instants, shares of a step: Radau's nodes, roots of P_3 - P_4 (Legendre's on 0..1)."""
+_OTHERS = [np.delete(AT, k) for k in range(INSTANTS)]
+CUBIC = np.array([polyfromroots(others) / np.prod(t - others) for t, others in zip(AT, _OTHERS, strict=True)]).T.copy()
+"""[power, k]: coefficients of the polynomial that is 1 at instant k and 0 at the others."""
+_TERMS = 30
+"""Of a series in omega h, which is about 1: the last is below rounding by ten orders."""
+
+
+@kernel
+def tabulate_flow(p: np.void, s: np.void) -> None:
+    """Fill in the tables of a step of p["regular_s"]."""
+    s["flow_h_s"], tau = p["regular_s"], p["amplifier_s"]
+    for j in range(INSTANTS):
+        s["instant_decay"][j] = math.exp(-AT[j] * p["regular_s"] / tau) if tau > 0.0 else 0.0
+    s["answer"][:] = 0.0
+    for c in range(6):
+        _solve(p, c, -1, s["flow"][c])
+    for axis in range(3):
+        steady = s["steady"][axis]
+        for power in range(INSTANTS - 1, -1, -1):
+            _solve(p, axis, power, steady)
+            for k in range(INSTANTS):
+                for i in range(6):
+                    for j in range(INSTANTS):
+                        s["answer"][k, axis, i, j] += CUBIC[power, k] * steady[i, j]
+
+
+@kernel
+def _solve(p: np.void, c: int, power: int, out: np.ndarray) -> None:
+    """Position and velocity (6, 4) at the instants: from a start that is 1 in entry ``c`` of those; or from 0, if
+    ``power`` >= 0, with an n of (t / h)^power along axis ``c``."""
+    h, stiff, damping = p["regular_s"], p["stiff_per_s2"], p["damping_per_s"]
+    pushed = 1.0 if power >= 0 else 0.0
+    x, y, z = _unit(c, 1.0 - pushed)  # coefficients of (t / h)^n in the position, and ...
+    dx, dy, dz = _unit(c - 3, h * (1.0 - pushed))  # ... of (t / h)^(n + 1)
+    out[:] = 0.0
+    for n in range(_TERMS):
+        for j in range(INSTANTS):
+            share, rate = AT[j] ** n, (n + 1) * AT[j] ** n / h
+            out[0, j], out[3, j] = out[0, j] + share * x, out[3, j] + rate * dx
+            out[1, j], out[4, j] = out[1, j] + share * y, out[4, j] + rate * dy
+            out[2, j], out[5, j] = out[2, j] + share * z, out[5, j] + rate * dz
+        kx, ky, kz = times(stiff, x, y, z)
+        ex, ey, ez = times(damping, dx, dy, dz)
+        nx, ny, nz = _unit(c, pushed if n == power else 0.0)
+        f, g = h * h / ((n + 1) * (n + 2)), h / (n + 2)
+        x, y, z, dx, dy, dz = dx, dy, dz, f * (nx - kx) - g * ex, f * (ny - ky) - g * ey, f * (nz - kz) - g * ez
+
+
+@kernel
+def _unit(axis: int, size: float) -> tuple[float, float, float]:
+    """A vector of ``size`` along an axis, if there is such an axis."""
+    return size if axis == 0 else 0.0, size if axis == 1 else 0.0, size if axis == 2 else 0.0
