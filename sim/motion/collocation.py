@@ -23,7 +23,6 @@ import numpy as np
 
 from sim.motion.amplifier import pass_time
 from sim.motion.flow import tabulate_flow
-from sim.motion.geometry import strokes
 from sim.motion.integrator import transient
 from sim.motion.kernel import inlined, kernel
 from sim.motion.layout import INSTANTS
@@ -49,8 +48,10 @@ def regular_step(p: np.void, s: np.void) -> bool:
         return False
     first_round(p, s, (nx, ny, nz))
     second_round(p, s)
-    near = s["near"][0] * s["near"][1] * s["near"][2] * s["near"][3]
-    return near != 0.0 and _end(p, s)
+    if s["near"][0] * s["near"][1] * s["near"][2] * s["near"][3] == 0.0:
+        return False
+    _end(p, s)
+    return True
 
 
 @kernel
@@ -183,9 +184,9 @@ def second_round(p: np.void, s: np.void) -> None:
 
 
 @kernel
-def _end(p: np.void, s: np.void) -> bool:
-    """Take over where the step leads, or return False if a slider has come to a stop there."""
-    flow, answer, smooth, left, end = s["flow"], s["answer"], s["smooth"], s["left_m_per_s2"], s["pose"]
+def _end(p: np.void, s: np.void) -> None:
+    """Take over where the step leads."""
+    flow, answer, smooth, left, end = s["flow"], s["answer"], s["smooth"], s["left_m_per_s2"], s["motion"]
     one, two, e1 = s["fast_1_m"], s["fast_2_m"], s["instant_decay"][_END]
     e2, k = e1 * e1, 1.0 / p["amplifier_s"] if p["amplifier_s"] > 0.0 else 0.0
     for i in range(6):
@@ -195,19 +196,11 @@ def _end(p: np.void, s: np.void) -> bool:
             a, n = answer[node], left[:, node]
             end[i] += a[0, i, _END] * n[0] + a[1, i, _END] * n[1] + a[2, i, _END] * n[2]
     kx, ky, kz = _stretched(_stiff(p), _three(end))
-    for i in range(3):
-        end[i] += one[i] * e1 + two[i] * e2
-        end[3 + i] -= k * (one[i] * e1 + 2.0 * (two[i] * e2))
-    strokes(p, end, s["strokes_m"])
-    for i in range(3):
-        if not p["stop_low_m"] <= s["strokes_m"][i] <= p["stop_high_m"]:
-            return False
-    for i in range(6):
-        s["motion"][i] = end[i]
     known, push = s["ended_m_per_s2"], _three_at(s["fast_m_per_s2"], _END)
     known[0], known[1] = left[0, _END] - (push[0] + kx), left[1, _END] - (push[1] + ky)
     known[2] = left[2, _END] - (push[2] + kz)
     for i in range(3):
+        end[i] += one[i] * e1 + two[i] * e2
+        end[3 + i] -= k * (one[i] * e1 + 2.0 * (two[i] * e2))
         s["ended_m"][i] = end[i]
     pass_time(s, p["regular_s"], e1)
-    return True

@@ -22,6 +22,7 @@ CUBIC = np.array([polyfromroots(others) / np.prod(t - others) for t, others in z
 """[power, k]: coefficients of the polynomial that is 1 at instant k and 0 at the others."""
 _TERMS = 30
 """Of a series in omega h, which is about 1: the last is below rounding by ten orders."""
+_POWERS = AT ** np.arange(_TERMS)[:, None]
 
 
 @kernel
@@ -54,7 +55,7 @@ def _solve(p: np.void, c: int, power: int, out: np.ndarray) -> None:
     out[:] = 0.0
     for n in range(_TERMS):
         for j in range(INSTANTS):
-            share, rate = AT[j] ** n, (n + 1) * AT[j] ** n / h
+            share, rate = _POWERS[n, j], (n + 1) * _POWERS[n, j] / h
             out[0, j], out[3, j] = out[0, j] + share * x, out[3, j] + rate * dx
             out[1, j], out[4, j] = out[1, j] + share * y, out[4, j] + rate * dy
             out[2, j], out[5, j] = out[2, j] + share * z, out[5, j] + rate * dz

@@ -94,11 +94,11 @@ def transient(p: np.void, s: np.void) -> None:
         s["error_volt2"][i] = error[i] * error[i]
     x, y, z = s["motion"][0], s["motion"][1], s["motion"][2]
     ax, ay, az = comb_acceleration(p, s["volt2"], x, y, z)
+    bx, by, bz = comb_acceleration(p, s["error_volt2"], x, y, z)  # side by side: the pose is worked out once
     one[0], one[1], one[2] = times(p["response_1_s2"], ax, ay, az)
     one_push[0], one_push[1], one_push[2] = times(p["response_1"], ax, ay, az)
-    ax, ay, az = comb_acceleration(p, s["error_volt2"], x, y, z)
-    two[0], two[1], two[2] = times(p["response_2_s2"], ax, ay, az)
-    two_push[0], two_push[1], two_push[2] = times(p["response_2"], ax, ay, az)
+    two[0], two[1], two[2] = times(p["response_2_s2"], bx, by, bz)
+    two_push[0], two_push[1], two_push[2] = times(p["response_2"], bx, by, bz)
 
 
 @kernel

@@ -172,7 +172,7 @@ def _near_pull(
     return pull * E_X[i] + turn * N_X[i], pull * E_Y[i] + turn * N_Y[i], pull, comb, near
 
 
-@kernel
+@inlined
 def comb_acceleration(p: np.void, volt2: np.ndarray, x: float, y: float, z: float) -> tuple[float, float, float]:
     """The combs' own part of ``undamped_acceleration``, which is linear in ``volt2``."""
     height_m, projection_m, drawn_m = lift(p, z)
