@@ -18,6 +18,9 @@ covariance never exceeds what was known beforehand. It stands still where the re
 psi describes, where the stage is not where it should be, and after a comb was at a limit. What acts follows within some
 milliseconds, and the filter's prediction moves along by U, as if it had always known: nothing kicks, no voltage waits.
 
+Where a loop over the parameters shall become vectors, what it needs of another record, or of another row of its own, is
+read before it: a compiler can't know that what it writes does not change that.
+
 Beside it stands what was known once, the base. If one cause alone has changed since (a comb, a chain's springs, the
 hinges), one number makes the innovations that the base would leave as small as those that are left: it is a warning.
 """
@@ -45,6 +48,7 @@ LEAST_LOSS = 0.1
 """By how much, in variances of the noise, innovations have to be worse with the base before something has changed."""
 _MOST_SPARED = 0.5  # of a comb's pull: one that has become stronger is told as at most twice as strong
 _PARAMETERS, _CAUSES = np.int32(PARAMETERS), np.int32(CAUSES)  # a processor of 32 bits counts these for less
+_ROWS = np.int32(5)  # of the covariance at a time: few enough for registers
 _FLOOR_N = 1e-100  # in each force: else what is at rest falls below the normal numbers, and a PC slows down fivefold
 AGES = 3  # intervals that are remembered: two periods of delay, and the one that is decided
 
@@ -81,7 +85,7 @@ ADAPTATION_STATE = np.dtype(
     [
         ("learnt", "f8", (PARAMETERS,)),  # theta in spreads
         ("acting", "f8", (PARAMETERS,)),  # what feed-forward and filter reckon with
-        ("covariance", "f8", (PARAMETERS, PARAMETERS)),
+        ("covariance", "f8", (PARAMETERS, PARAMETERS)),  # transposed: symmetric but for rounding
         ("sensitivity", "f8", (3, 3, PARAMETERS)),  # U: axis, then x, v, d of the prediction
         ("shown", "f8", (3, PARAMETERS)),  # d nu
         ("force_n", "f8", (AGES, 3, PARAMETERS)),  # phi of the last intervals, newest first
@@ -136,17 +140,13 @@ def learn(
     state["axis"] = axis + 1 if axis < 2 else 0
     if near and state["calm"] >= adaptation["calm_ticks"]:
         _update(adaptation, state, axis, innovation_m[axis])
-    change = state["work"]
+    change, follow = state["work"], adaptation["follow"]
     for p in range(_PARAMETERS):
-        change[p] = adaptation["follow"] * (state["learnt"][p] - state["acting"][p])
+        change[p] = follow * (state["learnt"][p] - state["acting"][p])
         state["acting"][p] += change[p]
     for i in range(3):
-        u, phi, gamma = state["sensitivity"][i], adaptation["transition"][i], adaptation["input"][i]
-        force = state["force_n"][delay, i]
-        for p in range(_PARAMETERS):
-            x, v, d, f = u[0, p], u[1, p], u[2, p], force[p] + _FLOOR_N
-            u[0, p] = phi[0, 0] * x + phi[0, 1] * v + phi[0, 2] * d - gamma[0] * f
-            u[1, p] = phi[1, 0] * x + phi[1, 1] * v + phi[1, 2] * d - gamma[1] * f
+        _carry(adaptation, state, i, delay, has_measurement)
+        u = state["sensitivity"][i]
         for s in range(3):
             moved = 0.0
             for p in range(_PARAMETERS):
@@ -155,18 +155,32 @@ def learn(
 
 
 @kernel
+def _carry(adaptation: np.void, state: np.void, i: int, delay: int, has_measurement: bool) -> None:
+    """U of axis i: what the filter's gain makes of d nu, if there was a measurement, then on to the next sample."""
+    u, shown, k = state["sensitivity"][i], state["shown"][i], adaptation["gain"][i]
+    phi, gamma = adaptation["transition"][i], adaptation["input"][i]
+    force = state["force_n"][1 if delay == 1 else 2, i]  # so it is known to lie within the array
+    kx, kv, kd = k[0], k[1], k[2]
+    xx, xv, xd, xf = phi[0, 0], phi[0, 1], phi[0, 2], gamma[0]
+    vx, vv, vd, vf = phi[1, 0], phi[1, 1], phi[1, 2], gamma[1]
+    for p in range(_PARAMETERS):
+        x, v, d, f = u[0, p], u[1, p], u[2, p], force[p] + _FLOOR_N
+        if has_measurement:
+            x, v, d = x + kx * shown[p], v + kv * shown[p], d + kd * shown[p]
+        u[0, p] = xx * x + xv * v + xd * d - xf * f
+        u[1, p] = vx * x + vv * v + vd * d - vf * f
+        u[2, p] = d
+
+
+@kernel
 def _show(adaptation: np.void, state: np.void, row: Array) -> None:
-    """d nu at this sample, where the reference is at ``row`` (9,), and what the filter's gain makes of it."""
-    tau, spread, shown = adaptation["sense_delay_s"], adaptation["spread"], state["shown"]
+    """d nu at this sample, where the reference is at ``row`` (9,)."""
+    tau, spread, shown, u = adaptation["sense_delay_s"], adaptation["spread"], state["shown"], state["sensitivity"]
     for i in range(3):
-        u, k = state["sensitivity"][i], adaptation["gain"][i]
         for p in range(_PARAMETERS):
-            shown[i, p] = tau * u[1, p] - u[0, p]
+            shown[i, p] = tau * u[i, 1, p] - u[i, 0, p]
         shown[i, DELAY] += spread[DELAY] * row[3 + i]
         shown[i, BEND] -= spread[BEND] * row[6 + i]
-        for s in range(3):
-            for p in range(_PARAMETERS):
-                u[s, p] += k[s] * shown[i, p]
 
 
 @kernel
@@ -174,13 +188,16 @@ def _update(adaptation: np.void, state: np.void, axis: int, innovation_m: float)
     """One step of recursive least squares with the innovation of an axis: nu is -d nu times what theta still lacks."""
     p, learnt, acting = state["covariance"], state["learnt"], state["acting"]
     by, gain, base = state["shown"][axis], state["work"], state["base"]
+    b0, b1, b2, b3, b4 = by[0], by[1], by[2], by[3], by[4]
+    b5, b6, b7, b8, b9 = by[5], by[6], by[7], by[8], by[9]
+    b10, b11, b12, b13, b14 = by[10], by[11], by[12], by[13], by[14]
     told, missing, since = 0.0, innovation_m, innovation_m
     for i in range(_PARAMETERS):
-        total = 0.0
-        for k in range(_PARAMETERS):
-            total += p[i, k] * by[k]
-        gain[i] = total
-        told += total * by[i]
+        total = 0.0 + p[0, i] * b0 + p[1, i] * b1 + p[2, i] * b2 + p[3, i] * b3 + p[4, i] * b4
+        total = total + p[5, i] * b5 + p[6, i] * b6 + p[7, i] * b7 + p[8, i] * b8 + p[9, i] * b9
+        gain[i] = total + p[10, i] * b10 + p[11, i] * b11 + p[12, i] * b12 + p[13, i] * b13 + p[14, i] * b14
+    for i in range(_PARAMETERS):
+        told += gain[i] * by[i]
         missing += by[i] * (learnt[i] - acting[i])
         since += by[i] * (base[i] - acting[i])
     # Not whether the innovation is large: of a device that changes fast only the small ones would be left.
@@ -190,12 +207,17 @@ def _update(adaptation: np.void, state: np.void, axis: int, innovation_m: float)
     if state["cause"] == 0:  # what a change explains that has been named is no noise
         noise_m2 += adaptation["doubt"] * missing * missing
     scale = 1.0 / (told + noise_m2)
+    for k in range(0, _PARAMETERS, _ROWS):
+        g0, g1, g2, g3, g4 = gain[k], gain[k + 1], gain[k + 2], gain[k + 3], gain[k + 4]
+        for i in range(_PARAMETERS):
+            weight = gain[i] * scale
+            p[k, i] -= weight * g0
+            p[k + 1, i] -= weight * g1
+            p[k + 2, i] -= weight * g2
+            p[k + 3, i] -= weight * g3
+            p[k + 4, i] -= weight * g4
     for i in range(_PARAMETERS):
-        weight = gain[i] * scale
-        learnt[i] -= weight * missing
-        for k in range(_PARAMETERS):
-            p[i, k] -= weight * gain[k]
-    for i in range(_PARAMETERS):
+        learnt[i] -= gain[i] * scale * missing
         p[i, i] = min(p[i, i] + adaptation["drift"], 1.0)
     _keep_within(adaptation["bound"], p, learnt)
     state["updates"] += 1
@@ -213,7 +235,7 @@ def begin(adaptation: np.void, state: np.void) -> None:
     for i in range(_PARAMETERS):
         state["learnt"][i] = state["acting"][i] = adaptation["start"][i]
         for k in range(_PARAMETERS):
-            state["covariance"][i, k] = adaptation["start_covariance"][i, k]
+            state["covariance"][k, i] = adaptation["start_covariance"][i, k]
     if adaptation["known"] != 0:
         set_base(state)
 
@@ -266,7 +288,7 @@ def _keep_within(bound: Array, p: Array, learnt: Array) -> None:
         if beyond != 0.0:
             share = beyond / p[i, i]
             for k in range(_PARAMETERS):
-                learnt[k] -= share * p[k, i]
+                learnt[k] -= share * p[i, k]
     for i in range(_PARAMETERS):
         learnt[i] = min(max(learnt[i], -bound[i]), bound[i])
 
@@ -353,23 +375,6 @@ def _note_chain(
         out[k, CRANK + i] = across * n[i, k] if k < 2 else 0.0
         out[k, FRINGE] -= grown * along[k]
     out[2, LIFT] -= pull_n
-
-
-@kernel
-def discount(state: np.void, inverse: Array, lack_n: Array) -> None:
-    """Of what each comb (3,) lacks beyond what was learnt, leave what it would lack without that, too.
-
-    So nothing that was learnt can look like a fault by itself. What breaks suddenly shows in both.
-    """
-    for i in range(3):
-        known = 0.0
-        for k in range(3):
-            known += inverse[k, i] * state["told_n"][k]
-        whole = lack_n[i] + known
-        if lack_n[i] > 0.0:
-            lack_n[i] = min(lack_n[i], max(whole, 0.0))
-        else:
-            lack_n[i] = max(lack_n[i], min(whole, 0.0))
 
 
 @kernel

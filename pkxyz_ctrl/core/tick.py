@@ -342,7 +342,24 @@ def unexplained_force(law: np.void, memory: np.void, out_n: Array) -> None:
     for i in range(3):
         out_n[i] = inverse[0, i] * wx + inverse[1, i] * wy + inverse[2, i] * wz
     if law["adaptation"]["on"] != 0:
-        adaptation.discount(memory["adaptation"], inverse, out_n)
+        _discount(memory["adaptation"]["told_n"], inverse, out_n)
+
+
+@kernel
+def _discount(told_n: Array, inverse: Array, lack_n: Array) -> None:
+    """Of what each comb (3,) lacks beyond what was learnt, leave what it would lack without that, too.
+
+    So nothing that was learnt can look like a fault by itself. What breaks suddenly shows in both.
+    """
+    for i in range(3):
+        known = 0.0
+        for k in range(3):
+            known += inverse[k, i] * told_n[k]
+        whole = lack_n[i] + known
+        if lack_n[i] > 0.0:
+            lack_n[i] = min(lack_n[i], max(whole, 0.0))
+        else:
+            lack_n[i] = max(lack_n[i], min(whole, 0.0))
 
 
 @kernel
