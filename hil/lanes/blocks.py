@@ -15,15 +15,15 @@ from pkxyz_ctrl.loop.reference import reference_rows
 from pkxyz_ctrl.loop.row import ROW
 from pkxyz_ctrl.trajectory import Trajectory
 
-BLOCK_TICKS = 4096
-"""0.8 s at 5 kHz; bounds the memory of a run and what a killed one loses."""
+BLOCK_TICKS = 2048
+"""0.4 s at 5 kHz; bounds the memory of a run and what a killed one loses."""
 
 PREVIEW_ROWS = 25
 """Rows of the reference that the law may look at past its own: two periods of delay, the longest horizon of a plan, and
 the intervals after them."""
 
 
-@lru_cache(maxsize=4)
+@lru_cache(maxsize=16)
 def _sampled(trajectory: Trajectory, first: int, count: int, period_us: int) -> NDArray[np.void]:
     """Rows that nobody writes to: a study runs one scan again and again."""
     rows = reference_rows(trajectory.sample(first, count, period_us), first)

@@ -3,7 +3,7 @@
 import time
 from collections.abc import Callable
 from dataclasses import dataclass
-from functools import cache
+from functools import cache, lru_cache
 from pathlib import Path
 
 import numpy as np
@@ -22,6 +22,8 @@ from pkxyz_ctrl.loop.reference import standing_still
 from pkxyz_ctrl.safety.modes import Mode
 from pkxyz_ctrl.safety.trips import explain
 from sim.plant import Plant
+
+Instants = NDArray[np.int64]
 
 
 @dataclass(frozen=True)
@@ -90,24 +92,30 @@ def _run_fast(setup: Setup, run_block: RunBlock, memory: NDArray[np.void], plant
         reference = blocks.reference(memory)
         at_us = instants_us(setup, blocks.done, count)
         run_block(law, memory, reference, plant.params, plant.state, at_us, blocks.rows, count)
-        entered = np.flatnonzero(
-            (blocks.rows["mode"][:count] == Mode.FAULT) & (np.r_[mode, blocks.rows["mode"][: count - 1]] != Mode.FAULT)
-        )
-        faults += [f"at {row['t_us'] * 1e-6:.4f} s: {explain(int(row['trips']))}" for row in blocks.rows[entered]]
+        if (blocks.rows["mode"][:count] == Mode.FAULT).any():
+            modes = np.r_[mode, blocks.rows["mode"][:count]]
+            entered = np.flatnonzero((modes[1:] == Mode.FAULT) & (modes[:-1] != Mode.FAULT))
+            faults += [f"at {row['t_us'] * 1e-6:.4f} s: {explain(int(row['trips']))}" for row in blocks.rows[entered]]
         mode = int(blocks.rows["mode"][count - 1])
         blocks.hand_on(count)
     return faults
 
 
-def instants_us(setup: Setup, first: int, count: int) -> NDArray[np.int64]:
+def instants_us(setup: Setup, first: int, count: int) -> Instants:
     """Plant time of the samples: end of each tick's SYNC (its length depends on its counter), since the first one."""
-    tick = np.arange(first, first + count, dtype=np.int64)
     can = setup.bus.can
     if can is None:
-        return tick * setup.bus.period_us
+        return np.arange(first, first + count, dtype=np.int64) * setup.bus.period_us
     nominal = can.nominal_bitrate_bit_per_s
-    end_us = _sync_end_us(nominal, can.data_bitrate_bit_per_s or nominal, can.driver.fd)
-    return tick * setup.bus.period_us + end_us[tick % len(end_us)] - end_us[0]
+    data = can.data_bitrate_bit_per_s or nominal
+    return _sync_us(nominal, data, can.driver.fd, setup.bus.period_us, first, count)
+
+
+@lru_cache(maxsize=16)
+def _sync_us(nominal_bit_per_s: int, data_bit_per_s: int, fd: bool, period_us: int, first: int, count: int) -> Instants:
+    """Nobody writes to them: a study runs on one bus again and again."""
+    tick, end_us = np.arange(first, first + count, dtype=np.int64), _sync_end_us(nominal_bit_per_s, data_bit_per_s, fd)
+    return tick * period_us + end_us[tick % len(end_us)] - end_us[0]
 
 
 @cache

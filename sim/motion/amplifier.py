@@ -30,7 +30,8 @@ def plan(p: np.void, s: np.void, remaining_s: float) -> float:
     """Set base, slope and error of all channels from now on; returns how long they hold, s, at most ``remaining_s``."""
     tau = p["amplifier_s"]
     duration = remaining_s
-    strokes(p, s["motion"], s["strokes_m"])
+    if p["current_a"] > 0.0:
+        strokes(p, s["motion"], s["strokes_m"])
     for i in range(3):
         gap = s["target_v"][i] - s["voltage_v"][i]
         limit = p["slew_v_per_s"]
