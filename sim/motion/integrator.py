@@ -20,7 +20,7 @@ import numpy as np
 
 from sim.motion.amplifier import pass_time
 from sim.motion.kernel import kernel
-from sim.motion.mechanics import comb_acceleration, undamped_acceleration
+from sim.motion.mechanics import comb_accelerations, undamped_acceleration
 from sim.motion.nystrom import B_RATE, STAGES, A, B, C
 
 LONGEST_S = 205e-6
@@ -93,8 +93,7 @@ def transient(p: np.void, s: np.void) -> None:
         s["volt2"][i] = 2.0 * (s["base_v"][i] - s["charge_v"][i]) * error[i]
         s["error_volt2"][i] = error[i] * error[i]
     x, y, z = s["motion"][0], s["motion"][1], s["motion"][2]
-    ax, ay, az = comb_acceleration(p, s["volt2"], x, y, z)
-    bx, by, bz = comb_acceleration(p, s["error_volt2"], x, y, z)  # side by side: the pose is worked out once
+    ax, ay, az, bx, by, bz = comb_accelerations(p, s["volt2"], s["error_volt2"], x, y, z)
     one[0], one[1], one[2] = times(p["response_1_s2"], ax, ay, az)
     one_push[0], one_push[1], one_push[2] = times(p["response_1"], ax, ay, az)
     two[0], two[1], two[2] = times(p["response_2_s2"], bx, by, bz)

@@ -172,21 +172,26 @@ def _near_pull(
     return pull * E_X[i] + turn * N_X[i], pull * E_Y[i] + turn * N_Y[i], pull, comb, near
 
 
-@inlined
-def comb_acceleration(p: np.void, volt2: np.ndarray, x: float, y: float, z: float) -> tuple[float, float, float]:
-    """The combs' own part of ``undamped_acceleration``, which is linear in ``volt2``."""
+@kernel
+def comb_accelerations(
+    p: np.void, one: np.ndarray, two: np.ndarray, x: float, y: float, z: float
+) -> tuple[float, float, float, float, float, float]:
+    """The combs' own part of ``undamped_acceleration``, which is linear in squared voltages (3,): for two sets of them
+    at one pose, one after the other."""
     height_m, projection_m, drawn_m = lift(p, z)
-    fx, fy, combs = 0.0, 0.0, 0.0
+    fx, fy, combs, gx, gy, others = 0.0, 0.0, 0.0, 0.0, 0.0, 0.0
     for i in range(3):
         w = N_X[i] * x + N_Y[i] * y
         c = leg(p["crank_m"], w)
         q = E_X[i] * x + E_Y[i] * y + drawn_m + (p["crank_m"] - c)
-        comb = p["force_gain_n_per_v2"][i] * (1.0 + p["fringe_per_m"] * q) * volt2[i]
-        fx += comb * (E_X[i] + N_X[i] * w / c)
-        fy += comb * (E_Y[i] + N_Y[i] * w / c)
-        combs += comb
-    per_kg = p["per_kg"]
-    return fx * per_kg, fy * per_kg, combs * (height_m / projection_m + p["levitation"]) * per_kg
+        gain = p["force_gain_n_per_v2"][i] * (1.0 + p["fringe_per_m"] * q)
+        along_x, along_y = E_X[i] + N_X[i] * w / c, E_Y[i] + N_Y[i] * w / c
+        comb, other = gain * one[i], gain * two[i]
+        fx, gx = fx + comb * along_x, gx + other * along_x
+        fy, gy = fy + comb * along_y, gy + other * along_y
+        combs, others = combs + comb, others + other
+    per_kg, steep = p["per_kg"], height_m / projection_m + p["levitation"]
+    return fx * per_kg, fy * per_kg, combs * steep * per_kg, gx * per_kg, gy * per_kg, others * steep * per_kg
 
 
 @kernel

@@ -19,7 +19,7 @@ from sim.motion.geometry import E_X, E_Y, N_X, N_Y, leg, lift, strokes
 from sim.motion.integrator import CONTACT_S, LAST, tabulate, times
 from sim.motion.kernel import kernel
 from sim.motion.layout import CUBIC, MODES
-from sim.motion.mechanics import comb_acceleration, undamped_acceleration
+from sim.motion.mechanics import comb_accelerations, undamped_acceleration
 from sim.motion.nystrom import B_RATE, STAGES, A, B, C
 from sim.structure.side import rise_within
 
@@ -118,14 +118,13 @@ def _transient(p: np.void, s: np.void, n: int) -> None:
         pose[j] = s["motion"][j]
         for k in range(n - 3):
             pose[j] -= p["mode_table"][k, j] * s["modes"][0, k]
+    ax, ay, az, bx, by, bz = comb_accelerations(p, s["volt2"], s["error_volt2"], pose[0], pose[1], pose[2])
     _comb_forces(p, s["volt2"], pose[0], pose[1], pose[2], s["comb_n"])
-    ax, ay, az = comb_acceleration(p, s["volt2"], pose[0], pose[1], pose[2])
     _generalise(p, s["comb_n"], ax, ay, az, n - 3, pull)
     _answer(p["general_response_1_s2"], pull, n, s["general_one"])
     _answer(p["general_response_1"], pull, n, s["general_one_push"])
     _comb_forces(p, s["error_volt2"], pose[0], pose[1], pose[2], s["comb_n"])
-    ax, ay, az = comb_acceleration(p, s["error_volt2"], pose[0], pose[1], pose[2])
-    _generalise(p, s["comb_n"], ax, ay, az, n - 3, pull)
+    _generalise(p, s["comb_n"], bx, by, bz, n - 3, pull)
     _answer(p["general_response_2_s2"], pull, n, s["general_two"])
     _answer(p["general_response_2"], pull, n, s["general_two_push"])
 

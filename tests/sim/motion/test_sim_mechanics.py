@@ -11,7 +11,7 @@ from sim_rig import DEVICE, config, counts, plant, settle
 
 from sim.config import Device
 from sim.motion.geometry import E_X, E_Y, N_X, N_Y, jacobian, strokes
-from sim.motion.mechanics import acceleration, arcsine, comb_acceleration, energy
+from sim.motion.mechanics import acceleration, arcsine, comb_accelerations, energy
 from sim.parameters import rest_stiffness
 
 PLAIN = plant(config())
@@ -112,7 +112,9 @@ def test_combs_act_through_the_transposed_jacobian(x, volt2):
     par, s = UNEVEN.params[0], UNEVEN.state[0]
     s["force_n"] = 0.0
     expected = jacobian(par, x).T @ (par["force_gain_n_per_v2"] * volt2) / par["mass_kg"]
-    np.testing.assert_allclose(comb_acceleration(par, volt2, *x), expected, rtol=1e-9, atol=1e-9)
+    np.testing.assert_allclose(
+        comb_accelerations(par, volt2, 0.5 * volt2, *x), [*expected, *(0.5 * expected)], rtol=1e-9, atol=1e-9
+    )
     both = np.array(acceleration(par, s, volt2, *x, 0.0, 0.0, 0.0))
     alone = np.array(acceleration(par, s, np.zeros(3), *x, 0.0, 0.0, 0.0))
     np.testing.assert_allclose(both - alone, expected, rtol=1e-9, atol=1e-8)
