@@ -89,11 +89,17 @@ def _decayed(one: Three, two: Three, e1: float) -> Three:
 
 @inlined
 def _led(table: np.ndarray, j: int, v: Three) -> Three:
-    """Pose at an instant that ``table`` (3, 6, 4) makes of three numbers."""
+    """Pose at an instant that the matrices in ``table`` (6, 4) make of three numbers."""
+    return _times((table[0, j], table[1, j], table[2, j]), (table[3, j], table[4, j], table[5, j]), v)
+
+
+@inlined
+def _times(own: Three, cross: Three, v: Three) -> Three:
+    """A symmetric matrix times a vector: what is on its diagonal, and its xy, xz, yz."""
     return (
-        table[0, 0, j] * v[0] + table[1, 0, j] * v[1] + table[2, 0, j] * v[2],
-        table[0, 1, j] * v[0] + table[1, 1, j] * v[1] + table[2, 1, j] * v[2],
-        table[0, 2, j] * v[0] + table[1, 2, j] * v[1] + table[2, 2, j] * v[2],
+        own[0] * v[0] + cross[0] * v[1] + cross[1] * v[2],
+        cross[0] * v[0] + own[1] * v[1] + cross[2] * v[2],
+        cross[1] * v[0] + cross[2] * v[1] + own[2] * v[2],
     )
 
 
@@ -105,24 +111,13 @@ def _stiff(p: np.void) -> tuple[Three, Three]:
 
 
 @inlined
-def _stretched(stiff: tuple[Three, Three], x: Three) -> Three:
-    """K x / m."""
-    own, cross = stiff
-    return (
-        own[0] * x[0] + cross[0] * x[1] + cross[1] * x[2],
-        cross[0] * x[0] + own[1] * x[1] + cross[2] * x[2],
-        cross[1] * x[0] + cross[2] * x[1] + own[2] * x[2],
-    )
-
-
-@inlined
 def _left(
     m: Constants, stiff: tuple[Three, Three], volt2: Three, x: Three, fast: Three, push: Three
 ) -> tuple[float, float, float, float]:
     """n where the smooth part of the pose is ``x`` and the transient adds ``fast``, m, and what of its acceleration
     answers ``push``; and whether that is near, as ``near_acceleration`` says it."""
     ax, ay, az, near = near_acceleration(m, volt2, x[0] + fast[0], x[1] + fast[1], x[2] + fast[2])
-    kx, ky, kz = _stretched(stiff, x)
+    kx, ky, kz = _times(*stiff, x)
     return ax + (push[0] + kx), ay + (push[1] + ky), az + (push[2] + kz), near
 
 
@@ -134,7 +129,7 @@ def _at_start(p: np.void, s: np.void) -> tuple[float, float, float, float]:
     push = _added(_three(s["fast_1_m_per_s2"]), _three(s["fast_2_m_per_s2"]))
     motion, ended, known = s["motion"], s["ended_m"], s["ended_m_per_s2"]
     if motion[0] == ended[0] and motion[1] == ended[1] and motion[2] == ended[2] and p["amplifier_s"] > 0.0:
-        x, y, z = _stretched(_stiff(p), at)
+        x, y, z = _times(*_stiff(p), at)
         return known[0] + (push[0] + x), known[1] + (push[1] + y), known[2] + (push[2] + z), 1.0
     base, error, charge = s["base_v"], s["error_v"], s["charge_v"]
     vx, vy, vz = base[0] + error[0] - charge[0], base[1] + error[1] - charge[1], base[2] + error[2] - charge[2]
@@ -150,13 +145,19 @@ def first_round(p: np.void, s: np.void, n: Three) -> None:
     one_push, two_push, v = _three(s["fast_1_m_per_s2"]), _three(s["fast_2_m_per_s2"]), _three(s["smooth"][3:])
     bx, by, bz = s["base_v"][0] - charge[0], s["base_v"][1] - charge[1], s["base_v"][2] - charge[2]
     ex, ey, ez = _three(s["error_v"])
-    flow, steady, decay, near = s["flow"], s["steady"], s["instant_decay"], s["near"]
+    from_pose, from_rate, steady, decay, near = (
+        s["from_pose"],
+        s["from_rate"],
+        s["steady"],
+        s["instant_decay"],
+        s["near"],
+    )
     volt2, fast, push, free, left = s["instant_volt2"], s["fast_m"], s["fast_m_per_s2"], s["free_m"], s["left_m_per_s2"]
     for j in range(INSTANTS):
         e1 = decay[j]
         wx, wy, wz = bx + ex * e1, by + ey * e1, bz + ez * e1
         square = wx * wx, wy * wy, wz * wz
-        swung = _added(_led(flow[:3], j, x), _led(flow[3:], j, v))
+        swung = _added(_led(from_pose, j, x), _led(from_rate, j, v))
         shift, shove = _decayed(one, two, e1), _decayed(one_push, two_push, e1)
         left[0, j], left[1, j], left[2, j], near[j] = _left(
             m, stiff, square, _added(swung, _led(steady, j, n)), shift, shove
@@ -186,21 +187,24 @@ def second_round(p: np.void, s: np.void) -> None:
 @kernel
 def _end(p: np.void, s: np.void) -> None:
     """Take over where the step leads."""
-    flow, answer, smooth, left, end = s["flow"], s["answer"], s["smooth"], s["left_m_per_s2"], s["motion"]
-    one, two, e1 = s["fast_1_m"], s["fast_2_m"], s["instant_decay"][_END]
-    e2, k = e1 * e1, 1.0 / p["amplifier_s"] if p["amplifier_s"] > 0.0 else 0.0
-    for i in range(6):
-        place = flow[0, i, _END] * smooth[0] + flow[1, i, _END] * smooth[1] + flow[2, i, _END] * smooth[2]
-        end[i] = place + (flow[3, i, _END] * smooth[3] + flow[4, i, _END] * smooth[4] + flow[5, i, _END] * smooth[5])
-        for node in range(INSTANTS):
-            a, n = answer[node], left[:, node]
-            end[i] += a[0, i, _END] * n[0] + a[1, i, _END] * n[1] + a[2, i, _END] * n[2]
-    kx, ky, kz = _stretched(_stiff(p), _three(end))
+    motion, table, answer, left = s["motion"], s["end_rate"], s["answer"], s["left_m_per_s2"]
+    x, v = _three(s["smooth"]), _three(s["smooth"][3:])
+    pose = _added(_three_at(s["free_m"], _END), _led(answer[0], _END, _three_at(left, 0)))
+    rate = _added(_times(_three(table[0]), _three(table[0, 3:]), x), _times(_three(table[1]), _three(table[1, 3:]), v))
+    rate = _added(rate, _times(_three(table[2]), _three(table[2, 3:]), _three_at(left, 0)))
+    for node in range(1, INSTANTS):
+        n, row = _three_at(left, node), table[2 + node]
+        pose = _added(pose, _led(answer[node], _END, n))
+        rate = _added(rate, _times(_three(row), _three(row[3:]), n))
+    kx, ky, kz = _times(*_stiff(p), pose)
     known, push = s["ended_m_per_s2"], _three_at(s["fast_m_per_s2"], _END)
     known[0], known[1] = left[0, _END] - (push[0] + kx), left[1, _END] - (push[1] + ky)
     known[2] = left[2, _END] - (push[2] + kz)
+    one, two, e1 = s["fast_1_m"], s["fast_2_m"], s["instant_decay"][_END]
+    e2, k = e1 * e1, 1.0 / p["amplifier_s"] if p["amplifier_s"] > 0.0 else 0.0
+    motion[0], motion[1], motion[2] = _added(pose, _three_at(s["fast_m"], _END))
+    motion[3], motion[4], motion[5] = rate
     for i in range(3):
-        end[i] += one[i] * e1 + two[i] * e2
-        end[3 + i] -= k * (one[i] * e1 + 2.0 * (two[i] * e2))
-        s["ended_m"][i] = end[i]
+        motion[3 + i] -= k * (one[i] * e1 + 2.0 * (two[i] * e2))
+        s["ended_m"][i] = motion[i]
     pass_time(s, p["regular_s"], e1)

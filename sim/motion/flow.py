@@ -2,9 +2,10 @@
 
     x'' + D x' + K x / m = n
 
-with the stiffness K of the rest pose, the mass m and the damping D. Position and velocity at four instants are linear
-in those at the start, in a steady n, and in the values at the instants of an n that is a cubic; each by its Taylor
-series in time."""
+with the stiffness K of the rest pose, the mass m and the damping D. Poses at four instants, and the velocity at the
+last, are linear in pose and velocity at the start, in a steady n, and in the values at the instants of an n that is a
+cubic; each by its Taylor series in time. Damping is modal, D a function of K, so each of these matrices is one, too: it
+is symmetric, and kept as its xx, yy, zz, xy, xz, yz."""
 
 import math
 
@@ -31,17 +32,32 @@ def tabulate_flow(p: np.void, s: np.void) -> None:
     s["flow_h_s"], tau = p["regular_s"], p["amplifier_s"]
     for j in range(INSTANTS):
         s["instant_decay"][j] = math.exp(-AT[j] * p["regular_s"] / tau) if tau > 0.0 else 0.0
-    s["answer"][:] = 0.0
-    for c in range(6):
-        _solve(p, c, -1, s["flow"][c])
+    solved, end, steady, answer = s["solved"], s["end_rate"], s["steady"], s["answer"]
+    s["from_pose"][:], s["from_rate"][:], steady[:], answer[:], end[:] = 0.0, 0.0, 0.0, 0.0, 0.0
     for axis in range(3):
-        steady = s["steady"][axis]
-        for power in range(INSTANTS - 1, -1, -1):
-            _solve(p, axis, power, steady)
+        _solve(p, axis, -1, solved)
+        _keep(solved, axis, 1.0, s["from_pose"], end[0])
+        _solve(p, 3 + axis, -1, solved)
+        _keep(solved, axis, 1.0, s["from_rate"], end[1])
+        for power in range(INSTANTS):
+            _solve(p, axis, power, solved)
             for k in range(INSTANTS):
-                for i in range(6):
-                    for j in range(INSTANTS):
-                        s["answer"][k, axis, i, j] += CUBIC[power, k] * steady[i, j]
+                _keep(solved, axis, CUBIC[power, k], answer[k], end[2 + k])
+    for k in range(INSTANTS):
+        for entry in range(6):
+            for j in range(INSTANTS):
+                steady[entry, j] += answer[k, entry, j]
+
+
+@kernel
+def _keep(solved: np.ndarray, axis: int, share: float, poses: np.ndarray, end_rate: np.ndarray) -> None:
+    """Add a share of what ``solved`` (6, 4) says of column ``axis`` to matrices of the poses (6, 4), and of the rate at
+    the end (6,)."""
+    for row in range(axis + 1):
+        entry = axis if row == axis else row + axis + 2
+        for j in range(INSTANTS):
+            poses[entry, j] += share * solved[row, j]
+        end_rate[entry] += share * solved[3 + row, INSTANTS - 1]
 
 
 @kernel

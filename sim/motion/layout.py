@@ -127,10 +127,12 @@ STATE = np.dtype(
         ("error_volt2", "f8", 3), ("fast_1_m", "f8", 3), ("fast_2_m", "f8", 3), ("fast_1_m_per_s2", "f8", 3),
         ("fast_2_m_per_s2", "f8", 3), ("slopes", "f8", (STAGES, 3)), ("start", "f8", 6),
         # ... of the usual length; instants stand last, in the record that is written: of these LLVM makes vectors
-        ("flow_h_s", "f8"), ("instant_decay", "f8", INSTANTS), ("flow", "f8", (6, 6, INSTANTS)), ("steady", "f8", (3, 6,
-        INSTANTS)), ("answer", "f8", (INSTANTS, 3, 6, INSTANTS)), ("smooth", "f8", 6), ("free_m", "f8", (3, INSTANTS)),
-        ("instant_volt2", "f8", (3, INSTANTS)), ("fast_m", "f8", (3, INSTANTS)), ("fast_m_per_s2", "f8", (3, INSTANTS)),
-        ("left_m_per_s2", "f8", (3, INSTANTS)), ("near", "f8", INSTANTS),
+        ("flow_h_s", "f8"), ("instant_decay", "f8", INSTANTS), ("solved", "f8", (6, INSTANTS)),
+        ("from_pose", "f8", (6, INSTANTS)), ("from_rate", "f8", (6, INSTANTS)), ("steady", "f8", (6, INSTANTS)),
+        ("answer", "f8", (INSTANTS, 6, INSTANTS)), ("end_rate", "f8", (2 + INSTANTS, 6)),
+        ("smooth", "f8", 6), ("free_m", "f8", (3, INSTANTS)), ("instant_volt2", "f8", (3, INSTANTS)),
+        ("fast_m", "f8", (3, INSTANTS)), ("fast_m_per_s2", "f8", (3, INSTANTS)), ("left_m_per_s2", "f8", (3, INSTANTS)),
+        ("near", "f8", INSTANTS),
         ("ended_m", "f8", 3), ("ended_m_per_s2", "f8", 3),  # pose and acceleration where the last one ended
         # ... of any other
         ("tabulated_h_s", "f8"), ("decay", "f8", STAGES), ("shrink", "f8", (STAGES, 3, 3)), ("swell", "f8", (STAGES, 3,

@@ -49,15 +49,28 @@ def test_tables_are_those_of_the_matrix_exponential():
         at = 6 + 3 * power
         system[at : at + 3, at + 3 : at + 6] = np.eye(3) / PERIOD_S  # time in steps
     powers = np.vander(AT, increasing=True)
+
+    def whole(entries):
+        xx, yy, zz, xy, xz, yz = entries
+        return np.array([[xx, xy, xz], [xy, yy, yz], [xz, yz, zz]])
+
+    def answer_to(node, moved):
+        cubic = np.linalg.solve(powers, np.eye(INSTANTS)[node])
+        return sum(math.factorial(n) * c * moved[:, 6 + 3 * n : 9 + 3 * n] for n, c in enumerate(cubic))
+
     for j, share in enumerate(AT):
         moved = expm(system * share * PERIOD_S)[:6]
-        np.testing.assert_allclose(s["flow"][:, :, j].T, moved[:, :6], rtol=1e-12, atol=1e-12)
-        np.testing.assert_allclose(s["steady"][:, :, j].T, moved[:, 6:9], rtol=1e-10, atol=1e-22)
-        for axis in range(3):
-            for node in range(INSTANTS):
-                cubic = np.linalg.solve(powers, np.eye(INSTANTS)[node])
-                by_power = sum(math.factorial(n) * c * moved[:, 6 + 3 * n + axis] for n, c in enumerate(cubic))
-                np.testing.assert_allclose(s["answer"][node, axis, :, j], by_power, rtol=1e-8, atol=1e-19)
+        np.testing.assert_allclose(whole(s["from_pose"][:, j]), moved[:3, :3], rtol=1e-12, atol=1e-12)
+        np.testing.assert_allclose(whole(s["from_rate"][:, j]), moved[:3, 3:6], rtol=1e-12, atol=1e-17)
+        np.testing.assert_allclose(whole(s["steady"][:, j]), moved[:3, 6:9], rtol=1e-9, atol=1e-20)
+        for node in range(INSTANTS):
+            np.testing.assert_allclose(
+                whole(s["answer"][node, :, j]), answer_to(node, moved)[:3], rtol=1e-8, atol=1e-19
+            )
+    np.testing.assert_allclose(whole(s["end_rate"][0]), moved[3:, :3], rtol=1e-11, atol=1e-9)
+    np.testing.assert_allclose(whole(s["end_rate"][1]), moved[3:, 3:6], rtol=1e-11, atol=1e-12)
+    for node in range(INSTANTS):
+        np.testing.assert_allclose(whole(s["end_rate"][2 + node]), answer_to(node, moved)[3:], rtol=1e-8, atol=1e-14)
 
 
 def error_m(p, to_v) -> float:
