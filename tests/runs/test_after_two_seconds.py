@@ -50,7 +50,7 @@ def test_a_raster_of_a_stage_that_nobody_has_identified(scenario, rms_nm, within
 
 CIRCLE_ON = {"mild": ("circle", "mild"), "lab": ("circle_lab", "lab"), "nominal": ("circle", "nominal")}
 LEARNT_NM = {"mild": (3.61, 3.39), "lab": (3.80, 3.66), "nominal": (1.23, 1.22)}
-LARGEST_NM = {"mild": 4.47, "lab": 4.99, "nominal": 1.88}
+LARGEST_NM = {"mild": 4.52, "lab": 4.99, "nominal": 1.88}
 NOT_LEARNT_NM = {"mild": (12.6, 38.0), "lab": (20.6, 52.4), "nominal": (1.16, 1.14)}
 
 

@@ -22,6 +22,7 @@ def scan(n: int, period_us: int) -> np.ndarray:
 
 @pytest.mark.parametrize("period_us", [200, 500])
 def test_within_a_picometre_over_a_scan(period_us):
+    """At most 0.08 pm in periods of 200 us, 0.05 pm in those of 500."""
     p = plant(config(amplifier_bandwidth={"corner_hz": 30e3}), period_us=period_us)
     drives = scan(100_000 // period_us, period_us)
     truth = reference_motion(p.params, p.state, drives, period_us)
@@ -33,7 +34,7 @@ def test_within_a_picometre_over_a_scan(period_us):
     error = np.abs(np.array(ours) - truth)
     assert np.ptp(truth, axis=0).min() > 1e-6
     assert error[-1].max() < 0.2 * PM
-    assert error.max() < 1.0 * PM
+    assert error.max() < 0.1 * PM
 
 
 def test_a_jump_costs_less_than_a_nanometre():
