@@ -18,11 +18,11 @@ covariance never exceeds what was known beforehand. It stands still where the re
 psi describes, where the stage is not where it should be, and after a comb was at a limit. What acts follows within some
 milliseconds, and the filter's prediction moves along by U, as if it had always known: nothing kicks, no voltage waits.
 
-Where a loop over the parameters shall become vectors, what it needs of another record, or of another row of its own, is
-read before it: a compiler can't know that what it writes does not change that.
-
 Beside it stands what was known once, the base. If one cause alone has changed since (a comb, a chain's springs, the
 hinges), one number makes the innovations that the base would leave as small as those that are left: it is a warning.
+
+Where a loop over the parameters shall become vectors, what it needs of another record, or of another row of its own, is
+read before it: a compiler can't know that what it writes does not change that.
 """
 
 import math

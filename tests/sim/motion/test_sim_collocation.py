@@ -195,19 +195,20 @@ def test_the_acceleration_without_a_branch_is_the_one_with(pose_um, volt):
 def test_it_tells_where_it_does_not_hold():
     """At a stop, where a crank or a link has turned too far for the series, and of what is not a number."""
     p = under_way((0, 0, 0), (0, 0, 0), (0, 0, 0), (0, 0, 0))
-    par, s = p.params[0], p.state[0]
-    lean_m = 1.01 * NEAR * par["crank_m"]
-    beyond_stop = {"y": 1.01 * par["stop_high_m"]}
-    par_free = par.copy()
-    par_free["stop_high_m"], par_free["stop_low_m"] = 1.0, -1.0
-    for record, pose in (
-        (par, beyond_stop),
-        (par_free, {"x": lean_m}),
-        (par_free, {"z": 2e-4}),
-        (par, {"x": math.nan}),
-    ):
-        at = {"x": 0.0, "y": 0.0, "z": 0.0} | pose
-        assert near_acceleration(constants(record, s), (0.0, 0.0, 0.0), at["x"], at["y"], at["z"])[3] == 0.0
+    free, s = p.params[0], p.state[0]
+    stopped = p.params.copy()[0]
+    stopped["stop_high_m"] = 20e-6
+    lean_m = 1.01 * NEAR * free["crank_m"]
+
+    def near(record, *pose):
+        return near_acceleration(constants(record, s), (0.0, 0.0, 0.0), *pose)[3]
+
+    assert near(stopped, 0.0, 19.9e-6, 0.0) == near(free, 0.0, 20.1e-6, 0.0) == 1.0
+    assert near(stopped, 0.0, 20.1e-6, 0.0) == 0.0
+    assert near(free, 0.98 * lean_m, 0.0, 0.0) == 1.0
+    assert near(free, lean_m, 0.0, 0.0) == 0.0
+    assert near(free, 0.0, 0.0, 80e-6) == 0.0
+    assert near(free, math.nan, 0.0, 0.0) == 0.0
 
 
 @pytest.mark.skipif(
