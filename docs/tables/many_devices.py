@@ -1,9 +1,11 @@
-"""Keeps the shares of two draws of 10^5 devices in a closed loop, and how long each took, for docs/do/wafer.md.
+"""Keeps the shares of two draws of 10^5 devices and of one of 10^6 in a closed loop, and how long each took, for
+docs/do/wafer.md.
 
-python docs/tables/many_devices.py FOLDER
+python docs/tables/many_devices.py FOLDER [SEED ...]
 
-FOLDER, which must not be there yet, takes what both find, some GB; they have the machine to themselves for some minutes
-each. Without it nothing happens, so that ``make docs`` does not wait.
+FOLDER, which must not be there yet, takes what they find, some GB; they have the machine to themselves, for some
+minutes and for most of an hour. With seeds the others stay as they are kept. Without a folder nothing happens, so that
+``make docs`` does not wait.
 """
 
 import json
@@ -14,19 +16,20 @@ from pathlib import Path
 from typing import Any
 
 KEPT = Path(__file__).with_suffix(".json")
-SEEDS = (1, 2)
+DEVICES = {1: 100_000, 2: 100_000, 3: 1_000_000}
+"""Of each seed."""
 WORDS = (
-    "--scenario", "examples/short_scan.toml", "--shipped", "--devices", "100000", "--loops", "100000",
-    "--sensitivity", "0", "--loop-sensitivity", "0",
+    "--scenario", "examples/short_scan.toml", "--shipped", "--sensitivity", "0", "--loop-sensitivity", "0", "--json",
 )  # fmt: skip
 """Of `pkxyz yield`."""
 
 
 def drawn(seed: int, folder: Path) -> tuple[dict[str, Any], float]:
     """What `pkxyz yield --json` tells, and how many seconds it took by the clock."""
+    many = ["--seed", str(seed), "--devices", str(DEVICES[seed]), "--loops", str(DEVICES[seed])]
+    words = [sys.executable, "-m", "hil", "yield", *WORDS, *many, "--out", str(folder / str(seed))]
     begin_s = time.perf_counter()
-    words = [sys.executable, "-m", "hil", "yield", *WORDS, "--seed", str(seed), "--out", str(folder / str(seed))]
-    told = subprocess.run([*words, "--json"], check=True, capture_output=True, text=True).stdout
+    told = subprocess.run(words, check=True, capture_output=True, text=True).stdout
     return json.loads(told), time.perf_counter() - begin_s
 
 
@@ -42,5 +45,7 @@ def kept_of(told: dict[str, Any], seconds: float) -> dict[str, Any]:
 if __name__ == "__main__" and len(sys.argv) > 1:
     place = Path(sys.argv[1])
     place.mkdir(parents=True)  # what went on with an earlier one would have taken no time
-    both = [kept_of(*drawn(seed, place)) for seed in SEEDS]
-    KEPT.write_text(json.dumps(both, indent=1) + "\n", encoding="utf-8")
+    kept = {draw["seed"]: draw for draw in json.loads(KEPT.read_text(encoding="utf-8"))}
+    for asked in map(int, sys.argv[2:] or DEVICES):
+        kept[asked] = kept_of(*drawn(asked, place))
+        KEPT.write_text(json.dumps(list(kept.values()), indent=1) + "\n", encoding="utf-8")
