@@ -5,7 +5,7 @@ from numpy.typing import NDArray
 
 from pkxyz_ctrl.compiled.kernel import kernel
 from pkxyz_ctrl.core import adaptation, feedback, linear_law, set_point_model, youla
-from pkxyz_ctrl.core.elasticity import gradient_and_pulls
+from pkxyz_ctrl.core.elasticity import BENT, gradient_and_pulls
 from pkxyz_ctrl.core.linear3 import inverse3
 
 Array = NDArray[np.float64]
@@ -20,7 +20,9 @@ A plan answers to set-points, too. For the others ``set_point_model`` does, and 
 COMING = np.dtype(
     [
         ("row", "f8", (9,)),  # of the reference
-        ("pulls", "f8", (3, 3)),  # ``kinematics.pulls`` there
+        ("bent", BENT),  # there
+        ("pulls", "f8", (3, 3)),  # ``kinematics.pulls`` there, and ...
+        ("inverse", "f8", (3, 3)),  # ... their inverse
         ("holding_n", "f8", (3,)),  # at the platform, what holds it there, and ...
         ("needed_n", "f8", (3,)),  # ... what moves it along, too
     ],
@@ -36,19 +38,20 @@ def _look_ahead(law: np.void, begin: Array, end: Array, coming: np.void) -> None
     """Write what the interval between two rows (9,) takes into ``coming``, a record of ``COMING``."""
     row, holding, needed = coming["row"], coming["holding_n"], coming["needed_n"]
     feedback.ahead(law["feedback"], begin, end, row)
-    gradient_and_pulls(law["geometry"], law["elasticity"], row[0:3], holding, coming["pulls"])
+    gradient_and_pulls(law["geometry"], law["elasticity"], row[0:3], holding, coming["pulls"], coming["bent"])
+    inverse3(coming["pulls"], coming["inverse"])
     for i in range(3):
         needed[i] = holding[i]
     feedback.add_motion(law["feedback"], row, needed)
 
 
 @kernel
-def foresee_errors(law: np.void, memory: np.void, inverse: Array) -> None:
-    """What the device's errors make of the interval in ``coming``; ``inverse`` (3,3) is that of its pulls."""
+def foresee_errors(law: np.void, memory: np.void) -> None:
+    """What the device's errors make of the interval in ``coming``."""
     coming = memory["coming"]
     adaptation.foresee(
-        law["adaptation"], memory["adaptation"], law["geometry"], law["elasticity"],
-        law["feedback"]["damping_n_s_per_m"], coming["row"], inverse, coming["pulls"], coming["needed_n"],
+        law["adaptation"], memory["adaptation"], law["geometry"], law["feedback"]["damping_n_s_per_m"], coming["row"],
+        coming["bent"], coming["inverse"], coming["pulls"], coming["needed_n"],
     )  # fmt: skip
 
 
@@ -67,13 +70,12 @@ def ask(law: np.void, memory: np.void, now: Array, after: Array, later: Array) -
     for i in range(3):
         demand[i] = coming["needed_n"][i]
         for k in range(3):
-            j[i, k] = coming["pulls"][i, k]
-    inverse3(j, inverse)
+            j[i, k], inverse[i, k] = coming["pulls"][i, k], coming["inverse"][i, k]
     share = feedback.authority(gains, inverse, coming["holding_n"])
     learnt, online = memory["adaptation"], law["adaptation"]["on"] != 0
     if online:
         if not is_foreseen:
-            foresee_errors(law, memory, inverse)
+            foresee_errors(law, memory)
         adaptation.note(learnt, aim[0])
     _look_ahead(law, aim[1], aim[2], coming)
     last, before = memory["feedforward_n"], scratch["w_n"]

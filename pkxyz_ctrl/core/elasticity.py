@@ -28,6 +28,18 @@ ELASTICITY = np.dtype(
     align=True,
 )
 
+BENT = np.dtype(
+    [
+        ("along_m", "f8", (3,)),  # of each chain: c, as ``kinematics.crank`` says it
+        ("stroke_m", "f8", (3,)),
+        ("slider_n", "f8", (3,)),  # that the slider's springs need
+        ("crank_n_m", "f8", (3,)),  # that the parallelogram needs
+        ("projection_m", "f8"),  # of the links
+        ("link_n_m", "f8"),  # that their hinges need
+    ],
+    align=True,
+)
+"""How a stage bends at one position, for whoever needs more of it than the sum."""
 
 _SMALL = 0.1
 _HALVINGS = 4  # from a right angle
@@ -77,14 +89,26 @@ def _elevation_change(geometry: np.void, dz: float, delta: float) -> float:
 
 
 @kernel
-def _springs(
-    geometry: np.void, elasticity: np.void, i: int, x: float, y: float, s: float, c: float, drop: float
-) -> tuple[float, float]:
-    """Force in N along chain i's direction of action that its springs need, and across it, from what ``crank`` and
-    ``link`` say.
+def _springs(geometry: np.void, elasticity: np.void, i: int, q: float, s: float, c: float) -> tuple[float, float]:
+    """Force in N along chain i's direction of action that its springs need at stroke ``q``, and across it; ``s`` and
+    ``c`` as ``crank`` says.
     """
-    force = elasticity["slider_n_per_m"][i] * stroke(geometry, i, x, y, s, c, drop)
-    return force, (force * s + elasticity["crank_n_m_per_rad"][i] * arcsine(s / geometry["crank_m"])) / c
+    force = elasticity["slider_n_per_m"][i] * q
+    return force, (force * s + _crank_torque(geometry, elasticity, i, s)) / c
+
+
+@kernel
+def _crank_torque(geometry: np.void, elasticity: np.void, i: int, s: float) -> float:
+    """In N m, that chain i's parallelogram needs."""
+    torque: float = elasticity["crank_n_m_per_rad"][i] * arcsine(s / geometry["crank_m"])
+    return torque
+
+
+@kernel
+def _link_torque(geometry: np.void, elasticity: np.void, dz: float, delta: float) -> float:
+    """In N m, that the out-of-plane hinges need at height ``dz`` above rest."""
+    torque: float = elasticity["link_n_m_per_rad"] * _elevation_change(geometry, dz, delta)
+    return torque
 
 
 @kernel
@@ -96,19 +120,24 @@ def energy_gradient(geometry: np.void, elasticity: np.void, position_m: Array, o
     fx = fy = pull = 0.0
     for i in range(3):
         s, c = crank(geometry, i, x, y)
-        force, across = _springs(geometry, elasticity, i, x, y, s, c, drop)
+        force, across = _springs(geometry, elasticity, i, stroke(geometry, i, x, y, s, c, drop), s, c)
         fx += force * e[i, 0] + across * n[i, 0]
         fy += force * e[i, 1] + across * n[i, 1]
         pull += force
     out[0] = fx
     out[1] = fy
-    out[2] = (pull * z + elasticity["link_n_m_per_rad"] * _elevation_change(geometry, position_m[2], delta)) / delta
+    out[2] = (pull * z + _link_torque(geometry, elasticity, position_m[2], delta)) / delta
 
 
 @kernel
-def gradient_and_pulls(geometry: np.void, elasticity: np.void, position_m: Array, out: Array, pulls_out: Array) -> None:
-    """``energy_gradient`` (3,) and ``kinematics.pulls`` (3,3) at one position, whose cranks and links both need."""
+def gradient_and_pulls(
+    geometry: np.void, elasticity: np.void, position_m: Array, out: Array, pulls_out: Array, bent: np.void
+) -> None:
+    """``energy_gradient`` (3,) and ``kinematics.pulls`` (3,3) at one position, whose cranks and links both need, and
+    how the stage bends there: a record of ``BENT``.
+    """
     e, n = geometry["e"], geometry["n"]
+    along_m, stroke_m, slider_n, crank_n_m = bent["along_m"], bent["stroke_m"], bent["slider_n"], bent["crank_n_m"]
     x, y = position_m[0], position_m[1]
     z, delta, drop = link(geometry, position_m[2])
     slope = z / delta
@@ -119,13 +148,15 @@ def gradient_and_pulls(geometry: np.void, elasticity: np.void, position_m: Array
         pulls_out[i, 0] = e[i, 0] + n[i, 0] * tangent
         pulls_out[i, 1] = e[i, 1] + n[i, 1] * tangent
         pulls_out[i, 2] = slope + geometry["lift"]
-        force, across = _springs(geometry, elasticity, i, x, y, s, c, drop)
+        q = stroke(geometry, i, x, y, s, c, drop)
+        force, torque = elasticity["slider_n_per_m"][i] * q, _crank_torque(geometry, elasticity, i, s)
+        across = (force * s + torque) / c
         fx += force * e[i, 0] + across * n[i, 0]
         fy += force * e[i, 1] + across * n[i, 1]
         pull += force
-    out[0] = fx
-    out[1] = fy
-    out[2] = (pull * z + elasticity["link_n_m_per_rad"] * _elevation_change(geometry, position_m[2], delta)) / delta
+        along_m[i], stroke_m[i], slider_n[i], crank_n_m[i] = c, q, force, torque
+    bent["projection_m"], bent["link_n_m"] = delta, _link_torque(geometry, elasticity, position_m[2], delta)
+    out[0], out[1], out[2] = fx, fy, (pull * z + bent["link_n_m"]) / delta
 
 
 @kernel
@@ -142,7 +173,7 @@ def gradient_and_forces(
     wx = wy = held = fx = fy = pull = gx = gy = other_pull = 0.0
     for i in range(3):
         s, c = crank(geometry, i, x, y)
-        spring, spring_across = _springs(geometry, elasticity, i, x, y, s, c, drop)
+        spring, spring_across = _springs(geometry, elasticity, i, stroke(geometry, i, x, y, s, c, drop), s, c)
         across, other_across = comb_force_n[i] * s / c, other_n[i] * s / c
         wx += spring * e[i, 0] + spring_across * n[i, 0]
         wy += spring * e[i, 1] + spring_across * n[i, 1]
@@ -153,20 +184,11 @@ def gradient_and_forces(
         gx += other_n[i] * e[i, 0] + other_across * n[i, 0]
         gy += other_n[i] * e[i, 1] + other_across * n[i, 1]
         other_pull += other_n[i]
-    wz = (held * z + elasticity["link_n_m_per_rad"] * _elevation_change(geometry, position_m[2], delta)) / delta
+    wz = (held * z + _link_torque(geometry, elasticity, position_m[2], delta)) / delta
     out[0], out[1], out[2] = fx, fy, pull * z / delta + geometry["lift"] * pull
     other_out[0], other_out[1] = gx, gy
     other_out[2] = other_pull * z / delta + geometry["lift"] * other_pull
     return wx, wy, wz
-
-
-@kernel
-def link_force(geometry: np.void, elasticity: np.void, dz: float) -> float:
-    """Part of dV/dz in N that the out-of-plane hinges have at height ``dz`` above rest."""
-    _, delta, _ = link(geometry, dz)
-    tilt: float = _elevation_change(geometry, dz, delta)
-    force: float = elasticity["link_n_m_per_rad"] * tilt / delta
-    return force
 
 
 @njit(cache=True, error_model="numpy")

@@ -22,7 +22,7 @@ from numpy.typing import NDArray
 
 from pkxyz_ctrl.compiled.kernel import kernel
 from pkxyz_ctrl.core import feedback, kinematics
-from pkxyz_ctrl.core.elasticity import gradient_and_pulls
+from pkxyz_ctrl.core.elasticity import BENT, gradient_and_pulls
 from pkxyz_ctrl.core.linear3 import inverse3, multiply3_transposed
 
 Array = NDArray[np.float64]
@@ -51,6 +51,7 @@ SCRATCH = np.dtype(
         ("middle", "f8", (3,)),
         ("force", "f8", (3,)),
         ("pulls", "f8", (3, 3)),
+        ("bent", BENT),
         ("inverse", "f8", (3, 3)),
         ("seen", "f8", (6,)),
         ("later", "f8", (6,)),
@@ -119,7 +120,8 @@ def deviation(law: np.void, memory: np.void, plan: np.void) -> None:
     """e at the start of the first interval, as the state feedback sees it; and the feed-forward in that interval."""
     scratch, rows, force, error = memory["scratch"], plan["rows"], plan["first_n"], plan["error"]
     target, last = scratch["row"], scratch["w_n"]
-    gradient_and_pulls(law["geometry"], law["elasticity"], plan["middle"][0, 0:3], force, plan["first_pulls"])
+    middle, pulls, bent = plan["middle"][0, 0:3], plan["first_pulls"], plan["scratch"]["bent"]
+    gradient_and_pulls(law["geometry"], law["elasticity"], middle, force, pulls, bent)
     feedback.add_motion(law["feedback"], plan["middle"][0], force)
     for i in range(3):
         last[i] = memory["feedforward_n"][i] if memory["feedforward_known"] != 0 else force[i]
@@ -218,7 +220,7 @@ def comb_forces(law: np.void, plan: np.void, k: int, begin: Array, end: Array, n
         middle[i] = row[k, i] + off[i]
     if kinematics.in_domain(law["geometry"], middle) != 0:
         return False
-    gradient_and_pulls(law["geometry"], law["elasticity"], middle, force, scratch["pulls"])
+    gradient_and_pulls(law["geometry"], law["elasticity"], middle, force, scratch["pulls"], scratch["bent"])
     for i in range(3):
         held = stiffness[i, 0] * off[0] + stiffness[i, 1] * off[1] + stiffness[i, 2] * off[2]
         force[i] += moving[k, i] + nu_n[i] - held

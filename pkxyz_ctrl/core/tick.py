@@ -27,7 +27,7 @@ from pkxyz_ctrl.core import (
 from pkxyz_ctrl.core import estimator as filtering
 from pkxyz_ctrl.core.demand import COMING, LINEAR, OPEN_LOOP, PREDICTIVE, ask, foresee_errors
 from pkxyz_ctrl.core.elasticity import ELASTICITY
-from pkxyz_ctrl.core.linear3 import inverse3, multiply3_transposed
+from pkxyz_ctrl.core.linear3 import multiply3_transposed
 
 Array = NDArray[np.float64]
 
@@ -70,7 +70,6 @@ SCRATCH = np.dtype(
     [
         ("pulls", "f8", (3, 3)),
         ("inverse", "f8", (3, 3)),
-        ("inverse_ahead", "f8", (3, 3)),
         ("state", "f8", (9,)),
         ("row", "f8", (9,)),
         ("next_n", "f8", (3,)),
@@ -225,10 +224,9 @@ def prepare(law: np.void, memory: np.void) -> None:
             law["adaptation"], memory["adaptation"], law["delay_periods"], estimator["operating_point_m"],
             state["innovation_m"], state["filtered"], state["predicted"], memory["to_learn"] == _SEEN,
         )  # fmt: skip
-        adaptation.move_on(memory["adaptation"])
+        adaptation.move_on(memory["adaptation"], law["delay_periods"])
         if memory["set_point_model"]["foreseen"] != 0:
-            inverse3(memory["coming"]["pulls"], memory["scratch"]["inverse_ahead"])
-            foresee_errors(law, memory, memory["scratch"]["inverse_ahead"])
+            foresee_errors(law, memory)
         memory["to_learn"] = 0
     if memory["to_follow"] != 0:
         _follow(law, memory)

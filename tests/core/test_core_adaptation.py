@@ -18,6 +18,7 @@ from pkxyz_ctrl.config.controller import ControllerConfig
 from pkxyz_ctrl.config.files import load
 from pkxyz_ctrl.config.stage import StageConfig
 from pkxyz_ctrl.core import adaptation, tick
+from pkxyz_ctrl.core.elasticity import BENT, gradient_and_pulls
 from pkxyz_ctrl.core.linear3 import inverse3
 from pkxyz_ctrl.design.law import design_law
 from pkxyz_ctrl.design.margins.tolerances import Tolerances
@@ -65,14 +66,17 @@ def test_what_each_error_lacks_is_what_a_stage_with_that_error_would_need(seed):
     law, memory = fresh()
     row = np.concatenate([MIDDLE + rng.uniform(-4e-6, 4e-6, 3), rng.uniform(-3e-3, 3e-3, 3), rng.uniform(-2, 2, 3)])
     drawn = stage()
-    force, pulls, inverse = needed_n(drawn, row), drawn.pulls(row[:3]), np.empty((3, 3))
+    force, pulls, inverse = needed_n(drawn, row), np.empty((3, 3)), np.empty((3, 3))
+    bent = np.zeros(1, BENT)[0]
+    gradient_and_pulls(law["geometry"], law["elasticity"], row[:3], np.empty(3), pulls, bent)
     inverse3(pulls, inverse)
     adaptation.foresee(
-        law["adaptation"], memory["adaptation"], law["geometry"], law["elasticity"],
-        law["feedback"]["damping_n_s_per_m"], row, inverse, pulls, force,
+        law["adaptation"], memory["adaptation"], law["geometry"], law["feedback"]["damping_n_s_per_m"], row, bent,
+        inverse, pulls, force,
     )  # fmt: skip
-    combs, spread = np.linalg.solve(pulls.T, force), law["adaptation"]["spread"]
-    found = memory["adaptation"]["force_n"][0] / spread
+    assert pulls == pytest.approx(drawn.pulls(row[:3]), rel=1e-12)
+    combs, spread = np.linalg.solve(pulls.T, force), law["adaptation"]["spread"][:P]
+    found = memory["adaptation"]["force_n"][0][:, :P] / spread
 
     def lacks(by=1e-4, **calibration):
         device = Stage(drawn.config.model_copy(update={"calibration": Calibration(**calibration)}))
@@ -100,12 +104,15 @@ def test_without_forgetting_it_is_least_squares_with_what_was_known_beforehand(s
     record["drift"], record["bound"] = 0.0, 1e9
     by, nu = rng.normal(size=(60, P)) * 1e-9, rng.normal(size=60) * 2e-9
     for n in range(60):
-        state["shown"][n % 3] = by[n]
+        state["shown"][n % 3, :P] = by[n]
         adaptation._update(record, state, n % 3, nu[n])
     weight = 1.0 / record["variance_m2"][np.arange(60) % 3]
     information = np.eye(P) + (by * weight[:, None]).T @ by
-    assert state["learnt"] == pytest.approx(-np.linalg.solve(information, by.T @ (weight * nu)), rel=1e-6, abs=1e-9)
-    assert state["covariance"] == pytest.approx(np.linalg.inv(information), rel=1e-6, abs=1e-9)
+    learnt, covariance = state["learnt"][:P], state["covariance"][:, :P]
+    assert learnt == pytest.approx(-np.linalg.solve(information, by.T @ (weight * nu)), rel=1e-6, abs=1e-9)
+    assert covariance == pytest.approx(np.linalg.inv(information), rel=1e-6, abs=1e-9)
+    assert not state["learnt"][P:].any()  # room, and nothing in it
+    assert not state["covariance"][:, P:].any()
 
 
 def test_numbers_stay_within_their_bounds_and_take_the_others_along():
@@ -121,7 +128,7 @@ def test_numbers_stay_within_their_bounds_and_take_the_others_along():
         adaptation._update(record, state, 0, -10e-9 * missing)
     assert state["learnt"][:2] == pytest.approx([1.0, 5.0], abs=0.01)
     assert np.abs(state["learnt"]).max() <= 5.0
-    assert np.linalg.eigvalsh(state["covariance"]).min() > 0.0
+    assert np.linalg.eigvalsh(state["covariance"][:, :P]).min() > 0.0
 
 
 # -- in the loop -------------------------------------------------------------------------------------------------------
