@@ -55,6 +55,23 @@ def thrice(a: np.ndarray, b: np.ndarray) -> float:
     return winding(a) + winding(b) * winding(a)
 
 
+@fresh
+def chains(values: np.ndarray, out: np.ndarray) -> None:
+    """Three times as much as a hundred instructions."""
+    for i in range(3):
+        x = values[i]
+        for _ in range(2):
+            x = math.sqrt(x * x + 1.0) / (0.3 + x) + math.sqrt(0.5 + x) / (1.0 + x * (0.2 + x * (0.7 + x)))
+            x = x * (1.0 + x * (0.25 + x * (0.125 + x * (0.0625 + x)))) - x / (3.0 + x * (2.0 + x * (1.5 + x)))
+        out[i] = x
+
+
+@fresh
+def neighbours(a: np.ndarray, b: np.ndarray, out: np.ndarray) -> None:
+    x, y = a[0] * b[0] + a[2], a[1] * b[1] + a[3]
+    out[0], out[1] = x, y
+
+
 def library(compiled):
     return compiled.overloads[compiled.signatures[0]].library
 
@@ -76,6 +93,24 @@ def test_what_stays_a_function_is_known_to_nobody_else():
     assert "define internal" not in whole
     values = np.array([0.3, 1.7, 0.9, 2.2])
     assert thrice(values, values[1:]) == pytest.approx(thrice.py_func(values, values[1:]), rel=1e-14)
+
+
+def test_a_loop_of_long_rounds_stays_a_loop():
+    """So that what is fetched is one round's code: three chains rolled out have twelve roots."""
+    chains.compile((float64[::1], float64[::1]))
+    assert 1 <= library(chains).get_llvm_str().count("@llvm.sqrt.f64(double %") <= 4
+    values, out = np.array([0.3, 1.7, 0.9]), np.empty(3)
+    chains(values, out)
+    again = np.empty(3)
+    chains.py_func(values, again)
+    assert np.array_equal(out, again)
+
+
+def test_like_operations_on_neighbours_are_one():
+    neighbours.compile((float64[::1], float64[::1], float64[::1]))
+    whole = library(neighbours).get_llvm_str()
+    assert "fmul <2 x double>" in whole
+    assert "<4 x double>" not in whole
 
 
 def test_its_bits_are_those_of_python():
