@@ -28,3 +28,10 @@ def test_the_table_is_of_the_measured_figures():
     assert any(f"{plan.device_s * 1e3:.1f} ms of a core" in row for row in cluster_plan.rows())
     assert any(f"{plan.cores} cores" in cell for row in cluster_plan.rows() for cell in row)
     assert any(f"{plan.sent_bytes * 1e-3:.0f} kB to a worker" in cell for row in cluster_plan.rows() for cell in row)
+
+
+def test_a_million_devices_in_one_run_took_little_more_than_was_calculated():
+    """The plan has the devices alone; the run compiles, draws them, writes files, and at its end one core waits."""
+    over = 2.0 * cluster_plan.million_s() / cluster_plan.planned(1e6, 3600.0).core_s
+    assert 1.0 < over < 1.3
+    assert any("46 minutes: 1.5 core-hours" in cell for row in cluster_plan.rows() for cell in row)
