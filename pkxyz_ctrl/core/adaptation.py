@@ -40,13 +40,12 @@ PARAMETERS = 15
 growth of the pull over ``fringe_m`` of stroke; lift by pull; relative error of the damping; sense delay in s, and by
 how many s^2 the acceleration shows in what is measured. The mass is taken as drawn: only ratios to it are seen.
 """
-ROOM = 16  # of a row of them: whole vectors; the last number says nothing
 CAUSES = 7
 """What may change by itself: each comb, the springs of each chain, the out-of-plane hinges."""
 LEAST_LOSS = 0.1
 """By how much, in variances of the noise, innovations have to be worse with the base before something has changed."""
 _MOST_SPARED = 0.5  # of a comb's pull: one that has become stronger is told as at most twice as strong
-_PARAMETERS, _ROOM, _CAUSES = np.int32(PARAMETERS), np.int32(ROOM), np.int32(CAUSES)  # cheaper to count by, of 32 bits
+_PARAMETERS, _CAUSES = np.int32(PARAMETERS), np.int32(CAUSES)  # a processor of 32 bits counts these for less
 _ROWS = np.int32(5)  # of the covariance at a time: few enough for registers
 _FLOOR_N = 1e-100  # in each force: else what is at rest falls below the normal numbers, and a PC slows down fivefold
 AGES = 3  # intervals that are remembered: two periods of delay, and the one that is decided
@@ -58,8 +57,8 @@ ADAPTATION = np.dtype(
         ("gain", "f8", (3, 3)),  # of each axis: the filter's
         ("sense_delay_s", "f8"),
         ("variance_m2", "f8", (3,)),  # of the innovations, where the model is right
-        ("spread", "f8", (ROOM,)),  # how far devices differ, one standard deviation, in units of the parameter
-        ("bound", "f8", (ROOM,)),  # most that is learnt, in spreads
+        ("spread", "f8", (PARAMETERS,)),  # how far devices differ, one standard deviation, in units of the parameter
+        ("bound", "f8", (PARAMETERS,)),  # most that is learnt, in spreads
         ("start", "f8", (PARAMETERS,)),  # what is known at the beginning, in spreads, and ...
         ("start_covariance", "f8", (PARAMETERS, PARAMETERS)),  # ... how well
         ("doubt", "f8"),  # share of an unexpected innovation's square that counts as noise
@@ -82,22 +81,22 @@ ADAPTATION = np.dtype(
 
 ADAPTATION_STATE = np.dtype(
     [
-        ("learnt", "f8", (ROOM,)),  # theta in spreads
-        ("acting", "f8", (ROOM,)),  # what feed-forward and filter reckon with
-        ("covariance", "f8", (PARAMETERS, ROOM)),  # transposed: symmetric but for rounding
-        ("sensitivity", "f8", (3, 3, ROOM)),  # U: axis, then x, v, d of the prediction
-        ("shown", "f8", (3, ROOM)),  # d nu
-        ("force_n", "f8", (AGES, 3, ROOM)),  # phi of the last intervals, newest first
+        ("learnt", "f8", (PARAMETERS,)),  # theta in spreads
+        ("acting", "f8", (PARAMETERS,)),  # what feed-forward and filter reckon with
+        ("covariance", "f8", (PARAMETERS, PARAMETERS)),  # transposed: symmetric but for rounding
+        ("sensitivity", "f8", (3, 3, PARAMETERS)),  # U: axis, then x, v, d of the prediction
+        ("shown", "f8", (3, PARAMETERS)),  # d nu
+        ("force_n", "f8", (AGES, 3, PARAMETERS)),  # phi of the last intervals, newest first
         ("motion", "f8", (AGES, 9)),  # row of the reference at their beginnings
         ("added_n", "f8", (3,)),  # what the feed-forward of this tick has more
         ("told_n", "f8", (3,)),  # what the filter was told of the last interval that it went through
-        ("base", "f8", (ROOM,)),
+        ("base", "f8", (PARAMETERS,)),
         ("answer", "f8", (CAUSES,)),  # to each cause: mean square of what it shows, over that of the noise, ...
         ("clue", "f8", (CAUSES,)),  # ... and its product with what the base leaves
         ("left_by_base", "f8"),  # mean square innovation with the base, and ...
         ("left", "f8"),  # ... with what is learnt, over that of the noise
         ("change", "f8"),  # relative, of the cause that is warned of
-        ("work", "f8", (ROOM,)),
+        ("work", "f8", (PARAMETERS,)),
         ("updates", "i8"),
         ("begun", "i4"),  # 0: nothing is known yet, not even how little
         ("based", "i4"),  # 1: there is a base
@@ -140,7 +139,7 @@ def learn(
     if near and state["calm"] >= adaptation["calm_ticks"]:
         _update(adaptation, state, axis, innovation_m[axis])
     change, follow = state["work"], adaptation["follow"]
-    for p in range(_ROOM):
+    for p in range(_PARAMETERS):
         change[p] = follow * (state["learnt"][p] - state["acting"][p])
         state["acting"][p] += change[p]
     for i in range(3):
@@ -162,7 +161,7 @@ def _carry(adaptation: np.void, state: np.void, i: int, delay: int, has_measurem
     kx, kv, kd = k[0], k[1], k[2]
     xx, xv, xd, xf = phi[0, 0], phi[0, 1], phi[0, 2], gamma[0]
     vx, vv, vd, vf = phi[1, 0], phi[1, 1], phi[1, 2], gamma[1]
-    for p in range(_ROOM):
+    for p in range(_PARAMETERS):
         x, v, d, f = u[0, p], u[1, p], u[2, p], force[p] + _FLOOR_N
         if has_measurement:
             x, v, d = x + kx * shown[p], v + kv * shown[p], d + kd * shown[p]
@@ -176,7 +175,7 @@ def _show(adaptation: np.void, state: np.void, row: Array) -> None:
     """d nu at this sample, where the reference is at ``row`` (9,)."""
     tau, spread, shown, u = adaptation["sense_delay_s"], adaptation["spread"], state["shown"], state["sensitivity"]
     for i in range(3):
-        for p in range(_ROOM):
+        for p in range(_PARAMETERS):
             shown[i, p] = tau * u[i, 1, p] - u[i, 0, p]
         shown[i, DELAY] += spread[DELAY] * row[3 + i]
         shown[i, BEND] -= spread[BEND] * row[6 + i]
@@ -191,7 +190,7 @@ def _update(adaptation: np.void, state: np.void, axis: int, innovation_m: float)
     b5, b6, b7, b8, b9 = by[5], by[6], by[7], by[8], by[9]
     b10, b11, b12, b13, b14 = by[10], by[11], by[12], by[13], by[14]
     told, missing, since = 0.0, innovation_m, innovation_m
-    for i in range(_ROOM):
+    for i in range(_PARAMETERS):
         total = 0.0 + p[0, i] * b0 + p[1, i] * b1 + p[2, i] * b2 + p[3, i] * b3 + p[4, i] * b4
         total = total + p[5, i] * b5 + p[6, i] * b6 + p[7, i] * b7 + p[8, i] * b8 + p[9, i] * b9
         gain[i] = total + p[10, i] * b10 + p[11, i] * b11 + p[12, i] * b12 + p[13, i] * b13 + p[14, i] * b14
@@ -208,16 +207,15 @@ def _update(adaptation: np.void, state: np.void, axis: int, innovation_m: float)
     scale = 1.0 / (told + noise_m2)
     for k in range(0, _PARAMETERS, _ROWS):
         g0, g1, g2, g3, g4 = gain[k], gain[k + 1], gain[k + 2], gain[k + 3], gain[k + 4]
-        for i in range(_ROOM):
+        for i in range(_PARAMETERS):
             weight = gain[i] * scale
             p[k, i] -= weight * g0
             p[k + 1, i] -= weight * g1
             p[k + 2, i] -= weight * g2
             p[k + 3, i] -= weight * g3
             p[k + 4, i] -= weight * g4
-    for i in range(_ROOM):
-        learnt[i] -= gain[i] * scale * missing
     for i in range(_PARAMETERS):
+        learnt[i] -= gain[i] * scale * missing
         p[i, i] = min(p[i, i] + adaptation["drift"], 1.0)
     _keep_within(adaptation["bound"], p, learnt)
     state["updates"] += 1
@@ -284,7 +282,7 @@ def _compare(adaptation: np.void, state: np.void, by: Array, since: float, missi
 def _keep_within(bound: Array, p: Array, learnt: Array) -> None:
     """Take numbers back to their bounds, and the others along by as much as they depend on them."""
     outside = np.int32(0)
-    for i in range(_ROOM):
+    for i in range(_PARAMETERS):
         outside |= np.int32(0) if abs(learnt[i]) <= bound[i] else np.int32(1)
     if outside == 0:
         return
@@ -319,7 +317,7 @@ def move_on(state: np.void, delay: int) -> None:
         for i in range(9):
             motion[age, i] = motion[age - 1, i]
         for i in range(3):
-            for p in range(_ROOM):
+            for p in range(_PARAMETERS):
                 force[age, i, p] = force[age - 1, i, p]
 
 
@@ -340,7 +338,7 @@ def foresee(
         pull = inverse[0, i] * feedforward_n[0] + inverse[1, i] * feedforward_n[1] + inverse[2, i] * feedforward_n[2]
         _note_chain(adaptation["fringe_m"], geometry, i, bent, pulls[i], pull, newest)
     for i in range(3):
-        for p in range(_ROOM):
+        for p in range(_PARAMETERS):
             newest[i, p] *= adaptation["spread"][p]
 
 
