@@ -11,7 +11,7 @@ local to an object, too, and such a one may have lost arguments that the other s
 A tick is 45 kB of code that runs once, where a processor's first cache holds 32: what it costs is less its number of
 instructions than their length. So loops are rolled out up to a hundred instructions, not LLVM's three hundred, and like
 operations on neighbours become one, in twos: fours would wait for numbers that were just written one by one. With it a
-tick that learns takes a seventh less time; other kernels are no slower.
+tick that learns takes a tenth less time; other kernels are no slower.
 
 numba tells functions of one name and records of one kind apart by counts that start anew in each process. Two kernels
 that different processes had left in the cache could therefore bear one name, and LLVM, which links by name, took one
