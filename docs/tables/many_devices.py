@@ -3,7 +3,7 @@ docs/do/wafer.md.
 
 python docs/tables/many_devices.py FOLDER [SEED ...]
 
-FOLDER, which must not be there yet, takes what they find, some GB; they have the machine to themselves, for some
+FOLDER, which must not be there yet, takes what they find, half a GB; they have the machine to themselves, for some
 minutes and for most of an hour. With seeds the others stay as they are kept. Without a folder nothing happens, so that
 ``make docs`` does not wait.
 """
@@ -48,4 +48,4 @@ if __name__ == "__main__" and len(sys.argv) > 1:
     kept = {draw["seed"]: draw for draw in json.loads(KEPT.read_text(encoding="utf-8"))}
     for asked in map(int, sys.argv[2:] or DEVICES):
         kept[asked] = kept_of(*drawn(asked, place))
-        KEPT.write_text(json.dumps(list(kept.values()), indent=1) + "\n", encoding="utf-8")
+        KEPT.write_text(json.dumps([kept[seed] for seed in sorted(kept)], indent=1) + "\n", encoding="utf-8")

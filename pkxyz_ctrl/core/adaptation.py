@@ -281,7 +281,7 @@ def _compare(adaptation: np.void, state: np.void, by: Array, since: float, missi
 @kernel
 def _keep_within(bound: Array, p: Array, learnt: Array) -> None:
     """Take numbers back to their bounds, and the others along by as much as they depend on them."""
-    outside = np.int32(0)
+    outside = np.int32(0)  # seldom one is, and whether is told without a branch for each
     for i in range(_PARAMETERS):
         outside |= np.int32(0) if abs(learnt[i]) <= bound[i] else np.int32(1)
     if outside == 0:
