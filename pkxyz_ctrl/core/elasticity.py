@@ -89,19 +89,15 @@ def _elevation_change(geometry: np.void, dz: float, delta: float) -> float:
 
 
 @kernel
-def _springs(geometry: np.void, elasticity: np.void, i: int, q: float, s: float, c: float) -> tuple[float, float]:
-    """Force in N along chain i's direction of action that its springs need at stroke ``q``, and across it; ``s`` and
-    ``c`` as ``crank`` says.
+def _springs(
+    geometry: np.void, elasticity: np.void, i: int, q: float, s: float, c: float
+) -> tuple[float, float, float]:
+    """Force in N along chain i's direction of action that its springs need at stroke ``q``, and across it, and the
+    torque in N m of its parallelogram, which is in the latter; ``s`` and ``c`` as ``crank`` says.
     """
     force = elasticity["slider_n_per_m"][i] * q
-    return force, (force * s + _crank_torque(geometry, elasticity, i, s)) / c
-
-
-@kernel
-def _crank_torque(geometry: np.void, elasticity: np.void, i: int, s: float) -> float:
-    """In N m, that chain i's parallelogram needs."""
-    torque: float = elasticity["crank_n_m_per_rad"][i] * arcsine(s / geometry["crank_m"])
-    return torque
+    torque = elasticity["crank_n_m_per_rad"][i] * arcsine(s / geometry["crank_m"])
+    return force, (force * s + torque) / c, torque
 
 
 @kernel
@@ -120,7 +116,7 @@ def energy_gradient(geometry: np.void, elasticity: np.void, position_m: Array, o
     fx = fy = pull = 0.0
     for i in range(3):
         s, c = crank(geometry, i, x, y)
-        force, across = _springs(geometry, elasticity, i, stroke(geometry, i, x, y, s, c, drop), s, c)
+        force, across, _ = _springs(geometry, elasticity, i, stroke(geometry, i, x, y, s, c, drop), s, c)
         fx += force * e[i, 0] + across * n[i, 0]
         fy += force * e[i, 1] + across * n[i, 1]
         pull += force
@@ -149,8 +145,7 @@ def gradient_and_pulls(
         pulls_out[i, 1] = e[i, 1] + n[i, 1] * tangent
         pulls_out[i, 2] = slope + geometry["lift"]
         q = stroke(geometry, i, x, y, s, c, drop)
-        force, torque = elasticity["slider_n_per_m"][i] * q, _crank_torque(geometry, elasticity, i, s)
-        across = (force * s + torque) / c
+        force, across, torque = _springs(geometry, elasticity, i, q, s, c)
         fx += force * e[i, 0] + across * n[i, 0]
         fy += force * e[i, 1] + across * n[i, 1]
         pull += force
@@ -173,7 +168,7 @@ def gradient_and_forces(
     wx = wy = held = fx = fy = pull = gx = gy = other_pull = 0.0
     for i in range(3):
         s, c = crank(geometry, i, x, y)
-        spring, spring_across = _springs(geometry, elasticity, i, stroke(geometry, i, x, y, s, c, drop), s, c)
+        spring, spring_across, _ = _springs(geometry, elasticity, i, stroke(geometry, i, x, y, s, c, drop), s, c)
         across, other_across = comb_force_n[i] * s / c, other_n[i] * s / c
         wx += spring * e[i, 0] + spring_across * n[i, 0]
         wy += spring * e[i, 1] + spring_across * n[i, 1]
