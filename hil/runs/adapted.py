@@ -35,8 +35,9 @@ def save(
     if controller.learn != "online" or learnt["updates"] == 0:
         return None
     spread = spreads(controller, Stage(stage))
-    covariance = 0.5 * (learnt["covariance"] + learnt["covariance"].T) * np.outer(spread, spread)
-    values, errors = learnt["learnt"] * spread, np.sqrt(np.diag(covariance))
+    found, known = learnt["learnt"][: len(spread)], learnt["covariance"][:, : len(spread)]
+    covariance = 0.5 * (known + known.T) * np.outer(spread, spread)
+    values, errors = found * spread, np.sqrt(np.diag(covariance))
     data = {
         "format": _FORMAT,
         "provenance": origin | {"updates": int(learnt["updates"]), "versions": versions()},

@@ -21,8 +21,8 @@ milliseconds, and the filter's prediction moves along by U, as if it had always 
 Beside it stands what was known once, the base. If one cause alone has changed since (a comb, a chain's springs, the
 hinges), one number makes the innovations that the base would leave as small as those that are left: it is a warning.
 
-Where a loop over the parameters shall become vectors, what it needs of another record, or of another row of its own, is
-read before it: a compiler can't know that what it writes does not change that.
+Where a loop over the parameters shall become vectors, what it needs of another record or row is read before it: a
+compiler can't know that what it writes does not change that.
 """
 
 import math
@@ -40,13 +40,14 @@ PARAMETERS = 15
 growth of the pull over ``fringe_m`` of stroke; lift by pull; relative error of the damping; sense delay in s, and by
 how many s^2 the acceleration shows in what is measured. The mass is taken as drawn: only ratios to it are seen.
 """
+ROOM = 16  # of a row of them: whole vectors; the last number says nothing
 CAUSES = 7
 """What may change by itself: each comb, the springs of each chain, the out-of-plane hinges."""
 LEAST_LOSS = 0.1
 """By how much, in variances of the noise, innovations have to be worse with the base before something has changed."""
 _MOST_SPARED = 0.5  # of a comb's pull: one that has become stronger is told as at most twice as strong
-_PARAMETERS, _CAUSES = np.int32(PARAMETERS), np.int32(CAUSES)  # a processor of 32 bits counts these for less
-_ROWS = np.int32(5)  # of the covariance at a time: few enough for registers
+_PARAMETERS, _ROOM, _CAUSES = np.int32(PARAMETERS), np.int32(ROOM), np.int32(CAUSES)  # cheaper to count by, of 32 bits
+_LANES, _ROWS = np.int32(4), np.int32(5)  # of the covariance at a time: few enough for registers
 _FLOOR_N = 1e-100  # in each force: else what is at rest falls below the normal numbers, and a PC slows down fivefold
 AGES = 3  # intervals that are remembered: two periods of delay, and the one that is decided
 
@@ -57,8 +58,8 @@ ADAPTATION = np.dtype(
         ("gain", "f8", (3, 3)),  # of each axis: the filter's
         ("sense_delay_s", "f8"),
         ("variance_m2", "f8", (3,)),  # of the innovations, where the model is right
-        ("spread", "f8", (PARAMETERS,)),  # how far devices differ, one standard deviation, in units of the parameter
-        ("bound", "f8", (PARAMETERS,)),  # most that is learnt, in spreads
+        ("spread", "f8", (ROOM,)),  # how far devices differ, one standard deviation, in units of the parameter
+        ("bound", "f8", (ROOM,)),  # most that is learnt, in spreads
         ("start", "f8", (PARAMETERS,)),  # what is known at the beginning, in spreads, and ...
         ("start_covariance", "f8", (PARAMETERS, PARAMETERS)),  # ... how well
         ("doubt", "f8"),  # share of an unexpected innovation's square that counts as noise
@@ -81,31 +82,50 @@ ADAPTATION = np.dtype(
 
 ADAPTATION_STATE = np.dtype(
     [
-        ("learnt", "f8", (PARAMETERS,)),  # theta in spreads
-        ("acting", "f8", (PARAMETERS,)),  # what feed-forward and filter reckon with
-        ("covariance", "f8", (PARAMETERS, PARAMETERS)),  # transposed: symmetric but for rounding
-        ("sensitivity", "f8", (3, 3, PARAMETERS)),  # U: axis, then x, v, d of the prediction
-        ("shown", "f8", (3, PARAMETERS)),  # d nu
-        ("force_n", "f8", (AGES, 3, PARAMETERS)),  # phi of the last intervals, newest first
+        ("learnt", "f8", (ROOM,)),  # theta in spreads
+        ("acting", "f8", (ROOM,)),  # what feed-forward and filter reckon with
+        ("covariance", "f8", (PARAMETERS, ROOM)),  # transposed: symmetric but for rounding
+        ("sensitivity", "f8", (3, 3, ROOM)),  # U: axis, then x, v, d of the prediction
+        ("shown", "f8", (3, ROOM)),  # d nu
         ("motion", "f8", (AGES, 9)),  # row of the reference at their beginnings
         ("added_n", "f8", (3,)),  # what the feed-forward of this tick has more
         ("told_n", "f8", (3,)),  # what the filter was told of the last interval that it went through
-        ("base", "f8", (PARAMETERS,)),
+        ("base", "f8", (ROOM,)),
         ("answer", "f8", (CAUSES,)),  # to each cause: mean square of what it shows, over that of the noise, ...
         ("clue", "f8", (CAUSES,)),  # ... and its product with what the base leaves
         ("left_by_base", "f8"),  # mean square innovation with the base, and ...
         ("left", "f8"),  # ... with what is learnt, over that of the noise
         ("change", "f8"),  # relative, of the cause that is warned of
-        ("work", "f8", (PARAMETERS,)),
+        ("work", "f8", (ROOM,)),
+        ("lanes", "f8", (4,)),
         ("updates", "i8"),
         ("begun", "i4"),  # 0: nothing is known yet, not even how little
         ("based", "i4"),  # 1: there is a base
         ("axis", "i4"),  # whose turn it is
         ("cause", "i4"),  # 0: no warning; else 1 + a cause
         ("calm", "i4"),  # ticks since something was not as it should be for learning
+        ("force_n", "f8", (AGES, 3, ROOM)),  # phi of the last intervals, newest first
     ],
     align=True,
 )
+"""Last the ages of ``force_n``: a board need not hold those beyond the delay, at which no kernel looks."""
+
+
+@kernel
+def _product(a: Array, b: Array, lanes: Array) -> float:
+    """Scalar product of two rows (ROOM,), in four sums: one after the other a processor would wait for each."""
+    for q in range(_LANES):
+        lanes[q] = a[q] * b[q] + a[4 + q] * b[4 + q] + (a[8 + q] * b[8 + q] + a[12 + q] * b[12 + q])
+    return lanes[0] + lanes[1] + (lanes[2] + lanes[3])
+
+
+@kernel
+def _product_with_change(a: Array, b: Array, since: Array, lanes: Array) -> float:
+    """The same with what ``b`` differs in from ``since``."""
+    for q in range(_LANES):
+        lanes[q] = a[q] * (b[q] - since[q]) + a[4 + q] * (b[4 + q] - since[4 + q])
+        lanes[q] += a[8 + q] * (b[8 + q] - since[8 + q]) + a[12 + q] * (b[12 + q] - since[12 + q])
+    return lanes[0] + lanes[1] + (lanes[2] + lanes[3])
 
 
 @kernel
@@ -139,17 +159,13 @@ def learn(
     if near and state["calm"] >= adaptation["calm_ticks"]:
         _update(adaptation, state, axis, innovation_m[axis])
     change, follow = state["work"], adaptation["follow"]
-    for p in range(_PARAMETERS):
+    for p in range(_ROOM):
         change[p] = follow * (state["learnt"][p] - state["acting"][p])
         state["acting"][p] += change[p]
     for i in range(3):
         _carry(adaptation, state, i, delay, has_measurement)
-        u = state["sensitivity"][i]
         for s in range(3):
-            moved = 0.0
-            for p in range(_PARAMETERS):
-                moved += u[s, p] * change[p]
-            predicted[3 * s + i] += moved
+            predicted[3 * s + i] += _product(state["sensitivity"][i, s], change, state["lanes"])
 
 
 @kernel
@@ -158,13 +174,12 @@ def _carry(adaptation: np.void, state: np.void, i: int, delay: int, has_measurem
     u, shown, k = state["sensitivity"][i], state["shown"][i], adaptation["gain"][i]
     phi, gamma = adaptation["transition"][i], adaptation["input"][i]
     force = state["force_n"][1 if delay == 1 else 2, i]  # so it is known to lie within the array
-    kx, kv, kd = k[0], k[1], k[2]
+    kx, kv, kd = (k[0], k[1], k[2]) if has_measurement else (0.0, 0.0, 0.0)
     xx, xv, xd, xf = phi[0, 0], phi[0, 1], phi[0, 2], gamma[0]
     vx, vv, vd, vf = phi[1, 0], phi[1, 1], phi[1, 2], gamma[1]
-    for p in range(_PARAMETERS):
-        x, v, d, f = u[0, p], u[1, p], u[2, p], force[p] + _FLOOR_N
-        if has_measurement:
-            x, v, d = x + kx * shown[p], v + kv * shown[p], d + kd * shown[p]
+    for p in range(_ROOM):
+        f = force[p] + _FLOOR_N
+        x, v, d = u[0, p] + kx * shown[p], u[1, p] + kv * shown[p], u[2, p] + kd * shown[p]
         u[0, p] = xx * x + xv * v + xd * d - xf * f
         u[1, p] = vx * x + vv * v + vd * d - vf * f
         u[2, p] = d
@@ -175,7 +190,7 @@ def _show(adaptation: np.void, state: np.void, row: Array) -> None:
     """d nu at this sample, where the reference is at ``row`` (9,)."""
     tau, spread, shown, u = adaptation["sense_delay_s"], adaptation["spread"], state["shown"], state["sensitivity"]
     for i in range(3):
-        for p in range(_PARAMETERS):
+        for p in range(_ROOM):
             shown[i, p] = tau * u[i, 1, p] - u[i, 0, p]
         shown[i, DELAY] += spread[DELAY] * row[3 + i]
         shown[i, BEND] -= spread[BEND] * row[6 + i]
@@ -185,41 +200,44 @@ def _show(adaptation: np.void, state: np.void, row: Array) -> None:
 def _update(adaptation: np.void, state: np.void, axis: int, innovation_m: float) -> None:
     """One step of recursive least squares with the innovation of an axis: nu is -d nu times what theta still lacks."""
     p, learnt, acting = state["covariance"], state["learnt"], state["acting"]
-    by, gain, base = state["shown"][axis], state["work"], state["base"]
+    by, gain, base, lanes = state["shown"][axis], state["work"], state["base"], state["lanes"]
     b0, b1, b2, b3, b4 = by[0], by[1], by[2], by[3], by[4]
     b5, b6, b7, b8, b9 = by[5], by[6], by[7], by[8], by[9]
     b10, b11, b12, b13, b14 = by[10], by[11], by[12], by[13], by[14]
-    told, missing, since = 0.0, innovation_m, innovation_m
-    for i in range(_PARAMETERS):
+    for i in range(_ROOM):
         total = 0.0 + p[0, i] * b0 + p[1, i] * b1 + p[2, i] * b2 + p[3, i] * b3 + p[4, i] * b4
         total = total + p[5, i] * b5 + p[6, i] * b6 + p[7, i] * b7 + p[8, i] * b8 + p[9, i] * b9
         gain[i] = total + p[10, i] * b10 + p[11, i] * b11 + p[12, i] * b12 + p[13, i] * b13 + p[14, i] * b14
-    for i in range(_PARAMETERS):
-        told += gain[i] * by[i]
-        missing += by[i] * (learnt[i] - acting[i])
-        since += by[i] * (base[i] - acting[i])
+    told = _product(gain, by, lanes)
     # Not whether the innovation is large: of a device that changes fast only the small ones would be left.
     if not told > adaptation["least"] * adaptation["variance_m2"][axis]:
         return
+    missing = innovation_m + _product_with_change(by, learnt, acting, lanes)
     noise_m2 = adaptation["variance_m2"][axis]
     if state["cause"] == 0:  # what a change explains that has been named is no noise
         noise_m2 += adaptation["doubt"] * missing * missing
     scale = 1.0 / (told + noise_m2)
     for k in range(0, _PARAMETERS, _ROWS):
         g0, g1, g2, g3, g4 = gain[k], gain[k + 1], gain[k + 2], gain[k + 3], gain[k + 4]
-        for i in range(_PARAMETERS):
+        for i in range(_ROOM):
             weight = gain[i] * scale
             p[k, i] -= weight * g0
             p[k + 1, i] -= weight * g1
             p[k + 2, i] -= weight * g2
             p[k + 3, i] -= weight * g3
             p[k + 4, i] -= weight * g4
+    bound, outside = adaptation["bound"], np.int32(0)  # seldom is one, and whether is told without a branch for each
+    for i in range(_ROOM):
+        better = learnt[i] - gain[i] * scale * missing
+        learnt[i] = better
+        outside |= np.int32(0) if abs(better) <= bound[i] else np.int32(1)
     for i in range(_PARAMETERS):
-        learnt[i] -= gain[i] * scale * missing
         p[i, i] = min(p[i, i] + adaptation["drift"], 1.0)
-    _keep_within(adaptation["bound"], p, learnt)
+    if outside != 0:
+        _keep_within(bound, p, learnt)
     state["updates"] += 1
     if state["based"] != 0:
+        since = innovation_m + _product_with_change(by, base, acting, lanes)
         scale = 1.0 / math.sqrt(adaptation["variance_m2"][axis])
         _compare(adaptation, state, by, scale * since, scale * missing, scale)
     elif state["updates"] >= adaptation["base_updates"]:
@@ -241,9 +259,8 @@ def begin(adaptation: np.void, state: np.void) -> None:
 @kernel
 def set_base(state: np.void) -> None:
     """What is known now is what changes are counted from."""
-    state["based"] = 1
-    state["left_by_base"] = state["left"] = 0.0
-    state["cause"], state["change"] = 0, 0.0
+    state["based"], state["cause"] = 1, 0
+    state["left_by_base"] = state["left"] = state["change"] = 0.0
     for i in range(_PARAMETERS):
         state["base"][i] = state["learnt"][i]
     for c in range(_CAUSES):
@@ -281,11 +298,6 @@ def _compare(adaptation: np.void, state: np.void, by: Array, since: float, missi
 @kernel
 def _keep_within(bound: Array, p: Array, learnt: Array) -> None:
     """Take numbers back to their bounds, and the others along by as much as they depend on them."""
-    outside = np.int32(0)  # seldom one is, and whether is told without a branch for each
-    for i in range(_PARAMETERS):
-        outside |= np.int32(0) if abs(learnt[i]) <= bound[i] else np.int32(1)
-    if outside == 0:
-        return
     for i in range(_PARAMETERS):
         beyond = learnt[i] - min(max(learnt[i], -bound[i]), bound[i])
         if beyond != 0.0:
@@ -301,12 +313,8 @@ def tell(state: np.void, age: int) -> None:
     """Write -phi theta (3,) of the interval of the force that was decided ``age`` ticks ago to ``told_n``: what the
     filter has to reckon with there.
     """
-    acting, force, out = state["acting"], state["force_n"][age + 1], state["told_n"]
     for i in range(3):
-        total = 0.0
-        for p in range(_PARAMETERS):
-            total += force[i, p] * acting[p]
-        out[i] = -total
+        state["told_n"][i] = -_product(state["force_n"][age + 1, i], state["acting"], state["lanes"])
 
 
 @kernel
@@ -317,7 +325,7 @@ def move_on(state: np.void, delay: int) -> None:
         for i in range(9):
             motion[age, i] = motion[age - 1, i]
         for i in range(3):
-            for p in range(_PARAMETERS):
+            for p in range(_ROOM):
                 force[age, i, p] = force[age - 1, i, p]
 
 
@@ -338,7 +346,7 @@ def foresee(
         pull = inverse[0, i] * feedforward_n[0] + inverse[1, i] * feedforward_n[1] + inverse[2, i] * feedforward_n[2]
         _note_chain(adaptation["fringe_m"], geometry, i, bent, pulls[i], pull, newest)
     for i in range(3):
-        for p in range(_PARAMETERS):
+        for p in range(_ROOM):
             newest[i, p] *= adaptation["spread"][p]
 
 
@@ -347,14 +355,10 @@ def note(state: np.void, start: Array) -> None:
     """The interval that was foreseen is decided, and begins at the row ``start`` (9,): write phi theta, which the
     feed-forward lacks, to ``added_n``.
     """
-    newest, acting, added = state["force_n"][0], state["acting"], state["added_n"]
     for i in range(9):
         state["motion"][0, i] = start[i]
     for i in range(3):
-        total = 0.0
-        for p in range(_PARAMETERS):
-            total += newest[i, p] * acting[p]
-        added[i] = total
+        state["added_n"][i] = _product(state["force_n"][0, i], state["acting"], state["lanes"])
 
 
 @kernel
@@ -382,17 +386,15 @@ def disturb(state: np.void) -> None:
 
 
 @kernel
-def clear(state: np.void) -> None:
+def clear(state: np.void, delay: int) -> None:
     """The loop is open, or the filter begins anew: forget the motion, keep what was learnt."""
     for i in range(3):
         state["added_n"][i] = state["told_n"][i] = 0.0
-        for p in range(_PARAMETERS):
+        for p in range(_ROOM):
             state["shown"][i, p] = 0.0
             for k in range(3):
                 state["sensitivity"][i, k, p] = 0.0
-            for age in range(AGES):
+            for age in range(delay + 1):
                 state["force_n"][age, i, p] = 0.0
-    for age in range(AGES):
-        for i in range(9):
-            state["motion"][age, i] = 0.0
+    state["motion"][:] = 0.0
     state["calm"] = 0

@@ -272,7 +272,7 @@ def release(law: np.void, memory: np.void) -> None:
     if law["youla"]["taps"] > 0:
         youla.clear(memory["youla"])
     if law["adaptation"]["on"] != 0:
-        adaptation.clear(memory["adaptation"])
+        adaptation.clear(memory["adaptation"], law["delay_periods"])
     set_point_model.set_out(law["estimator"], memory["set_point_model"], memory["scratch"]["nothing"])
 
 
@@ -299,7 +299,7 @@ def set_position(law: np.void, memory: np.void, position_m: Array) -> None:
     for i in range(3):
         memory["estimate"]["innovation_m"][i] = 0.0
     if law["adaptation"]["on"] != 0:
-        adaptation.clear(memory["adaptation"])
+        adaptation.clear(memory["adaptation"], law["delay_periods"])
 
 
 @kernel

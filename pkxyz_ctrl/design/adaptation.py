@@ -26,11 +26,12 @@ def fill_adaptation(tick: Any, stage: Stage, controller: ControllerConfig, bus: 
         record["transition"][axis], record["input"][axis] = phi[keep, keep], gamma[keep, axis]
         record["gain"][axis], record["variance_m2"][axis] = filter_["gain"][keep, axis], variance_m2[axis, axis]
     record["sense_delay_s"] = filter_["sense_delay_s"]
-    record["spread"] = spreads(controller, stage)
+    spread = spreads(controller, stage)
+    record["spread"][: learning.PARAMETERS] = spread
     most = np.full(learning.PARAMETERS, config.most_relative)
     most[learning.DAMPING], most[learning.DELAY] = config.most_damping, config.most_delay_s
-    most[learning.BEND] = 4.0 * record["spread"][learning.BEND]
-    record["bound"], record["doubt"] = most / record["spread"], config.doubt
+    most[learning.BEND] = 4.0 * spread[learning.BEND]
+    record["bound"][: learning.PARAMETERS], record["doubt"] = most / spread, config.doubt
     record["drift"] = config.drift_per_rts**2 * bus.period_s
     record["follow"] = min(1.0, bus.period_s / config.follow_s)
     record["least"] = config.least_told
@@ -43,7 +44,7 @@ def fill_adaptation(tick: Any, stage: Stage, controller: ControllerConfig, bus: 
     record["warn"], record["alone"] = config.warn_relative, config.alone
     record["forget"] = min(1.0, bus.period_s / config.forget_s)
     start = config.start
-    record["start"] = 0.0 if start is None else np.array(start.values) / record["spread"]
-    record["start_covariance"] = np.eye(learning.PARAMETERS) if start is None else within(start, record["spread"])
+    record["start"] = 0.0 if start is None else np.array(start.values) / spread
+    record["start_covariance"] = np.eye(learning.PARAMETERS) if start is None else within(start, spread)
     record["known"] = start is not None
     record["on"] = controller.learn == "online"

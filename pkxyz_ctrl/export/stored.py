@@ -6,6 +6,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from pkxyz_ctrl.core import tick
+from pkxyz_ctrl.core.adaptation import ADAPTATION_STATE, AGES
 from pkxyz_ctrl.core.demand import LINEAR, PREDICTIVE
 from pkxyz_ctrl.core.linear_law import LINEAR_LAW
 from pkxyz_ctrl.core.youla import YOULA_STATE
@@ -39,7 +40,9 @@ def stored(law: Records) -> Stored:
         return _stored_planned(int(numbers["predictive"]["horizon"]))
     last = _at(cycling.MEMORY, "tick")
     if numbers["adaptation"]["on"] != 0:
-        memory = cycling.MEMORY.itemsize
+        ages = int(numbers["delay_periods"]) + 1
+        age_bytes = ADAPTATION_STATE["force_n"].itemsize // AGES
+        memory = last + _at(tick.MEMORY, "adaptation") + _at(ADAPTATION_STATE, "force_n") + ages * age_bytes
     elif numbers["youla"]["taps"] > 0:
         memory = last + _at(tick.MEMORY, "adaptation")
     else:

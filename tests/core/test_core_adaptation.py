@@ -75,8 +75,8 @@ def test_what_each_error_lacks_is_what_a_stage_with_that_error_would_need(seed):
         inverse, pulls, force,
     )  # fmt: skip
     assert pulls == pytest.approx(drawn.pulls(row[:3]), rel=1e-12)
-    combs, spread = np.linalg.solve(pulls.T, force), law["adaptation"]["spread"]
-    found = memory["adaptation"]["force_n"][0] / spread
+    combs, spread = np.linalg.solve(pulls.T, force), law["adaptation"]["spread"][:P]
+    found = memory["adaptation"]["force_n"][0][:, :P] / spread
 
     def lacks(by=1e-4, **calibration):
         device = Stage(drawn.config.model_copy(update={"calibration": Calibration(**calibration)}))
@@ -104,12 +104,15 @@ def test_without_forgetting_it_is_least_squares_with_what_was_known_beforehand(s
     record["drift"], record["bound"] = 0.0, 1e9
     by, nu = rng.normal(size=(60, P)) * 1e-9, rng.normal(size=60) * 2e-9
     for n in range(60):
-        state["shown"][n % 3] = by[n]
+        state["shown"][n % 3, :P] = by[n]
         adaptation._update(record, state, n % 3, nu[n])
     weight = 1.0 / record["variance_m2"][np.arange(60) % 3]
     information = np.eye(P) + (by * weight[:, None]).T @ by
-    assert state["learnt"] == pytest.approx(-np.linalg.solve(information, by.T @ (weight * nu)), rel=1e-6, abs=1e-9)
-    assert state["covariance"] == pytest.approx(np.linalg.inv(information), rel=1e-6, abs=1e-9)
+    learnt, covariance = state["learnt"][:P], state["covariance"][:, :P]
+    assert learnt == pytest.approx(-np.linalg.solve(information, by.T @ (weight * nu)), rel=1e-6, abs=1e-9)
+    assert covariance == pytest.approx(np.linalg.inv(information), rel=1e-6, abs=1e-9)
+    assert not state["learnt"][P:].any()  # room, and nothing in it
+    assert not state["covariance"][:, P:].any()
 
 
 def test_numbers_stay_within_their_bounds_and_take_the_others_along():
@@ -125,7 +128,7 @@ def test_numbers_stay_within_their_bounds_and_take_the_others_along():
         adaptation._update(record, state, 0, -10e-9 * missing)
     assert state["learnt"][:2] == pytest.approx([1.0, 5.0], abs=0.01)
     assert np.abs(state["learnt"]).max() <= 5.0
-    assert np.linalg.eigvalsh(state["covariance"]).min() > 0.0
+    assert np.linalg.eigvalsh(state["covariance"][:, :P]).min() > 0.0
 
 
 # -- in the loop -------------------------------------------------------------------------------------------------------

@@ -127,7 +127,7 @@ def test_what_was_learnt_moves_the_prediction_as_if_the_filter_had_always_known(
     for each in (player, knowing):
         each.go_on(1250, "at once")
     before = player.expected - knowing.expected
-    player.memory["tick"]["adaptation"]["learnt"] = theta
+    player.memory["tick"]["adaptation"]["learnt"][0, : len(theta)] = theta
     for each in (player, knowing):
         each.go_on(1, "at once")
     after = player.expected - knowing.expected
