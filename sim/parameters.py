@@ -6,17 +6,18 @@ import numpy as np
 
 from sim.config import Device, PlantConfig
 from sim.motion import layout
+from sim.motion.at_rest import linearise, settle
 from sim.motion.geometry import strokes
 from sim.motion.integrator import LONGEST_S
 from sim.motion.kernel import kernel
 from sim.motion.layout import PARAMS, STATE
-from sim.motion.mechanics import acceleration, stiffness
+from sim.motion.mechanics import stiffness
 from sim.motion.parasitic import rest
 from sim.motion.streams import start_streams
 from sim.structure.build import build_flexible_modes, build_general_response, build_misalignment, build_tilt
 from sim.structure.pose import combs_seen
 from sim.structure.side import balance
-from sim.surroundings.build import build_surroundings, start_surroundings
+from sim.surroundings.build import build_surroundings, seed_offsets, start_surroundings
 from sim.surroundings.slow import grow_old
 
 EPSILON_0_F_PER_M = 8.8541878128e-12  # CODATA 2018
@@ -37,13 +38,11 @@ def build_parameters(
     params = np.zeros(1, PARAMS)
     p = params[0]
     _mechanism(p, config, device)
-    stiff = rest_stiffness(p, np.zeros(3))
-    _damping(p, config, device, stiff)
     _drive_combs(p, config, device)
     _amplifier(p, config, drive_v_per_count)
-    _transient_response(p, stiff)
+    quality, stiff = config.damping.quality_factor or device.dynamics.quality_factor, np.empty((3, 3))
+    linearise(params, quality if config.damping.on else 0.0, stiff)
     step_s = period_us * 1e-6
-    p["stiff_per_s2"] = stiff / p["mass_kg"]
     p["regular_s"] = step_s / math.ceil(step_s / LONGEST_S)
     _modes_and_forces(p, config, stiff)
     _sense_chain(p, config, device, period_us, sense_f_per_count, sense_zero_f)
@@ -79,14 +78,15 @@ def _mechanism(p: np.void, config: PlantConfig, device: Device) -> None:
     link = f.youngs_modulus_pa * f.link_hinge_width_m * f.link_hinge_thickness_m**3 / 12 / f.link_hinge_length_m
     mismatch = config.stiffness_mismatch
     leaf_error, crank_error, link_error = (
-        np.array(e) if mismatch.on else np.zeros(3) for e in (mismatch.leaf, mismatch.crank_hinge, mismatch.link_hinge)
+        error if mismatch.on else (0.0, 0.0, 0.0)
+        for error in (mismatch.leaf, mismatch.crank_hinge, mismatch.link_hinge)
     )
-    p["leaf_n_per_m"] = 4 * leaf * (1 + leaf_error)
-    p["crank_hinge_nm"] = 4 * crank * (1 + crank_error)
-    p["link_hinge_nm"] = 4 * f.out_of_plane_chains * link * (1 + np.mean(link_error))
-    p["mass_kg"] = device.dynamics.mass_kg * (1 + (config.mass_error.relative if config.mass_error.on else 0.0))
-    p["per_kg"], p["per_crank"], p["per_link2"] = 1 / p["mass_kg"], 1 / p["crank_m"], 1 / p["link_m"] ** 2
-    p["weight_n"] = _weight(config, float(p["mass_kg"]))
+    p["leaf_n_per_m"] = [4 * leaf * (1 + error) for error in leaf_error]
+    p["crank_hinge_nm"] = [4 * crank * (1 + error) for error in crank_error]
+    p["link_hinge_nm"] = 4 * f.out_of_plane_chains * link * (1 + sum(link_error) / 3)
+    mass_kg = device.dynamics.mass_kg * (1 + (config.mass_error.relative if config.mass_error.on else 0.0))
+    p["mass_kg"], p["per_kg"], p["weight_n"] = mass_kg, 1 / mass_kg, _weight(config, mass_kg)
+    p["per_crank"], p["per_link2"] = 1 / device.geometry.crank_length_m, 1 / p["link_m"] ** 2
     stops = config.stops
     far_m = 1.0  # no stop
     p["stop_low_m"] = device.limits.stroke_min_m - stops.clearance_m if stops.on else -far_m
@@ -101,16 +101,6 @@ def rest_stiffness(p: np.void, position_m: np.ndarray) -> np.ndarray:
 
 def _symmetric(xx: float, xy: float, xz: float, yy: float, yz: float, zz: float) -> np.ndarray:
     return np.array([[xx, xy, xz], [xy, yy, yz], [xz, yz, zz]])
-
-
-def _damping(p: np.void, config: PlantConfig, device: Device, rest_n_per_m: np.ndarray) -> None:
-    """Modal damping D = C / m: every mode of the rest pose gets w / Q."""
-    if not config.damping.on:
-        return
-    quality = config.damping.quality_factor or device.dynamics.quality_factor
-    w2, modes = np.linalg.eigh(rest_n_per_m / p["mass_kg"])
-    p["damping_per_s"] = (modes * np.sqrt(w2) / quality) @ modes.T
-    p["damping2_per_s2"] = 0.25 * p["damping_per_s"] @ p["damping_per_s"]
 
 
 def _weight(config: PlantConfig, mass_kg: float) -> np.ndarray:
@@ -167,21 +157,6 @@ def _amplifier(p: np.void, config: PlantConfig, v_per_count: float) -> None:
     p["volt_per_count"] = v_per_count * (1 + np.array(config.amplifier_gain.relative) * config.amplifier_gain.on)
     p["amplifier_offset_v"] = np.array(config.amplifier_offset.offset_v) * config.amplifier_offset.on
     p["dac_step"] = config.dac.step_counts if config.dac.on else 1
-
-
-def _transient_response(p: np.void, rest_n_per_m: np.ndarray) -> None:
-    """R, where xi = R A exp(-k t) solves xi'' + D xi' + K xi / m = A exp(-k t) to leading orders in 1 / k, and what R A
-    stands before in -(xi'' + D xi'); for k = 1 / tau and twice that. K is that of the rest pose: of R, a part in 2000
-    hangs on it.
-    """
-    unit, d = np.eye(3), p["damping_per_s"]
-    stiff = rest_n_per_m / p["mass_kg"]
-    for n in (1, 2):
-        tau = p["amplifier_s"] / n
-        response = tau**2 * (unit + tau * d - tau**2 * stiff)
-        p[f"response_{n}_s2"] = response
-        if tau > 0.0:
-            p[f"response_{n}"] = (d / tau - unit / tau**2) @ response
 
 
 def _modes_and_forces(p: np.void, config: PlantConfig, rest_n_per_m: np.ndarray) -> None:
@@ -252,9 +227,10 @@ def state_at_rest(params: np.ndarray, config: PlantConfig, seed: int) -> np.ndar
         layout.DRIFT_STREAM: config.drift.seed_offset,
         **{layout.SENSE_STREAM + i: config.sense_noise.seed_offset for i in range(3)},
         **{layout.SENSE_DRIFT_STREAM + i: config.sense_drift.seed_offset for i in range(3)},
+        **seed_offsets(config),
     }
     start_streams(s["random"], seed, offsets)
-    start_surroundings(p, s, config, seed)
+    start_surroundings(p, s, config)
     return state
 
 
@@ -279,26 +255,12 @@ def _see(params: np.ndarray, state: np.ndarray) -> None:
     combs_seen(params[0], s, s["filtered_m"], s["rates_m_per_s"])
 
 
-@kernel
-def _push(
-    params: np.ndarray, state: np.ndarray, volt2: np.ndarray, x: np.ndarray, force_n: np.ndarray, hessian: np.ndarray
-) -> None:
-    """Force (3,), N, on the table at rest at ``x``, and the Hessian (6,) of its springs as ``stiffness`` has it."""
-    p = params[0]
-    ax, ay, az = acceleration(p, state[0], volt2, x[0], x[1], x[2], 0.0, 0.0, 0.0)
-    force_n[0], force_n[1], force_n[2] = p["mass_kg"] * ax, p["mass_kg"] * ay, p["mass_kg"] * az
-    hessian[0], hessian[1], hessian[2], hessian[3], hessian[4], hessian[5] = stiffness(p, x[0], x[1], x[2])
-
-
 def equilibrium(params: np.ndarray, state: np.ndarray, volt2: np.ndarray) -> np.ndarray:
     """Position (3,), m, where elastic, comb and constant forces balance, by Newton's method from rest.
 
     Raises ArithmeticError if it does not settle, which needs forces far beyond the stage's own."""
-    x, force, hessian = np.zeros(3), np.empty(3), np.empty(6)
-    for _ in range(50):
-        _push(params, state, volt2, x, force, hessian)
-        change = np.linalg.solve(_symmetric(*hessian), force)
-        x = x + change
-        if np.abs(change).max() < 1e-18:
-            return x
-    raise ArithmeticError(f"no static equilibrium near rest: the table still moves by {np.abs(change).max():.1e} m")
+    x = np.zeros(3)
+    moves_m = settle(params, state, volt2, x, np.empty(3), np.empty((3, 3)))
+    if not moves_m < 1e-18:
+        raise ArithmeticError(f"no static equilibrium near rest: the table still moves by {moves_m:.1e} m")
+    return x

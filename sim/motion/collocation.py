@@ -140,45 +140,46 @@ def _at_start(p: np.void, s: np.void) -> tuple[float, float, float, float]:
 def first_round(p: np.void, s: np.void, n: Three) -> None:
     """Write n at the instants, where the ``n`` of the start leads; and what is known of them beforehand: squared
     voltages, what the transient adds, and where the stage swings by itself."""
-    m, stiff, charge = constants(p, s), _stiff(p), s["charge_v"]
-    one, two, x = _three(s["fast_1_m"]), _three(s["fast_2_m"]), _three(s["smooth"])
+    charge, one, two, x = s["charge_v"], _three(s["fast_1_m"]), _three(s["fast_2_m"]), _three(s["smooth"])
     one_push, two_push, v = _three(s["fast_1_m_per_s2"]), _three(s["fast_2_m_per_s2"]), _three(s["smooth"][3:])
     bx, by, bz = s["base_v"][0] - charge[0], s["base_v"][1] - charge[1], s["base_v"][2] - charge[2]
     ex, ey, ez = _three(s["error_v"])
-    from_pose, from_rate, steady, decay, near = (
-        s["from_pose"],
-        s["from_rate"],
-        s["steady"],
-        s["instant_decay"],
-        s["near"],
-    )
-    volt2, fast, push, free, left = s["instant_volt2"], s["fast_m"], s["fast_m_per_s2"], s["free_m"], s["left_m_per_s2"]
+    from_pose, from_rate, steady, decay = s["from_pose"], s["from_rate"], s["steady"], s["instant_decay"]
+    volt2, fast, push, free, pose = s["instant_volt2"], s["fast_m"], s["fast_m_per_s2"], s["free_m"], s["pose_m"]
+    near = s["near"]
     for j in range(INSTANTS):
         e1 = decay[j]
         wx, wy, wz = bx + ex * e1, by + ey * e1, bz + ez * e1
-        square = wx * wx, wy * wy, wz * wz
         swung = _added(_led(from_pose, j, x), _led(from_rate, j, v))
-        shift, shove = _decayed(one, two, e1), _decayed(one_push, two_push, e1)
-        left[0, j], left[1, j], left[2, j], near[j] = _left(
-            m, stiff, square, _added(swung, _led(steady, j, n)), shift, shove
-        )
-        volt2[0, j], volt2[1, j], volt2[2, j] = square
-        fast[0, j], fast[1, j], fast[2, j] = shift
-        push[0, j], push[1, j], push[2, j] = shove
+        volt2[0, j], volt2[1, j], volt2[2, j] = wx * wx, wy * wy, wz * wz
+        fast[0, j], fast[1, j], fast[2, j] = _decayed(one, two, e1)
+        push[0, j], push[1, j], push[2, j] = _decayed(one_push, two_push, e1)
         free[0, j], free[1, j], free[2, j] = swung
+        pose[0, j], pose[1, j], pose[2, j] = _added(swung, _led(steady, j, n))
+        near[j] = 1.0
+    _look(p, s)
 
 
 @kernel
 def second_round(p: np.void, s: np.void) -> None:
     """Write n at the instants, where that at the nodes leads."""
-    m, stiff, answer, near = constants(p, s), _stiff(p), s["answer"], s["near"]
-    volt2, fast, push, free, left = s["instant_volt2"], s["fast_m"], s["fast_m_per_s2"], s["free_m"], s["left_m_per_s2"]
+    answer, free, left, pose = s["answer"], s["free_m"], s["left_m_per_s2"], s["pose_m"]
     one, two, three, four = _three_at(left, 0), _three_at(left, 1), _three_at(left, 2), _three_at(left, 3)
     for j in range(INSTANTS):
         led = _added(_led(answer[0], j, one), _led(answer[1], j, two))
         led = _added(led, _added(_led(answer[2], j, three), _led(answer[3], j, four)))
+        pose[0, j], pose[1, j], pose[2, j] = _added(_three_at(free, j), led)
+    _look(p, s)
+
+
+@kernel
+def _look(p: np.void, s: np.void) -> None:
+    """Write n at the instants from the poses there, and where one is not near, 0 to its ``near``."""
+    m, stiff, near, pose, left = constants(p, s), _stiff(p), s["near"], s["pose_m"], s["left_m_per_s2"]
+    volt2, fast, push = s["instant_volt2"], s["fast_m"], s["fast_m_per_s2"]
+    for j in range(INSTANTS):
         ax, ay, az, near_there = _left(
-            m, stiff, _three_at(volt2, j), _added(_three_at(free, j), led), _three_at(fast, j), _three_at(push, j)
+            m, stiff, _three_at(volt2, j), _three_at(pose, j), _three_at(fast, j), _three_at(push, j)
         )
         left[0, j], left[1, j], left[2, j] = ax, ay, az
         near[j] *= near_there
@@ -187,15 +188,15 @@ def second_round(p: np.void, s: np.void) -> None:
 @kernel
 def _end(p: np.void, s: np.void) -> None:
     """Take over where the step leads."""
-    motion, table, answer, left = s["motion"], s["end_rate"], s["answer"], s["left_m_per_s2"]
+    motion, table, left, parts, to_end = s["motion"], s["end_rate"], s["left_m_per_s2"], s["ended"], s["to_end"]
+    for j in range(INSTANTS):
+        n = _three_at(left, j)
+        parts[0, j], parts[1, j], parts[2, j] = _led(to_end, j, n)
+        parts[3, j], parts[4, j], parts[5, j] = _led(to_end[6:], j, n)
     x, v = _three(s["smooth"]), _three(s["smooth"][3:])
-    pose = _added(_three_at(s["free_m"], _END), _led(answer[0], _END, _three_at(left, 0)))
     rate = _added(_times(_three(table[0]), _three(table[0, 3:]), x), _times(_three(table[1]), _three(table[1, 3:]), v))
-    rate = _added(rate, _times(_three(table[2]), _three(table[2, 3:]), _three_at(left, 0)))
-    for node in range(1, INSTANTS):
-        n, row = _three_at(left, node), table[2 + node]
-        pose = _added(pose, _led(answer[node], _END, n))
-        rate = _added(rate, _times(_three(row), _three(row[3:]), n))
+    rate = _added(rate, (_sum(parts[3]), _sum(parts[4]), _sum(parts[5])))
+    pose = _added(_three_at(s["free_m"], _END), (_sum(parts[0]), _sum(parts[1]), _sum(parts[2])))
     kx, ky, kz = _times(*_stiff(p), pose)
     known, push = s["ended_m_per_s2"], _three_at(s["fast_m_per_s2"], _END)
     known[0], known[1] = left[0, _END] - (push[0] + kx), left[1, _END] - (push[1] + ky)
@@ -208,3 +209,9 @@ def _end(p: np.void, s: np.void) -> None:
         motion[3 + i] -= k * (one[i] * e1 + 2.0 * (two[i] * e2))
         s["ended_m"][i] = motion[i]
     pass_time(s, p["regular_s"], e1)
+
+
+@inlined
+def _sum(a: np.ndarray) -> float:
+    """Of what each node adds."""
+    return float((a[0] + a[1]) + (a[2] + a[3]))

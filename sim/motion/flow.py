@@ -47,6 +47,7 @@ def tabulate_flow(p: np.void, s: np.void) -> None:
         for entry in range(6):
             for j in range(INSTANTS):
                 steady[entry, j] += answer[k, entry, j]
+            s["to_end"][entry, k], s["to_end"][6 + entry, k] = answer[k, entry, INSTANTS - 1], end[2 + k, entry]
 
 
 @kernel

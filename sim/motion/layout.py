@@ -130,9 +130,10 @@ STATE = np.dtype(
         ("flow_h_s", "f8"), ("instant_decay", "f8", INSTANTS), ("solved", "f8", (6, INSTANTS)),
         ("from_pose", "f8", (6, INSTANTS)), ("from_rate", "f8", (6, INSTANTS)), ("steady", "f8", (6, INSTANTS)),
         ("answer", "f8", (INSTANTS, 6, INSTANTS)), ("end_rate", "f8", (2 + INSTANTS, 6)),
-        ("smooth", "f8", 6), ("free_m", "f8", (3, INSTANTS)), ("instant_volt2", "f8", (3, INSTANTS)),
+        ("to_end", "f8", (12, INSTANTS)), ("smooth", "f8", 6), ("free_m", "f8", (3, INSTANTS)),
+        ("instant_volt2", "f8", (3, INSTANTS)),
         ("fast_m", "f8", (3, INSTANTS)), ("fast_m_per_s2", "f8", (3, INSTANTS)), ("left_m_per_s2", "f8", (3, INSTANTS)),
-        ("near", "f8", INSTANTS),
+        ("near", "f8", INSTANTS), ("pose_m", "f8", (3, INSTANTS)), ("ended", "f8", (6, INSTANTS)),
         ("ended_m", "f8", 3), ("ended_m_per_s2", "f8", 3),  # pose and acceleration where the last one ended
         # ... of any other
         ("tabulated_h_s", "f8"), ("decay", "f8", STAGES), ("shrink", "f8", (STAGES, 3, 3)), ("swell", "f8", (STAGES, 3,

@@ -9,7 +9,6 @@ from sim.config.surroundings import Flicker, FloorVibration, Mains
 from sim.motion import layout
 from sim.motion.layout import FLICKERS
 from sim.motion.noise import next_u64, normal
-from sim.motion.streams import start_streams
 from sim.surroundings.tones import sum_tones
 
 TONES_A_BAND = 3
@@ -31,11 +30,13 @@ def build_surroundings(p: np.void, config: PlantConfig) -> None:
         p["tone_count"] = k + 1
     noise, flicker = config.amplifier_noise, config.sense_flicker
     p["amplifier_noise_on"], p["sense_flicker_on"] = noise.on, flicker.on
-    p["amplifier_v_per_rt_hz"] = noise.density_v_per_rt_hz
-    p["amplifier_flicker_per_s"], size = _relaxations(noise)
-    p["amplifier_flicker_v"] = noise.density_v_per_rt_hz * size
-    p["sense_flicker_per_s"], size = _relaxations(flicker)
-    p["sense_flicker_f"] = flicker.density_f_per_rt_hz * size
+    if noise.on:
+        p["amplifier_v_per_rt_hz"] = noise.density_v_per_rt_hz
+        p["amplifier_flicker_per_s"], size = _relaxations(noise)
+        p["amplifier_flicker_v"] = noise.density_v_per_rt_hz * size
+    if flicker.on:
+        p["sense_flicker_per_s"], size = _relaxations(flicker)
+        p["sense_flicker_f"] = flicker.density_f_per_rt_hz * size
     _slow(p, config)
 
 
@@ -88,6 +89,8 @@ def _mains(mains: Mains) -> list[tuple[float, float, float, float]]:
 def _slow(p: np.void, config: PlantConfig) -> None:
     warm, old = config.temperature, config.ageing
     p["slow_on"] = warm.on or old.on
+    if not p["slow_on"]:
+        return
     p["warm_k"], p["warming_k"], p["swing_k"] = np.array([warm.offset_k, warm.settling_k, warm.swing_k]) * warm.on
     p["warming_s"], p["swing_rad_per_s"] = warm.settling_s, 2 * math.pi / warm.swing_period_s
     p["stiffness_per_k"], p["comb_per_k"] = warm.stiffness_per_k, warm.comb_gain_per_k
@@ -98,9 +101,9 @@ def _slow(p: np.void, config: PlantConfig) -> None:
         p[f"drawn_{name}"] = p[name]
 
 
-def start_surroundings(p: np.void, s: np.void, config: PlantConfig, seed: int) -> None:
-    """Seed the surroundings' streams and draw where lines, 1/f noise and the filtered noise of the chain stand."""
-    offsets = {
+def seed_offsets(config: PlantConfig) -> dict[int, int]:
+    """Of the surroundings' streams."""
+    return {
         layout.BASE_STREAM: config.base_noise.seed_offset,
         layout.AMPLIFIER_STREAM: config.amplifier_noise.seed_offset,
         layout.AMPLIFIER_FLICKER_STREAM: config.amplifier_noise.seed_offset,
@@ -108,7 +111,10 @@ def start_surroundings(p: np.void, s: np.void, config: PlantConfig, seed: int) -
         layout.FLOOR_STREAM: config.floor_vibration.seed_offset,
         layout.MAINS_STREAM: config.mains.seed_offset,
     }
-    start_streams(s["random"], seed, offsets)
+
+
+def start_surroundings(p: np.void, s: np.void, config: PlantConfig) -> None:
+    """Draw where lines, 1/f noise and the filtered noise of the chain stand, when the streams have started."""
     lines, tones = len(_mains(config.mains)), int(p["tone_count"])
     for k in range(tones):
         source = layout.MAINS_STREAM if k >= tones - lines else layout.FLOOR_STREAM
