@@ -87,7 +87,7 @@ class Blocks:
         learner: Learner | None = None,
     ) -> None:
         self.ticks = ticks
-        self.rows = np.zeros(BLOCK_TICKS, ROW)
+        self.rows = np.empty(BLOCK_TICKS, ROW)
         self.done = 0
         self._handout = Handout(trajectory, period_us, excitation, learner)
         self._on_block = on_block

@@ -37,6 +37,16 @@ def runner_of(law: Records, outputs: Records | None = None) -> RunBlock:
 
 
 @kernel
+def meet(
+    plant_params: Records, plant_state: Records, due: NDArray[np.int32], row: np.void, sense_count: NDArray[np.int32]
+) -> None:
+    """The plant at a sample: the truth into ``row``, drive counts ``due`` (3,) to the combs, sense counts (3,) out."""
+    observe(plant_params[0], plant_state[0], row)
+    kernels.drive(plant_params, plant_state, due)
+    kernels.sample(plant_params, plant_state, sense_count)
+
+
+@kernel
 def exchange(
     plant_params: Records,
     plant_state: Records,
@@ -45,11 +55,9 @@ def exchange(
     row: np.void,
     sense_count: NDArray[np.int32],
 ) -> None:
-    """The plant at a sample: the truth into ``row``, drive counts ``due`` (3,) to the combs, sense counts (3,) out."""
+    """The plant on to the next sample, and what is exchanged with it there."""
     kernels.advance(plant_params, plant_state, sample_us - plant_state[0]["t_us"])
-    observe(plant_params[0], plant_state[0], row)
-    kernels.drive(plant_params, plant_state, due)
-    kernels.sample(plant_params, plant_state, sense_count)
+    meet(plant_params, plant_state, due, row, sense_count)
 
 
 @kernel
@@ -67,14 +75,19 @@ def run_block(
 
     ``sample_us`` (count,) int64: plant time of each sample. At a sample the drive counts of the last tick are
     applied, as the amplifier does on SYNC, or with two periods of delay those of the tick before it; the truth is
-    taken just before them.
+    taken just before them. A row is copied when the plant has moved on: what has just been written in numbers a
+    processor can't read in vectors until it stands in the cache.
     """
     seen, row = memory[0]["input"], memory[0]["row"]
     due = memory[0]["tick"]["count"][law[0]["tick"]["delay_periods"] - 1]
     for i in range(count):
-        exchange(plant_params, plant_state, sample_us[i], due, row, seen["sense_count"])
+        kernels.advance(plant_params, plant_state, sample_us[i] - plant_state[0]["t_us"])
+        if i > 0:
+            rows[i - 1] = row
+        meet(plant_params, plant_state, due, row, seen["sense_count"])
         cycle(law, memory, reference)
-        rows[i] = row
+    if count > 0:
+        rows[count - 1] = row
 
 
 @kernel

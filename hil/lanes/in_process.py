@@ -25,6 +25,8 @@ from sim.plant import Plant
 
 Instants = NDArray[np.int64]
 
+_FAULT = int(Mode.FAULT)
+
 
 @dataclass(frozen=True)
 class LaneResult:
@@ -92,11 +94,12 @@ def _run_fast(setup: Setup, run_block: RunBlock, memory: NDArray[np.void], plant
         reference = blocks.reference(memory)
         at_us = instants_us(setup, blocks.done, count)
         run_block(law, memory, reference, plant.params, plant.state, at_us, blocks.rows, count)
-        if (blocks.rows["mode"][:count] == Mode.FAULT).any():
-            modes = np.r_[mode, blocks.rows["mode"][:count]]
-            entered = np.flatnonzero((modes[1:] == Mode.FAULT) & (modes[:-1] != Mode.FAULT))
+        modes = blocks.rows["mode"][:count]
+        if (modes == _FAULT).any():
+            is_fault = np.r_[mode, modes] == _FAULT
+            entered = np.flatnonzero(is_fault[1:] & ~is_fault[:-1])
             faults += [f"at {row['t_us'] * 1e-6:.4f} s: {explain(int(row['trips']))}" for row in blocks.rows[entered]]
-        mode = int(blocks.rows["mode"][count - 1])
+        mode = int(modes[-1])
         blocks.hand_on(count)
     return faults
 
