@@ -30,7 +30,7 @@ from numba.core.codegen import CPUCodeLibrary
 _optimise = CPUCodeLibrary._optimize_final_module
 
 _OPTIONS = (  # of LLVM, for all that this process compiles; one that it should not know any more is passed over
-    "-unroll-threshold=100",
+    "-unroll-threshold=60",
     "-slp-max-reg-size=128",
     "-slp-threshold=2",
 )
