@@ -98,15 +98,16 @@ def lockstep() -> list[Figure]:
 
 def fast() -> list[Figure]:
     """The default scenario in the fast lane: as a study runs it, without a file, and as `pkxyz sil` does, recorded;
-    and with a law that learns nothing meanwhile.
+    and with laws that learn nothing meanwhile.
     """
     scenario = load_scenario("raster")
     setup = scenario.setup()
     fixed = replace(setup, controller=setup.controller.model_copy(update={"learn": "off"}))
-    run, run_fixed = (partial(lanes.run, each, Lane.FAST, on_block=_forget) for each in (setup, fixed))
-    run()
-    run_fixed()
-    taken = repeated({"bare": run, "fixed": run_fixed}, REPEATS)
+    setups = {"bare": setup, "fixed": fixed, "lqg": load_scenario("raster", controller="lqg").setup()}
+    runs = {what: partial(lanes.run, each, Lane.FAST, on_block=_forget) for what, each in setups.items()}
+    for run in runs.values():
+        run()
+    taken = repeated(runs, REPEATS)
     bare = taken["bare"]
     best, median = bare.per(setup.ticks)
     with tempfile.TemporaryDirectory() as folder:
@@ -116,6 +117,8 @@ def fast() -> list[Figure]:
                "trajectory, cycle and plant, rows handed on"),
         Figure("fast.realtime_fixed", _factor(setup, taken["fixed"].best_s), "times", None, None,
                _factor(setup, taken["fixed"].median_s), 'the same with learn = "off"'),
+        Figure("fast.realtime_lqg", _factor(setup, taken["lqg"].best_s), "times", None, None,
+               _factor(setup, taken["lqg"].median_s), "the same under lqg, which neither learns nor has a ring"),
         Figure("fast.realtime_recorded", _factor(setup, recorded.best_s), "times", None, None,
                _factor(setup, recorded.median_s), "with the recording and the figures of the run"),
         Figure("fast.tick", best, "us", None, None, median, "tick.kernel and plant.period make most of it"),
