@@ -11,7 +11,6 @@ from sim.motion.geometry import strokes
 from sim.motion.integrator import LONGEST_S
 from sim.motion.kernel import kernel
 from sim.motion.layout import PARAMS, STATE
-from sim.motion.mechanics import stiffness
 from sim.motion.parasitic import rest
 from sim.motion.streams import start_streams
 from sim.structure.build import build_flexible_modes, build_general_response, build_misalignment, build_tilt
@@ -92,15 +91,6 @@ def _mechanism(p: np.void, config: PlantConfig, device: Device) -> None:
     p["stop_low_m"] = device.limits.stroke_min_m - stops.clearance_m if stops.on else -far_m
     p["stop_high_m"] = device.limits.stroke_max_m + stops.clearance_m if stops.on else far_m
     p["stop_n_per_m"], p["stop_damping_s_per_m"] = stops.stiffness_n_per_m, stops.damping_s_per_m
-
-
-def rest_stiffness(p: np.void, position_m: np.ndarray) -> np.ndarray:
-    """Hessian of the elastic energy, (3, 3), N/m."""
-    return _symmetric(*stiffness(p, *position_m))
-
-
-def _symmetric(xx: float, xy: float, xz: float, yy: float, yz: float, zz: float) -> np.ndarray:
-    return np.array([[xx, xy, xz], [xy, yy, yz], [xz, yz, zz]])
 
 
 def _weight(config: PlantConfig, mass_kg: float) -> np.ndarray:

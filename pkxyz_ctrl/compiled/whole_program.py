@@ -8,10 +8,11 @@ as LLVM keeps the order of IEEE 754's operations; compiling takes as long as bef
 They are private, not internal: LLVM's loader looks for a function by its name in all that it has loaded, in what is
 local to an object, too, and such a one may have lost arguments that the other still has.
 
-A tick is 45 kB of code that runs once, where a processor's first cache holds 32: what it costs is less its number of
-instructions than their length. So loops are rolled out up to a hundred instructions, not LLVM's three hundred, and like
-operations on neighbours become one, in twos: fours would wait for numbers that were just written one by one. With it a
-tick that learns takes a tenth less time; other kernels are no slower.
+Plant and tick are 34 kB of code that runs once a period, where a processor's first cache holds 32, and its second
+hands on 13 bytes a cycle: what a tick costs is less its number of instructions than their length. So loops are rolled
+out up to sixty instructions, not LLVM's three hundred, and like operations on neighbours become one, in twos: fours
+would wait for numbers that were just written one by one. With it a tick that learns takes a tenth less time; other
+kernels are no slower.
 
 numba tells functions of one name and records of one kind apart by counts that start anew in each process. Two kernels
 that different processes had left in the cache could therefore bear one name, and LLVM, which links by name, took one
@@ -20,6 +21,8 @@ one compilation, whoever loads it; its environment, its wrappers and what a cach
 """
 
 import os
+from collections.abc import Iterator
+from contextlib import contextmanager
 from typing import Any
 
 from llvmlite.binding import Linkage, set_option
@@ -30,10 +33,11 @@ from numba.core.codegen import CPUCodeLibrary
 _optimise = CPUCodeLibrary._optimize_final_module
 
 _OPTIONS = (  # of LLVM, for all that this process compiles; one that it should not know any more is passed over
-    "-unroll-threshold=60",
     "-slp-max-reg-size=128",
     "-slp-threshold=2",
 )
+_ROLLED_OUT = 60
+"""Up to so many instructions loops are rolled out."""
 
 
 def optimise_whole_programs() -> None:
@@ -43,7 +47,22 @@ def optimise_whole_programs() -> None:
         config.SLP_VECTORIZE = 1  # the pass that makes pairs; off with numba
         for option in _OPTIONS:
             set_option("numba", option)
+        _roll_out(_ROLLED_OUT)
         FunctionIdentity._unique_ids = iter(_drawn, None)  # without an end; a fork draws others
+
+
+@contextmanager
+def rolled_out(instructions: int) -> Iterator[None]:
+    """Roll loops out up to so many meanwhile, whatever this process compiles else."""
+    _roll_out(instructions)
+    try:
+        yield
+    finally:
+        _roll_out(_ROLLED_OUT)
+
+
+def _roll_out(instructions: int) -> None:
+    set_option("numba", f"-unroll-threshold={instructions}")
 
 
 def _drawn() -> int:

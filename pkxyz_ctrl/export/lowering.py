@@ -6,6 +6,7 @@ from typing import NamedTuple
 
 import llvmlite.binding as llvm
 
+from pkxyz_ctrl.compiled.whole_program import rolled_out
 from pkxyz_ctrl.export import runtime
 from pkxyz_ctrl.export.elf import undefined
 from pkxyz_ctrl.export.entries import MANY, RECORD, Argument, Entry, entries_for
@@ -25,6 +26,7 @@ _APART = re.compile(
 _SELDOM = re.compile(
     r"10adaptation(5learn|7foresee|5begin|8set_base|8_compare|5clear)B|9estimator11predict_farB|9feed_hold6sampleB"
 )
+_ROLLED_OUT = 100  # instructions: a board counts each, and has room for them
 _ROUNDS = 2  # of the passes: what a callee turned out to return is known to its caller in the second
 
 
@@ -148,8 +150,9 @@ def _optimised(text: str, machine: llvm.TargetMachine, public: set[str], *, is_s
     options = llvm.create_pipeline_tuning_options(speed_level=2)
     options.slp_vectorization = options.loop_vectorization = False
     builder = llvm.create_pass_builder(machine, options)
-    for _ in range(_ROUNDS):
-        builder.getModulePassManager().run(module, builder)
+    with rolled_out(_ROLLED_OUT):
+        for _ in range(_ROUNDS):
+            builder.getModulePassManager().run(module, builder)
     return module
 
 

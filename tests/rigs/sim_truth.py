@@ -8,7 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from sim.motion.geometry import strokes
-from sim.motion.mechanics import acceleration
+from sim.motion.mechanics import acceleration, stiffness
 from sim.motion.parasitic import rest
 from sim.parameters import equilibrium
 from sim.plant import Plant
@@ -86,3 +86,9 @@ def truth_about(plant: Plant, squared_v2: Array, held_s: float) -> Truth:
 def nominal_v_per_count(plant: Plant) -> float:
     """What the bus calls a count: 200 V over 32767 of them."""
     return 200.0 / 32767
+
+
+def stiffness_at(p: np.void, position_m: Array) -> Array:
+    """Hessian of the elastic energy at a position (3,), (3, 3), N/m."""
+    xx, xy, xz, yy, yz, zz = stiffness(p, *position_m)
+    return np.array([[xx, xy, xz], [xy, yy, yz], [xz, yz, zz]])

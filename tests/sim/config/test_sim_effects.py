@@ -5,9 +5,9 @@ import math
 import numpy as np
 import pytest
 from sim_rig import BARE, DEVICE, config, counts, plant, settle
+from sim_truth import stiffness_at
 
 from sim.config import PlantConfig
-from sim.parameters import rest_stiffness
 
 MODES = (
     {
@@ -169,7 +169,7 @@ def test_parasitic_mode_rings_at_its_frequency_and_share():
         share
         * p.params["force_gain_n_per_v2"][0, 0]
         * p.voltage_v[0] ** 2
-        / rest_stiffness(p.params[0], np.zeros(3))[0, 0]
+        / stiffness_at(p.params[0], np.zeros(3))[0, 0]
     )
     assert r[-1] == pytest.approx(static, rel=1e-2)
     np.testing.assert_allclose(table, 0.5 * r, atol=1e-18)
@@ -216,6 +216,6 @@ def test_drift_settles_as_an_exponential():
 
 def test_out_of_plane_chains_stiffen_z():
     device = DEVICE.model_copy(update={"flexures": DEVICE.flexures.model_copy(update={"out_of_plane_chains": 3})})
-    one, three = (rest_stiffness(plant(config(), device=d).params[0], np.zeros(3)) for d in (DEVICE, device))
+    one, three = (stiffness_at(plant(config(), device=d).params[0], np.zeros(3)) for d in (DEVICE, device))
     assert one[0, 0] == pytest.approx(three[0, 0], rel=1e-14)
     assert three[2, 2] - one[2, 2] == pytest.approx(8 * 6.25e-6 / 500e-6**2, rel=1e-6)  # 12 K3 - 4 K3, over delta_0^2

@@ -8,11 +8,11 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from scipy.optimize import minimize
 from sim_rig import DEVICE, config, counts, plant, settle
+from sim_truth import stiffness_at
 
 from sim.config import Device
 from sim.motion.geometry import E_X, E_Y, N_X, N_Y, jacobian, strokes
 from sim.motion.mechanics import acceleration, arcsine, comb_accelerations, energy
-from sim.parameters import rest_stiffness
 
 PLAIN = plant(config())
 UNEVEN = plant(
@@ -103,7 +103,7 @@ def test_stiffness_is_the_slope_of_the_force(p, x):
         return -par["mass_kg"] * np.array(acceleration(par, s, np.zeros(3), *at, 0.0, 0.0, 0.0))
 
     slope = np.column_stack([(f(x + h * a) - f(x - h * a)) / (2 * h) for a in np.eye(3)])
-    np.testing.assert_allclose(rest_stiffness(par, x), slope, rtol=1e-6, atol=1e-5)
+    np.testing.assert_allclose(stiffness_at(par, x), slope, rtol=1e-6, atol=1e-5)
 
 
 @settings(max_examples=40)
@@ -122,7 +122,7 @@ def test_combs_act_through_the_transposed_jacobian(x, volt2):
 
 def test_published_stiffness_and_frequencies():
     """K_xx = 0.0759, K_zz = 0.1136 N/mm and 630.92, 771.75 Hz (paper, section IV.E)."""
-    k = rest_stiffness(PLAIN.params[0], np.zeros(3))
+    k = stiffness_at(PLAIN.params[0], np.zeros(3))
     assert k[0, 0] == pytest.approx(75.9, rel=1e-3)
     assert k[1, 1] == pytest.approx(k[0, 0], rel=1e-12)
     assert k[2, 2] == pytest.approx(113.6, rel=1e-3)
@@ -177,7 +177,7 @@ def test_every_mode_decays_with_the_quality_factor(axis):
     """Amplitude over one period falls by exp(-pi / Q) for small motion, Q = 20."""
     p = plant(config())
     p.state["motion"][0, axis] = 1e-9
-    w = math.sqrt(rest_stiffness(p.params[0], np.zeros(3))[axis, axis] / p.params[0]["mass_kg"])
+    w = math.sqrt(stiffness_at(p.params[0], np.zeros(3))[axis, axis] / p.params[0]["mass_kg"])
     trace = []
     for _ in range(20_000):
         p.advance_to(p.t_us + 1)

@@ -4,13 +4,13 @@ import numpy as np
 import pytest
 from scipy.integrate import solve_ivp
 from sim_rig import CONFIGS, config, counts, plant, settle
+from sim_truth import stiffness_at
 from test_sim_effects import MODES
 from test_sim_integrator import PM, scan
 
 from sim.config import PlantConfig
 from sim.motion.geometry import strokes
 from sim.motion.mechanics import acceleration, energy
-from sim.parameters import rest_stiffness
 
 LAB = PlantConfig.load(CONFIGS / "plants" / "lab.toml")
 QUIET = {"amplifier_bandwidth": {"corner_hz": 30e3}}
@@ -166,7 +166,7 @@ def test_modes_ring_where_the_linear_equations_say():
     record = p.params[0]
     kappa = np.hstack([np.eye(3), -record["mode_table"][:2].T])
     mass = np.diag(np.concatenate([np.full(3, record["mass_kg"]), 1 / record["mode_per_kg"][:2]]))
-    stiff = kappa.T @ rest_stiffness(record, np.zeros(3)) @ kappa
+    stiff = kappa.T @ stiffness_at(record, np.zeros(3)) @ kappa
     stiff[3:, 3:] += np.diag(record["mode_w2_per_s2"][:2] / record["mode_per_kg"][:2])
     expected = np.sqrt(np.sort(np.linalg.eigvals(np.linalg.solve(mass, stiff)).real)) / (2 * np.pi)
     assert expected[3] > 2600.0 * 1.001  # the table is not held fast: the mode is stiffer than alone

@@ -9,10 +9,10 @@ import pytest
 from loop_rig import MIDDLE, rows_of, setup, stage
 from scipy.integrate import quad
 from sim_rig import CONFIGS, DEVICE, GRADIENT_F_PER_M, counts, plant
+from sim_truth import stiffness_at
 
 from pkxyz_ctrl.trajectory import Hold, Move, Trajectory
 from sim.config import Device, PlantConfig
-from sim.parameters import rest_stiffness
 
 ROOT = CONFIGS.parent
 LAB = PlantConfig.load(CONFIGS / "plants" / "lab.toml")
@@ -38,7 +38,7 @@ def test_the_pages_noises_are_those_of_the_formulas():
     kept = json.loads((ROOT / "docs" / "figures" / "plant_noise.json").read_text(encoding="utf-8"))
     shown = {words: [float(v) for v in cells[:3]] for words, cells in kept.items()}
     p = plant(LAB).params[0]
-    stiff = np.diag(rest_stiffness(p, np.zeros(3)))
+    stiff = np.diag(stiffness_at(p, np.zeros(3)))
     base = np.array(LAB.base_noise.density_m_per_s2_per_rt_hz) * p["mass_kg"] / stiff
     ringing = np.sqrt(np.sqrt(stiff / p["mass_kg"]) * 18.0 / 4)
     assert shown["table above its legs"] == pytest.approx(base * ringing * 1e9, rel=0.1)

@@ -6,10 +6,10 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from scipy import optimize, signal
 from sim_rig import DEVICE, GRADIENT_F_PER_M, config, counts, plant, settle
+from sim_truth import stiffness_at
 
 from sim.config import PlantConfig
 from sim.config.surroundings import FloorVibration
-from sim.parameters import rest_stiffness
 from sim.surroundings.build import build_surroundings
 
 FS_HZ = 5000.0
@@ -105,7 +105,7 @@ def test_the_stage_rings_as_white_noise_lets_it(source):
         newton = per_v * 1e-3 * np.sqrt(2 * 0.75)  # of two combs, on x
     settle(p, 100_000)
     x = recorded(p, 40_000, lambda p: p.position_m[0])
-    stiff = rest_stiffness(p.params[0], np.zeros(3))[0, 0]
+    stiff = stiffness_at(p.params[0], np.zeros(3))[0, 0]
     w = np.sqrt(stiff / 4.833e-6)
     expected = newton / stiff * np.sqrt(w * 10.0 / 4)
     assert (x - x.mean()).std() == pytest.approx(expected, rel=0.08)  # 8 s hold some 1600 correlation times

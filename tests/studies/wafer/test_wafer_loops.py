@@ -5,6 +5,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 from process_rig import SHIPPED, STAGE, devices, process
+from sim_truth import stiffness_at
 
 from hil.bench.study import short_scan
 from hil.lanes import in_process as lanes
@@ -21,7 +22,6 @@ from pkxyz_ctrl.design.margins import sensitivity
 from pkxyz_ctrl.fabrication.statics import pose, pose_of_strokes
 from pkxyz_ctrl.fabrication.wafer import dies_per_wafer, sample_devices, sample_numbered
 from pkxyz_ctrl.stage import Stage
-from sim.parameters import rest_stiffness
 
 MIDDLE = np.full(3, 12.5e-6)
 SCENARIO = load_scenario("raster")
@@ -60,7 +60,7 @@ def test_the_plant_has_the_springs_and_combs_that_were_made():
     params = replace(setup, plant=plant, device=truth.device(setup.device)).new_plant().params[0]
     for strokes in (np.zeros(3), MIDDLE, np.array([25e-6, 3e-6, 11e-6])):
         there, position = pose_of_strokes(made, strokes)
-        assert rest_stiffness(params, position[0]) == pytest.approx(there.stiffness_n_per_m[0], rel=1e-9, abs=1e-7)
+        assert stiffness_at(params, position[0]) == pytest.approx(there.stiffness_n_per_m[0], rel=1e-9, abs=1e-7)
     assert params["force_gain_n_per_v2"] == pytest.approx(made.comb_n_per_v2[0], rel=1e-12)
     assert params["mass_kg"] == pytest.approx(made.mass_kg[0], rel=1e-12)
     drawn_f_per_m = setup.new_plant().params[0]["sense_f_per_m"]
