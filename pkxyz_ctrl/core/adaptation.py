@@ -47,7 +47,7 @@ LEAST_LOSS = 0.1
 """By how much, in variances of the noise, innovations have to be worse with the base before something has changed."""
 _MOST_SPARED = 0.5  # of a comb's pull: one that has become stronger is told as at most twice as strong
 _PARAMETERS, _ROOM, _CAUSES = np.int32(PARAMETERS), np.int32(ROOM), np.int32(CAUSES)  # cheaper to count by, of 32 bits
-_LANES, _ROWS = np.int32(4), np.int32(5)  # of the covariance at a time: few enough for registers
+_LANES, _ROWS = np.int32(4), np.int32(5)  # sums of a product; rows of the covariance at a time, to fit into registers
 _FLOOR_N = 1e-100  # in each force: else what is at rest falls below the normal numbers, and a PC slows down fivefold
 AGES = 3  # intervals that are remembered: two periods of delay, and the one that is decided
 
@@ -97,7 +97,7 @@ ADAPTATION_STATE = np.dtype(
         ("left", "f8"),  # ... with what is learnt, over that of the noise
         ("change", "f8"),  # relative, of the cause that is warned of
         ("work", "f8", (ROOM,)),
-        ("lanes", "f8", (4,)),
+        ("lanes", "f8", (4,)),  # sums that make a product
         ("updates", "i8"),
         ("begun", "i4"),  # 0: nothing is known yet, not even how little
         ("based", "i4"),  # 1: there is a base

@@ -1,5 +1,5 @@
-"""The stage at rest, compiled: the linear stage that it is there, and where constant forces take it. A study makes
-plants by the thousand, and records in arrays: numba takes twenty times as long to tell the type of one alone."""
+"""The stage at rest: the linear stage that it is there, and where constant forces take it. Compiled, as a study makes
+plants by the thousand; records are in arrays, as numba takes twenty times as long to tell the type of one alone."""
 
 import math
 
@@ -20,27 +20,27 @@ def linearise(params: np.ndarray, quality: float, rest_n_per_m: np.ndarray) -> N
     D = (K / m)^(1/2) / Q, and none for a ``quality`` of 0; the response to a transient of the amplifier.
     """
     p = params[0]
-    stiff, root, other, shown = p["stiff_per_s2"], p["damping_per_s"], p["damping2_per_s2"], p["response_1"]
+    stiff, damping, square = p["stiff_per_s2"], p["damping_per_s"], p["damping2_per_s2"]
     _fill(rest_n_per_m, *stiffness(p, 0.0, 0.0, 0.0))
     for i in range(3):
         for k in range(3):
-            stiff[i, k] = rest_n_per_m[i, k] / p["mass_kg"]
+            stiff[i, k], damping[i, k] = rest_n_per_m[i, k] / p["mass_kg"], 0.0
     if quality > 0.0:
-        _take_root(stiff, root, other, shown, p["response_2"])
+        _take_root(stiff, damping, square, p["response_1"], p["response_2"])  # all of them are written below
         for i in range(3):
             for k in range(3):
-                root[i, k] /= quality
-    else:
-        root[:] = 0.0
+                damping[i, k] /= quality
     for i in range(3):
         for k in range(3):
-            other[i, k] = 0.25 * (root[i, 0] * root[0, k] + root[i, 1] * root[1, k] + root[i, 2] * root[2, k])
-    _respond(p["amplifier_s"], stiff, root, p["response_1_s2"], p["response_1"])
-    _respond(0.5 * p["amplifier_s"], stiff, root, p["response_2_s2"], p["response_2"])
+            dd = damping[i, 0] * damping[0, k] + damping[i, 1] * damping[1, k] + damping[i, 2] * damping[2, k]
+            square[i, k] = 0.25 * dd
+    _respond(p["amplifier_s"], stiff, damping, p["response_1_s2"], p["response_1"])
+    _respond(0.5 * p["amplifier_s"], stiff, damping, p["response_2_s2"], p["response_2"])
 
 
 @kernel
 def _fill(out: np.ndarray, xx: float, xy: float, xz: float, yy: float, yz: float, zz: float) -> None:
+    """A symmetric matrix (3, 3)."""
     out[0, 0], out[1, 1], out[2, 2] = xx, yy, zz
     out[0, 1], out[1, 0], out[0, 2], out[2, 0], out[1, 2], out[2, 1] = xy, xy, xz, xz, yz, yz
 
