@@ -6,7 +6,7 @@ import numpy as np
 
 from sim.config import Device, PlantConfig
 from sim.motion import layout
-from sim.motion.at_rest import linearise, settle
+from sim.motion.at_rest import STILL_M, linearise, settle
 from sim.motion.geometry import strokes
 from sim.motion.integrator import LONGEST_S
 from sim.motion.kernel import kernel
@@ -251,6 +251,6 @@ def equilibrium(params: np.ndarray, state: np.ndarray, volt2: np.ndarray) -> np.
     Raises ArithmeticError if it does not settle, which needs forces far beyond the stage's own."""
     x = np.zeros(3)
     moves_m = settle(params, state, volt2, x, np.empty(3), np.empty((3, 3)))
-    if not moves_m < 1e-18:
+    if not moves_m < STILL_M:
         raise ArithmeticError(f"no static equilibrium near rest: the table still moves by {moves_m:.1e} m")
     return x

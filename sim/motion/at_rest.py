@@ -10,7 +10,8 @@ from sim.motion.mechanics import acceleration, stiffness
 
 _ROUNDS = 50
 _ROUNDING = 1e-15
-_STILL_M = 1e-18
+STILL_M = 1e-18
+"""Who moves by less than this from one step of Newton's method to the next stands still."""
 
 
 @kernel
@@ -116,6 +117,6 @@ def settle(
             step = hessian[i, 0] * force_n[0] + hessian[i, 1] * force_n[1] + hessian[i, 2] * force_n[2]
             x[i] += step
             change = max(change, abs(step))
-        if change < _STILL_M:
+        if change < STILL_M:
             break
     return float(change)
