@@ -7,7 +7,7 @@ x = y + xi, xi = R_1 A_1 E + R_2 A_2 E^2, whatever the matrices R,
 
     y'' + D y' = a(y + xi, t) - (xi'' + D xi'),
 
-and with those of ``sim.parameters.transient_response``, which answer xi'' + D xi' + K xi / m = A E to leading orders in
+and with those of ``sim.motion.at_rest.linearise``, which answer xi'' + D xi' + K xi / m = A E to leading orders in
 tau, y is smooth. What stays rough is the turn of the Jacobian while a transient lasts.
 
 Damping. From the start of a step, y = y_0 + exp(-D t / 2) u takes the velocity out of the right-hand side:
