@@ -190,10 +190,11 @@ def _show(adaptation: np.void, state: np.void, row: Array) -> None:
     """d nu at this sample, where the reference is at ``row`` (9,)."""
     tau, spread, shown, u = adaptation["sense_delay_s"], adaptation["spread"], state["shown"], state["sensitivity"]
     for i in range(3):
+        late, bent = tau * u[i, 1, DELAY] - u[i, 0, DELAY], tau * u[i, 1, BEND] - u[i, 0, BEND]
         for p in range(_ROOM):
             shown[i, p] = tau * u[i, 1, p] - u[i, 0, p]
-        shown[i, DELAY] += spread[DELAY] * row[3 + i]
-        shown[i, BEND] -= spread[BEND] * row[6 + i]
+        shown[i, DELAY] = late + spread[DELAY] * row[3 + i]
+        shown[i, BEND] = bent - spread[BEND] * row[6 + i]
 
 
 @kernel
@@ -337,17 +338,15 @@ def foresee(
     """Write phi of the next interval, with ``row`` (9,) of the reference in its middle. There the stage is ``bent`` (a
     record of ``elasticity.BENT``), has ``pulls`` (3,3) with their ``inverse``, and needs ``feedforward_n`` (3,).
     """
-    newest = state["force_n"][0]
+    newest, spread = state["force_n"][0], adaptation["spread"]
     for i in range(3):
         newest[i, FRINGE] = newest[i, LIFT] = 0.0
-        newest[i, DAMPING] = damping[i, 0] * row[3] + damping[i, 1] * row[4] + damping[i, 2] * row[5]
-    newest[2, LINK] = bent["link_n_m"] / bent["projection_m"]
+        lost_n = damping[i, 0] * row[3] + damping[i, 1] * row[4] + damping[i, 2] * row[5]
+        newest[i, DAMPING] = spread[DAMPING] * lost_n
+    newest[2, LINK] = spread[LINK] * bent["link_n_m"] / bent["projection_m"]
     for i in range(3):
         pull = inverse[0, i] * feedforward_n[0] + inverse[1, i] * feedforward_n[1] + inverse[2, i] * feedforward_n[2]
-        _note_chain(adaptation["fringe_m"], geometry, i, bent, pulls[i], pull, newest)
-    for i in range(3):
-        for p in range(_ROOM):
-            newest[i, p] *= adaptation["spread"][p]
+        _note_chain(adaptation["fringe_m"], spread, geometry, i, bent, pulls[i], pull, newest)
 
 
 @kernel
@@ -363,20 +362,21 @@ def note(state: np.void, start: Array) -> None:
 
 @kernel
 def _note_chain(
-    fringe_m: float, geometry: np.void, i: int, bent: np.void, along: Array, pull_n: float, out: Array
+    fringe_m: float, spread: Array, geometry: np.void, i: int, bent: np.void, along: Array, pull_n: float, out: Array
 ) -> None:
-    """What errors of chain i make the feed-forward lack, per unit: its comb's pull, springs, and its share of the rest.
-    ``along`` (3,) is where the comb pulls.
+    """What errors of chain i make the feed-forward lack, per ``spread``: its comb's pull, springs, and its share of the
+    rest. ``along`` (3,) is where the comb pulls.
     """
     n = geometry["n"]
-    across, spring = bent["crank_n_m"][i] / bent["along_m"][i], bent["slider_n"][i]
-    grown = pull_n * bent["stroke_m"][i] / fringe_m
+    across = spread[CRANK + i] * bent["crank_n_m"][i] / bent["along_m"][i]
+    spring = spread[SLIDER + i] * bent["slider_n"][i]
+    pulled, grown = spread[COMB + i] * pull_n, spread[FRINGE] * pull_n * bent["stroke_m"][i] / fringe_m
     for k in range(3):
-        out[k, COMB + i] = -pull_n * along[k]
+        out[k, COMB + i] = -pulled * along[k]
         out[k, SLIDER + i] = spring * (along[k] if k < 2 else along[k] - geometry["lift"])
         out[k, CRANK + i] = across * n[i, k] if k < 2 else 0.0
         out[k, FRINGE] -= grown * along[k]
-    out[2, LIFT] -= pull_n
+    out[2, LIFT] -= spread[LIFT] * pull_n
 
 
 @kernel

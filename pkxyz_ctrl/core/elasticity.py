@@ -59,51 +59,51 @@ def arcsine(y: float) -> float:
         y /= math.sqrt(2.0 + 2.0 * math.sqrt((1.0 - y) * (1.0 + y)))
         doubled *= 2.0
     s = y * y
-    tail = 35 / 1152 + s * (63 / 2816 + s * (231 / 13312))
-    return doubled * (y + y * s * (1 / 6 + s * (3 / 40 + s * (5 / 112 + s * tail))))
+    s2 = s * s  # in pairs, which need not wait for one another
+    tail = 5 / 112 + s * (35 / 1152) + s2 * (63 / 2816 + s * (231 / 13312))
+    return doubled * (y + y * s * (1 / 6 + s * (3 / 40) + s2 * tail))
 
 
 @kernel
 def energy(geometry: np.void, elasticity: np.void, position_m: Array) -> float:
     """Strain energy in J at ``position_m`` (3,), 0 at rest."""
     x, y = position_m[0], position_m[1]
-    _, delta, drop = link(geometry, position_m[2])
+    _, _, _, drop = link(geometry, position_m[2])
     total = 0.0
     k1, k2 = elasticity["slider_n_per_m"], elasticity["crank_n_m_per_rad"]
     for i in range(3):
-        s, c = crank(geometry, i, x, y)
-        q = stroke(geometry, i, x, y, s, c, drop)
+        s, _, _, short = crank(geometry, i, x, y)
+        q = stroke(geometry, i, x, y, short, drop)
         theta = arcsine(s / geometry["crank_m"])
         total += 0.5 * k1[i] * q * q + 0.5 * k2[i] * theta * theta
-    tilt = _elevation_change(geometry, position_m[2], delta)
+    tilt = _elevation_change(geometry, position_m[2], drop)
     return total + 0.5 * elasticity["link_n_m_per_rad"] * tilt * tilt
 
 
 @kernel
-def _elevation_change(geometry: np.void, dz: float, delta: float) -> float:
-    """alpha - alpha_0 in rad from its sine, z delta_0 - delta z_0 over L2^2, with the
-    small difference written as a quotient.
-    """
+def _elevation_change(geometry: np.void, dz: float, drop: float) -> float:
+    """alpha - alpha_0 in rad from its sine, z delta_0 - delta z_0 over L2^2, where delta_0 - delta is ``drop``."""
     z0, delta0, reach = geometry["height_rest_m"], geometry["projection_rest_m"], geometry["link_m"]
-    return arcsine(dz * (delta0 + z0 * (dz + 2.0 * z0) / (delta + delta0)) / (reach * reach))
+    per_square = 1.0 / (reach * reach)
+    return arcsine((dz * delta0 + z0 * drop) * per_square)
 
 
 @kernel
 def _springs(
-    geometry: np.void, elasticity: np.void, i: int, q: float, s: float, c: float
+    elasticity: np.void, i: int, q: float, s: float, per_c: float, per_crank: float
 ) -> tuple[float, float, float]:
     """Force in N along chain i's direction of action that its springs need at stroke ``q``, and across it, and the
-    torque in N m of its parallelogram, which is in the latter; ``s`` and ``c`` as ``crank`` says.
+    torque in N m of its parallelogram, which is in the latter; ``s`` and 1 / c as ``crank`` says, and 1 / L1.
     """
     force = elasticity["slider_n_per_m"][i] * q
-    torque = elasticity["crank_n_m_per_rad"][i] * arcsine(s / geometry["crank_m"])
-    return force, (force * s + torque) / c, torque
+    torque = elasticity["crank_n_m_per_rad"][i] * arcsine(s * per_crank)
+    return force, (force * s + torque) * per_c, torque
 
 
 @kernel
-def _link_torque(geometry: np.void, elasticity: np.void, dz: float, delta: float) -> float:
+def _link_torque(geometry: np.void, elasticity: np.void, dz: float, drop: float) -> float:
     """In N m, that the out-of-plane hinges need at height ``dz`` above rest."""
-    torque: float = elasticity["link_n_m_per_rad"] * _elevation_change(geometry, dz, delta)
+    torque: float = elasticity["link_n_m_per_rad"] * _elevation_change(geometry, dz, drop)
     return torque
 
 
@@ -112,17 +112,18 @@ def energy_gradient(geometry: np.void, elasticity: np.void, position_m: Array, o
     """dV/dx (3,) in N: the force at the platform that holds it at ``position_m``."""
     e, n = geometry["e"], geometry["n"]
     x, y = position_m[0], position_m[1]
-    z, delta, drop = link(geometry, position_m[2])
+    z, _, per_delta, drop = link(geometry, position_m[2])
     fx = fy = pull = 0.0
+    per_crank = 1.0 / geometry["crank_m"]
     for i in range(3):
-        s, c = crank(geometry, i, x, y)
-        force, across, _ = _springs(geometry, elasticity, i, stroke(geometry, i, x, y, s, c, drop), s, c)
+        s, _, per_c, short = crank(geometry, i, x, y)
+        force, across, _ = _springs(elasticity, i, stroke(geometry, i, x, y, short, drop), s, per_c, per_crank)
         fx += force * e[i, 0] + across * n[i, 0]
         fy += force * e[i, 1] + across * n[i, 1]
         pull += force
     out[0] = fx
     out[1] = fy
-    out[2] = (pull * z + _link_torque(geometry, elasticity, position_m[2], delta)) / delta
+    out[2] = (pull * z + _link_torque(geometry, elasticity, position_m[2], drop)) * per_delta
 
 
 @kernel
@@ -135,23 +136,23 @@ def gradient_and_pulls(
     e, n = geometry["e"], geometry["n"]
     along_m, stroke_m, slider_n, crank_n_m = bent["along_m"], bent["stroke_m"], bent["slider_n"], bent["crank_n_m"]
     x, y = position_m[0], position_m[1]
-    z, delta, drop = link(geometry, position_m[2])
-    slope = z / delta
+    z, delta, per_delta, drop = link(geometry, position_m[2])
+    slope, per_crank = z * per_delta, 1.0 / geometry["crank_m"]
     fx = fy = pull = 0.0
     for i in range(3):
-        s, c = crank(geometry, i, x, y)
-        tangent = s / c
+        s, c, per_c, short = crank(geometry, i, x, y)
+        tangent = s * per_c
         pulls_out[i, 0] = e[i, 0] + n[i, 0] * tangent
         pulls_out[i, 1] = e[i, 1] + n[i, 1] * tangent
         pulls_out[i, 2] = slope + geometry["lift"]
-        q = stroke(geometry, i, x, y, s, c, drop)
-        force, across, torque = _springs(geometry, elasticity, i, q, s, c)
+        q = stroke(geometry, i, x, y, short, drop)
+        force, across, torque = _springs(elasticity, i, q, s, per_c, per_crank)
         fx += force * e[i, 0] + across * n[i, 0]
         fy += force * e[i, 1] + across * n[i, 1]
         pull += force
         along_m[i], stroke_m[i], slider_n[i], crank_n_m[i] = c, q, force, torque
-    bent["projection_m"], bent["link_n_m"] = delta, _link_torque(geometry, elasticity, position_m[2], delta)
-    out[0], out[1], out[2] = fx, fy, (pull * z + bent["link_n_m"]) / delta
+    bent["projection_m"], bent["link_n_m"] = delta, _link_torque(geometry, elasticity, position_m[2], drop)
+    out[0], out[1], out[2] = fx, fy, (pull * z + bent["link_n_m"]) * per_delta
 
 
 @kernel
@@ -164,12 +165,14 @@ def gradient_and_forces(
     """
     e, n = geometry["e"], geometry["n"]
     x, y = position_m[0], position_m[1]
-    z, delta, drop = link(geometry, position_m[2])
+    z, _, per_delta, drop = link(geometry, position_m[2])
     wx = wy = held = fx = fy = pull = gx = gy = other_pull = 0.0
+    slope, per_crank = z * per_delta, 1.0 / geometry["crank_m"]
     for i in range(3):
-        s, c = crank(geometry, i, x, y)
-        spring, spring_across, _ = _springs(geometry, elasticity, i, stroke(geometry, i, x, y, s, c, drop), s, c)
-        across, other_across = comb_force_n[i] * s / c, other_n[i] * s / c
+        s, _, per_c, short = crank(geometry, i, x, y)
+        q, tangent = stroke(geometry, i, x, y, short, drop), s * per_c
+        spring, spring_across, _ = _springs(elasticity, i, q, s, per_c, per_crank)
+        across, other_across = comb_force_n[i] * tangent, other_n[i] * tangent
         wx += spring * e[i, 0] + spring_across * n[i, 0]
         wy += spring * e[i, 1] + spring_across * n[i, 1]
         held += spring
@@ -179,10 +182,10 @@ def gradient_and_forces(
         gx += other_n[i] * e[i, 0] + other_across * n[i, 0]
         gy += other_n[i] * e[i, 1] + other_across * n[i, 1]
         other_pull += other_n[i]
-    wz = (held * z + _link_torque(geometry, elasticity, position_m[2], delta)) / delta
-    out[0], out[1], out[2] = fx, fy, pull * z / delta + geometry["lift"] * pull
+    wz = (held * z + _link_torque(geometry, elasticity, position_m[2], drop)) * per_delta
+    out[0], out[1], out[2] = fx, fy, pull * slope + geometry["lift"] * pull
     other_out[0], other_out[1] = gx, gy
-    other_out[2] = other_pull * z / delta + geometry["lift"] * other_pull
+    other_out[2] = other_pull * slope + geometry["lift"] * other_pull
     return wx, wy, wz
 
 
@@ -194,17 +197,17 @@ def stiffness(geometry: np.void, elasticity: np.void, position_m: Array, out: Ar
     length, n = geometry["crank_m"], geometry["n"]
     k1, k2, k3 = elasticity["slider_n_per_m"], elasticity["crank_n_m_per_rad"], elasticity["link_n_m_per_rad"]
     x, y = position_m[0], position_m[1]
-    z, delta, drop = link(geometry, position_m[2])
+    z, delta, _, drop = link(geometry, position_m[2])
     for a in range(3):
         for b in range(3):
             out[a, b] = k1[0] * (j[0, a] * j[0, b] + j[1, a] * j[1, b] + j[2, a] * j[2, b])
             out[a, b] += (k1[1] - k1[0]) * j[1, a] * j[1, b] + (k1[2] - k1[0]) * j[2, a] * j[2, b]
     for i in range(3):
-        s, c = crank(geometry, i, x, y)
-        q = stroke(geometry, i, x, y, s, c, drop)
+        s, c, _, short = crank(geometry, i, x, y)
+        q = stroke(geometry, i, x, y, short, drop)
         across = k1[i] * q * crank_bend(geometry, c) + k2[i] * (1.0 / c**2 + arcsine(s / length) * s / c**3)
         for a in range(2):
             for b in range(2):
                 out[a, b] += across * n[i, a] * n[i, b]
         out[2, 2] += k1[i] * q * link_bend(geometry, delta)
-    out[2, 2] += k3 * (1.0 / delta**2 + _elevation_change(geometry, position_m[2], delta) * z / delta**3)
+    out[2, 2] += k3 * (1.0 / delta**2 + _elevation_change(geometry, position_m[2], drop) * z / delta**3)

@@ -63,10 +63,9 @@ def update(estimator: np.void, estimate: np.void, measured_m: Array, has_measure
     gain, origin, tau = estimator["gain"], estimator["operating_point_m"], estimator["sense_delay_s"]
     for i in range(3):
         innovation[i] = measured_m[i] - origin[i] - (predicted[i] - tau * predicted[3 + i]) if has_measurement else 0.0
+    x, y, z = innovation[0], innovation[1], innovation[2]
     for i in range(9):
-        filtered[i] = (
-            predicted[i] + gain[i, 0] * innovation[0] + gain[i, 1] * innovation[1] + gain[i, 2] * innovation[2]
-        )
+        filtered[i] = predicted[i] + gain[i, 0] * x + gain[i, 1] * y + gain[i, 2] * z
 
 
 @kernel
@@ -87,11 +86,12 @@ def net_input(
     force_old_n: Array,
     apart_n: Array,
     apart_old_n: Array,
+    told_n: Array,
     w: Array,
     w_change: Array,
 ) -> None:
     """w (3,) and w_old - w (3,) in N at an estimated position, for the comb forces that act now and those that acted
-    before; ``apart_n`` (3,) and ``apart_old_n`` of them, at the platform, do not count.
+    before; ``apart_n`` (3,) and ``apart_old_n`` of them, at the platform, do not count. ``told_n`` (3,) acts beside.
     """
     stiffness, origin = estimator["stiffness_n_per_m"], estimator["operating_point_m"]
     ix, iy, iz = gradient_and_forces(geometry, elasticity, position_m, force_n, force_old_n, w, w_change)
@@ -104,9 +104,9 @@ def net_input(
         iz = iz - stiffness[2, 0] * x - stiffness[2, 1] * y - stiffness[2, 2] * z
     for i in range(3):
         w_change[i] += apart_n[i] - apart_old_n[i] - w[i]
-    w[0] -= ix + apart_n[0]
-    w[1] -= iy + apart_n[1]
-    w[2] -= iz + apart_n[2]
+    w[0] = w[0] - (ix + apart_n[0]) + told_n[0]
+    w[1] = w[1] - (iy + apart_n[1]) + told_n[1]
+    w[2] = w[2] - (iz + apart_n[2]) + told_n[2]
 
 
 @kernel
@@ -118,18 +118,19 @@ def predict(estimator: np.void, s: Array, w: Array, w_change: Array, out: Array)
     if estimator["decoupled"] != 0:
         for i in range(3):
             x, v, d, f, change = s[i], s[3 + i], s[6 + i], w[i], w_change[i]
-            out[i] = phi[i, i] * x + phi[i, 3 + i] * v + phi[i, 6 + i] * d + (gamma[i, i] * f + lag[i, i] * change)
+            out[i] = phi[i, i] * x + phi[i, 3 + i] * v + phi[i, 6 + i] * d + gamma[i, i] * f + lag[i, i] * change
             r = 3 + i
-            out[r] = phi[r, i] * x + phi[r, 3 + i] * v + phi[r, 6 + i] * d + (gamma[r, i] * f + lag[r, i] * change)
+            out[r] = phi[r, i] * x + phi[r, 3 + i] * v + phi[r, 6 + i] * d + gamma[r, i] * f + lag[r, i] * change
             out[6 + i] = d
         return
+    x, y, z, vx, vy, vz, dx, dy, dz = s[0], s[1], s[2], s[3], s[4], s[5], s[6], s[7], s[8]
+    wx, wy, wz, cx, cy, cz = w[0], w[1], w[2], w_change[0], w_change[1], w_change[2]
     for i in range(6):
-        total = 0.0
-        for k in range(9):
-            total += phi[i, k] * s[k]
-        for k in range(3):
-            total += gamma[i, k] * w[k] + lag[i, k] * w_change[k]
-        out[i] = total
+        total = phi[i, 0] * x + phi[i, 1] * y + phi[i, 2] * z
+        total = total + phi[i, 3] * vx + phi[i, 4] * vy + phi[i, 5] * vz
+        total = total + phi[i, 6] * dx + phi[i, 7] * dy + phi[i, 8] * dz
+        total = total + gamma[i, 0] * wx + gamma[i, 1] * wy + gamma[i, 2] * wz
+        out[i] = total + lag[i, 0] * cx + lag[i, 1] * cy + lag[i, 2] * cz
     for i in range(6, 9):
         out[i] = s[i]
 
@@ -175,12 +176,14 @@ def predict_far(
     for i in range(3):
         start[i], end[i] = origin[i] + s[i], origin[i] + out[i]
         middle[i] = 0.5 * (start[i] + end[i]) + bend_s * (s[3 + i] - out[3 + i])
-    net_input(geometry, elasticity, estimator, start, force_n, force_old_n, apart_n, apart_old_n, w, w_change)
-    net_input(geometry, elasticity, estimator, middle, force_n, force_old_n, apart_n, apart_old_n, w_middle, unused)
-    net_input(geometry, elasticity, estimator, end, force_n, force_old_n, apart_n, apart_old_n, w_end, unused)
+    net_input(geometry, elasticity, estimator, start, force_n, force_old_n, apart_n, apart_old_n, told_n, w, w_change)
+    net_input(
+        geometry, elasticity, estimator, middle, force_n, force_old_n, apart_n, apart_old_n, told_n, w_middle, unused
+    )
+    net_input(geometry, elasticity, estimator, end, force_n, force_old_n, apart_n, apart_old_n, told_n, w_end, unused)
     for i in range(3):
         change = w_end[i] - w[i]
-        w[i] = (w[i] + 4.0 * w_middle[i] + w_end[i]) / 6.0 + told_n[i]
+        w[i] = (w[i] + 4.0 * w_middle[i] + w_end[i]) / 6.0
         w_end[i] = change
     predict(estimator, s, w, w_change, out)
     for i in range(3):

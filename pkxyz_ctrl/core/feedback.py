@@ -70,7 +70,7 @@ def ahead(feedback: np.void, now: Array, after: Array, out: Array) -> None:
         way = after[i] - now[i] - v - 0.5 * a  # what third and higher orders make of position, velocity, acceleration
         speed = period * after[3 + i] - v - a
         bend = period * period * after[6 + i] - a
-        cubic, quartic, quintic = bend / 6.0, 0.0, 0.0
+        cubic, quartic, quintic = (1 / 6) * bend, 0.0, 0.0
         if abs(way) <= abs(speed) + abs(bend) + _JUMP_M:
             cubic = 10.0 * way - 4.0 * speed + 0.5 * bend
             quartic = -15.0 * way + 7.0 * speed - bend
@@ -100,8 +100,9 @@ def add_held_share(feedforward_n: Array, last_n: Array, next_n: Array, share: fl
     Held for a period T, a sinusoidal force at angular frequency w moves a mass less than the smooth one by 1 + (w T)^2
     / 24 at the samples; the second difference gives that back, without phase, up to terms of fourth order.
     """
+    part = share / 24.0
     for i in range(3):
-        out[i] -= share * (next_n[i] - 2.0 * feedforward_n[i] + last_n[i]) / 24.0
+        out[i] -= part * (next_n[i] - 2.0 * feedforward_n[i] + last_n[i])
 
 
 @kernel
@@ -124,10 +125,10 @@ def sampled_target(feedback: np.void, now: Array, feedforward_n: Array, feedforw
 @kernel
 def authority(feedback: np.void, inverse: Array, holding_n: Array) -> float:
     """g in 0..1 from the least comb force of J^-T ``holding_n``; ``inverse`` is J^-1 at the set-point."""
-    least = np.inf
+    least, per_newton = np.inf, 1.0 / feedback["authority_force_n"]
     for i in range(3):
         least = min(least, inverse[0, i] * holding_n[0] + inverse[1, i] * holding_n[1] + inverse[2, i] * holding_n[2])
-    return min(max(least / feedback["authority_force_n"], 0.0), 1.0)
+    return min(max(least * per_newton, 0.0), 1.0)
 
 
 @kernel
@@ -143,10 +144,13 @@ def add_feedback(
             off_m, off_m_per_s = origin_m[i] + predicted[i] - reference[i], predicted[3 + i] - reference[3 + i]
             out[i] -= share * (predicted[6 + i] + (kx[i, i] * off_m + kv[i, i] * off_m_per_s))
         return
+    x, y, z = (
+        origin_m[0] + predicted[0] - reference[0],
+        origin_m[1] + predicted[1] - reference[1],
+        origin_m[2] + predicted[2] - reference[2],
+    )
+    vx, vy, vz = predicted[3] - reference[3], predicted[4] - reference[4], predicted[5] - reference[5]
     for i in range(3):
-        total = predicted[6 + i]
-        for k in range(3):
-            total += kx[i, k] * (origin_m[k] + predicted[k] - reference[k]) + kv[i, k] * (
-                predicted[3 + k] - reference[3 + k]
-            )
+        total = predicted[6 + i] + (kx[i, 0] * x + kv[i, 0] * vx)
+        total = total + (kx[i, 1] * y + kv[i, 1] * vy) + (kx[i, 2] * z + kv[i, 2] * vz)
         out[i] -= share * total

@@ -68,48 +68,57 @@ def in_domain(geometry: np.void, position_m: Array) -> int:
 
 
 @kernel
-def link(geometry: np.void, dz: float) -> tuple[float, float, float]:
-    """The out-of-plane links at height ``dz`` above rest: height z, projection delta, and delta_0 - delta, all in m."""
+def link(geometry: np.void, dz: float) -> tuple[float, float, float, float]:
+    """The out-of-plane links at height ``dz`` above rest: height z, projection delta, 1 / delta, and delta_0 - delta,
+    in m and 1/m. Both quotients by one division, which a processor takes as long for as for some products.
+    """
     reach, z0 = geometry["link_m"], geometry["height_rest_m"]
     z = z0 + dz
     delta = math.sqrt((reach - z) * (reach + z))
-    return z, delta, dz * (z + z0) / (delta + geometry["projection_rest_m"])
+    total = delta + geometry["projection_rest_m"]
+    shared = 1.0 / (delta * total)
+    return z, delta, shared * total, dz * (z + z0) * (shared * delta)
 
 
 @kernel
-def crank(geometry: np.void, i: int, x: float, y: float) -> tuple[float, float]:
-    """Chain i's crank at (x, y): s = L1 sin(theta), across its direction of action, and c = L1 cos(theta), in m."""
+def crank(geometry: np.void, i: int, x: float, y: float) -> tuple[float, float, float, float]:
+    """Chain i's crank at (x, y): s = L1 sin(theta), across its direction of action, and c = L1 cos(theta), in m; 1 / c
+    and L1 - c, as in ``link`` by one division.
+    """
     n, length = geometry["n"], geometry["crank_m"]
     s = n[i, 0] * x + n[i, 1] * y
-    return s, math.sqrt((length - s) * (length + s))
+    c = math.sqrt((length - s) * (length + s))
+    total = length + c
+    shared = 1.0 / (c * total)
+    return s, c, shared * total, s * s * (shared * c)
 
 
 @kernel
-def stroke(geometry: np.void, i: int, x: float, y: float, s: float, c: float, drop: float) -> float:
-    """q_i in m from what ``crank`` and ``link`` say."""
+def stroke(geometry: np.void, i: int, x: float, y: float, short: float, drop: float) -> float:
+    """q_i in m from the last number of ``crank`` and that of ``link``."""
     e = geometry["e"]
-    return e[i, 0] * x + e[i, 1] * y + drop + s * s / (geometry["crank_m"] + c)
+    return e[i, 0] * x + e[i, 1] * y + drop + short
 
 
 @kernel
 def strokes(geometry: np.void, position_m: Array, out: Array) -> None:
     """Inverse kinematics (Eq. 8): strokes q (3,) in m relative to rest. ``position_m`` must be ``in_domain``."""
     x, y = position_m[0], position_m[1]
-    _, _, drop = link(geometry, position_m[2])
+    _, _, _, drop = link(geometry, position_m[2])
     for i in range(3):
-        s, c = crank(geometry, i, x, y)
-        out[i] = stroke(geometry, i, x, y, s, c, drop)
+        _, _, _, short = crank(geometry, i, x, y)
+        out[i] = stroke(geometry, i, x, y, short, drop)
 
 
 @kernel
 def jacobian(geometry: np.void, position_m: Array, out: Array) -> None:
     """dq/dx (3,3) at ``position_m``: rows [e_i + n_i tan(theta_i), tan(alpha)]. Eq. 12 is its value at rest."""
     e, n = geometry["e"], geometry["n"]
-    z, delta, _ = link(geometry, position_m[2])
-    slope = z / delta
+    z, _, per_delta, _ = link(geometry, position_m[2])
+    slope = z * per_delta
     for i in range(3):
-        s, c = crank(geometry, i, position_m[0], position_m[1])
-        tangent = s / c
+        s, _, per_c, _ = crank(geometry, i, position_m[0], position_m[1])
+        tangent = s * per_c
         out[i, 0] = e[i, 0] + n[i, 0] * tangent
         out[i, 1] = e[i, 1] + n[i, 1] * tangent
         out[i, 2] = slope
@@ -143,10 +152,10 @@ def link_bend(geometry: np.void, delta: float) -> float:
 def curvature(geometry: np.void, position_m: Array, out: Array) -> None:
     """d2q_i/dx2 (3,3,3) in 1/m at ``position_m``, first axis the chain."""
     n = geometry["n"]
-    _, delta, _ = link(geometry, position_m[2])
+    _, delta, _, _ = link(geometry, position_m[2])
     out[:] = 0.0
     for i in range(3):
-        _, c = crank(geometry, i, position_m[0], position_m[1])
+        _, c, _, _ = crank(geometry, i, position_m[0], position_m[1])
         across = crank_bend(geometry, c)
         for a in range(2):
             for b in range(2):
@@ -167,24 +176,25 @@ def newton_step(geometry: np.void, strokes_m: Array, position_m: Array, residual
     """
     e, n = geometry["e"], geometry["n"]
     x, y = position_m[0], position_m[1]
-    z, delta, drop = link(geometry, position_m[2])
-    s, c = crank(geometry, 0, x, y)
-    r0 = residual_m[0] = strokes_m[0] - stroke(geometry, 0, x, y, s, c, drop)
-    a0, b0 = e[0, 0] + n[0, 0] * (s / c), e[0, 1] + n[0, 1] * (s / c)
-    s, c = crank(geometry, 1, x, y)
-    residual_m[1] = strokes_m[1] - stroke(geometry, 1, x, y, s, c, drop)
+    z, delta, _, drop = link(geometry, position_m[2])
+    s, _, per_c, short = crank(geometry, 0, x, y)
+    r0 = residual_m[0] = strokes_m[0] - stroke(geometry, 0, x, y, short, drop)
+    a0, b0 = e[0, 0] + n[0, 0] * (s * per_c), e[0, 1] + n[0, 1] * (s * per_c)
+    s, _, per_c, short = crank(geometry, 1, x, y)
+    residual_m[1] = strokes_m[1] - stroke(geometry, 1, x, y, short, drop)
     r1 = residual_m[1] - r0
-    a1, b1 = e[1, 0] + n[1, 0] * (s / c) - a0, e[1, 1] + n[1, 1] * (s / c) - b0
-    s, c = crank(geometry, 2, x, y)
-    residual_m[2] = strokes_m[2] - stroke(geometry, 2, x, y, s, c, drop)
+    a1, b1 = e[1, 0] + n[1, 0] * (s * per_c) - a0, e[1, 1] + n[1, 1] * (s * per_c) - b0
+    s, _, per_c, short = crank(geometry, 2, x, y)
+    residual_m[2] = strokes_m[2] - stroke(geometry, 2, x, y, short, drop)
     r2 = residual_m[2] - r0
-    a2, b2 = e[2, 0] + n[2, 0] * (s / c) - a0, e[2, 1] + n[2, 1] * (s / c) - b0
+    a2, b2 = e[2, 0] + n[2, 0] * (s * per_c) - a0, e[2, 1] + n[2, 1] * (s * per_c) - b0
     determinant = a1 * b2 - a2 * b1
     if determinant == 0.0 or z == 0.0:
         return math.inf
-    dx = (r1 * b2 - r2 * b1) / determinant
-    dy = (a1 * r2 - a2 * r1) / determinant
-    dz = (r0 - a0 * dx - b0 * dy) * delta / z
+    inverse, per_slope = 1.0 / determinant, delta / z
+    dx = (r1 * b2 - r2 * b1) * inverse
+    dy = (a1 * r2 - a2 * r1) * inverse
+    dz = (r0 - a0 * dx - b0 * dy) * per_slope
     position_m[0] = x + dx
     position_m[1] = y + dy
     position_m[2] += dz

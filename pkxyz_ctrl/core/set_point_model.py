@@ -91,15 +91,12 @@ def approach(set_points: np.void, model: np.void, period_s: float, now: Array, a
             aim[0, i], aim[1, i] = now[i], after[i]
         for i in range(3):
             aim[0, i] += short[i]
-            short[i] -= jump(period_s, now, after, i)
-        _step(set_points, short)
+        _step(set_points, short, period_s, now, after, short)
         for i in range(3):
             aim[1, i] += short[i]
     for i in range(9):
         aim[2, i], expected[0, i], expected[1, i] = later[i], after[i], later[i]
-    for i in range(3):
-        following[i] = short[i] - jump(period_s, after, later, i)
-    _step(set_points, following)
+    _step(set_points, short, period_s, after, later, following)
     for i in range(3):
         aim[2, i] += following[i]
     model["foreseen"] = 1
@@ -107,13 +104,14 @@ def approach(set_points: np.void, model: np.void, period_s: float, now: Array, a
 
 
 @kernel
-def _step(set_points: np.void, short: Array) -> None:
-    """A tick's share of the way is made."""
-    square = short[0] * short[0] + short[1] * short[1] + short[2] * short[2]
-    most = set_points["jump_step_m"]
-    left = 1.0 - most / math.sqrt(square) if square > most * most else 0.0
-    for i in range(3):
-        short[i] *= left
+def _step(set_points: np.void, short: Array, period_s: float, now: Array, after: Array, out: Array) -> None:
+    """Of the way that is missing, with a jump between two rows added to it, a tick's share is made: write the rest."""
+    x, y = short[0] - jump(period_s, now, after, 0), short[1] - jump(period_s, now, after, 1)
+    z, most = short[2] - jump(period_s, now, after, 2), set_points["jump_step_m"]
+    square, left = x * x + y * y + z * z, 0.0
+    if square > most * most:
+        left = 1.0 - most / math.sqrt(square)
+    out[0], out[1], out[2] = left * x, left * y, left * z
 
 
 @kernel
@@ -142,14 +140,18 @@ def follow(
     """
     state, sample, applied = model["state"], model["sample_m"], model["applied_n"]
     fed_back, before = model["fed_back_n"], model["fed_back_old_n"]
-    position, w, w_change, after = scratch["position_m"], scratch["w_n"], scratch["w_change_n"], scratch["state"]
+    position, w, w_change, start = scratch["position_m"], scratch["w_n"], scratch["w_change_n"], scratch["state"]
     filtering.midway(estimator, state, position)
-    filtering.net_input(geometry, elasticity, estimator, position, force_n, applied, fed_back, before, w, w_change)
-    filtering.predict(estimator, state, w, w_change, after)
-    if filtering.goes_far(estimator, state, after):
+    nothing = scratch["nothing"]
+    filtering.net_input(
+        geometry, elasticity, estimator, position, force_n, applied, fed_back, before, nothing, w, w_change
+    )
+    for i in range(9):
+        start[i] = state[i]
+    filtering.predict(estimator, start, w, w_change, state)
+    if filtering.goes_far(estimator, start, state):
         filtering.predict_far(
-            geometry, elasticity, estimator, state, force_n, applied, fed_back, before, scratch["nothing"],
-            scratch["far"], after,
+            geometry, elasticity, estimator, start, force_n, applied, fed_back, before, nothing, scratch["far"], state,
         )  # fmt: skip
     tau, origin = estimator["sense_delay_s"], estimator["operating_point_m"]
     for age in range(DELAY_MAX):
@@ -157,6 +159,4 @@ def follow(
             sample[age, i] = sample[age + 1, i]
     for i in range(3):
         before[i], applied[i] = fed_back[i], force_n[i]
-        sample[delay_periods, i] = origin[i] + after[i] - tau * after[3 + i]
-    for i in range(9):
-        state[i] = after[i]
+        sample[delay_periods, i] = origin[i] + state[i] - tau * state[3 + i]

@@ -158,11 +158,9 @@ def estimate(law: np.void, memory: np.void, has_measurement: bool) -> None:
     if online:
         memory["to_learn"] = _SEEN if has_measurement else _BLIND
     position, w, w_change = scratch["position_m"], scratch["w_n"], scratch["w_change_n"]
-    acting, acted, start = scratch["acting_n"], scratch["acted_n"], scratch["state"]
+    acting, acted, start = scratch["acting_n"], scratch["acted_n"], state["filtered"]
     ahead, none = state["ahead"], scratch["nothing"]
     told = learnt["told_n"] if online else none
-    for i in range(9):
-        start[i] = state["filtered"][i]
     for i in range(3):
         seen[i] = seen[i] if has_measurement else origin[i] + start[i]
     for step in range(delay):
@@ -170,21 +168,24 @@ def estimate(law: np.void, memory: np.void, has_measurement: bool) -> None:
         voltage.forces_of_counts(drive, memory["count"][age], acting)
         voltage.forces_of_counts(drive, memory["count"][age + 1], acted)
         filtering.midway(estimator, start, position)
-        filtering.net_input(
-            law["geometry"], law["elasticity"], estimator, position, acting, acted, none, none, w, w_change
-        )
         if online:
             adaptation.tell(learnt, age)
-            for i in range(3):
-                w[i] += told[i]
+        filtering.net_input(
+            law["geometry"], law["elasticity"], estimator, position, acting, acted, none, none, told, w, w_change
+        )
         filtering.predict(estimator, start, w, w_change, ahead)
         if filtering.goes_far(estimator, start, ahead):
             far, geometry, elasticity = scratch["far"], law["geometry"], law["elasticity"]
             filtering.predict_far(geometry, elasticity, estimator, start, acting, acted, none, none, told, far, ahead)
-        for i in range(9):  # an assignment of whole arrays costs ten times as much: numba looks whether they overlap
-            start[i] = ahead[i]
-            if step == 0:
+        if step == 0:
+            for i in range(
+                9
+            ):  # an assignment of whole arrays costs ten times as much: numba looks whether they overlap
                 state["predicted"][i] = ahead[i]
+        if step + 1 < delay:
+            start = scratch["state"]
+            for i in range(9):
+                start[i] = ahead[i]
 
 
 @kernel

@@ -56,14 +56,15 @@ def counts_for_forces(
     the last one.
     """
     slew, most, scale = drive["count_slew_max"], drive["count_max"], drive["volt_per_count"]
-    gain = drive["force_gain_n_per_v2"]
+    gain, per_volt = drive["force_gain_n_per_v2"], 1.0 / scale
     for i in range(3):
-        wanted = math.sqrt(force_n[i] / gain[i]) if force_n[i] > 0.0 else 0.0  # NaN counts as no force
+        per_gain = 1.0 / gain[i]
+        wanted = math.sqrt(force_n[i] * per_gain) if force_n[i] > 0.0 else 0.0  # NaN counts as no force
         if drive["noise_shaping"] != 0 and wanted > 0.0:
             wanted += carry_v[i]
         low, high = max(0, count_last[i] - slew), min(most, count_last[i] + slew)
         above = scale * np.int32(high + 1)
-        nearest = np.int32(wanted / scale + 0.5) if wanted < above else high  # 0 for the least: -0.5
+        nearest = np.int32(wanted * per_volt + 0.5) if wanted < above else high  # 0 for the least: -0.5
         count[i] = min(max(nearest, low), high)
         carry_v[i] = min(max(wanted - scale * count[i], -scale), scale)
 

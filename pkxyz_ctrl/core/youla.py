@@ -16,7 +16,7 @@ from pkxyz_ctrl.core.feedback import stands_still
 
 Array = NDArray[np.float64]
 
-TAPS_MAX = 40
+TAPS_MAX = 40  # even
 
 YOULA = np.dtype(
     [
@@ -73,15 +73,20 @@ def add_feedback(youla: np.void, state: np.void, share: float, out: Array) -> No
 
 @kernel
 def _add_filtered(tap: Array, taps: int, state: np.void, share: float, out: Array) -> None:
+    """In two sums an axis, of even and of odd ages, which need not wait for one another. Taps not in use are 0."""
     innovation, at = state["innovation_m"], state["newest"]
-    x, y, z = 0.0, 0.0, 0.0
-    for j in range(taps):
-        x += tap[j, 0] * innovation[at + j, 0]
-        y += tap[j, 1] * innovation[at + j, 1]
-        z += tap[j, 2] * innovation[at + j, 2]
-    out[0] -= share * x
-    out[1] -= share * y
-    out[2] -= share * z
+    x, y, z, odd_x, odd_y, odd_z = 0.0, 0.0, 0.0, 0.0, 0.0, 0.0
+    for j in range(0, taps, 2):
+        n = at + j
+        x += tap[j, 0] * innovation[n, 0]
+        y += tap[j, 1] * innovation[n, 1]
+        z += tap[j, 2] * innovation[n, 2]
+        odd_x += tap[j + 1, 0] * innovation[n + 1, 0]
+        odd_y += tap[j + 1, 1] * innovation[n + 1, 1]
+        odd_z += tap[j + 1, 2] * innovation[n + 1, 2]
+    out[0] -= share * (x + odd_x)
+    out[1] -= share * (y + odd_y)
+    out[2] -= share * (z + odd_z)
 
 
 @kernel

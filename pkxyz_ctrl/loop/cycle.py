@@ -116,7 +116,7 @@ _LANDS_ONCE = int(Trip.OVERRUN)  # a computer that is late on the way down, too,
 
 def new_memory(mode: Mode = Mode.BOOT) -> NDArray[np.void]:
     """Memory of a controller that has just been switched on, in a mode: nothing known, 0 V, no reference."""
-    memory = np.zeros(1, MEMORY)
+    memory = np.frombuffer(bytearray(MEMORY.itemsize), MEMORY)  # as zeros(), which goes through the fields one by one
     memory["mode"] = mode
     return memory
 
@@ -144,6 +144,7 @@ def observe(law_array: Records, memory_array: Records, reference: Records) -> No
         _go_on_landing(law, memory)
     seen = memory["input"]
     usable = (seen["sense_status"] & _UNUSABLE) == 0
+    set_points.reference_rows(law, memory, reference)  # long before they are read: see ``hil.lanes.fast.run_block``
     if NODE_EXPECTED[memory["mode"]] == 0:  # an estimate that ran away with what broke would outlive the clear
         tick.set_at_rest(law["tick"], memory["tick"])
     if usable:
@@ -158,7 +159,6 @@ def observe(law_array: Records, memory_array: Records, reference: Records) -> No
     if memory["suspects"] != 0:
         for i in range(3):
             memory["tick"]["estimate"]["innovation_m"][i] = memory["rejected_innovation_m"][i]
-    set_points.reference_rows(law, memory, reference)
     quiet = law["quiet_holds"] != 0 or memory["input"]["quiet"] != 0
     youla.ask(memory["tick"]["youla"], quiet, memory["here"], memory["later"])
 

@@ -74,7 +74,8 @@ def test_what_is_multiplied_by_nothing_may_be_left_out(bus_name):
             record["decoupled"] = decoupled
             at, w, w_change, out = np.empty(3), np.empty(3), np.empty(3), np.empty(9)
             filtering.midway(record, s, at)
-            filtering.net_input(geometry, elasticity, record, at, force, old, apart, 0.5 * apart, w, w_change)
+            told = 0.1 * apart
+            filtering.net_input(geometry, elasticity, record, at, force, old, apart, 0.5 * apart, told, w, w_change)
             filtering.predict(record, s, w, w_change, out)
             found.append(np.concatenate([w, w_change, out]).tobytes())
         assert found[0] == found[1]
@@ -141,7 +142,7 @@ def test_far_ways_are_predicted_by_simpsons_rule(seed):
     middle, w, w_change, once, twice = np.empty(3), np.empty(3), np.empty(3), np.empty(9), np.empty(9)
     filtering.midway(record, s, middle)
     none = np.zeros(3)
-    filtering.net_input(law["geometry"], law["elasticity"], record, middle, force, old, none, none, w, w_change)
+    filtering.net_input(law["geometry"], law["elasticity"], record, middle, force, old, none, none, none, w, w_change)
     filtering.predict(record, s, w, w_change, once)
     twice[:] = once
     room = np.zeros(1, filtering.FAR)[0]
