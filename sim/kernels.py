@@ -76,8 +76,10 @@ def _move(p: np.void, s: np.void, total_s: float) -> None:
     remaining = total_s
     while remaining > 0.0:
         duration = plan(p, s, remaining)
-        n = math.ceil(duration / p["longest_s"])
-        h = duration / n
+        n, h = 1, duration
+        if duration > p["longest_s"]:  # seldom: two divisions, for which all that follows would wait
+            n = math.ceil(duration / p["longest_s"])
+            h = duration / n
         for k in range(n):
             if p["crosstalk_on"] != 0 and p["sense_filter_s"] > 0.0:
                 follow_voltages(p, s, h)

@@ -200,6 +200,7 @@ def state_at_rest(params: np.ndarray, config: PlantConfig, seed: int) -> np.ndar
     p, s = params[0], state[0]
     s["target_v"] = s["voltage_v"] = p["amplifier_offset_v"]
     s["force_n"] = p["weight_n"]
+    s["slider_at_m"] = np.inf  # nowhere yet
     volt2 = s["voltage_v"] ** 2
     s["motion"][:3] = equilibrium(params, state, volt2)
     if p["parasitic_on"]:

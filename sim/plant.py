@@ -1,7 +1,7 @@
 """The software plant as an object: integer time, counts in, counts out, and a view of the truth."""
 
 from collections.abc import Sequence
-from typing import NamedTuple
+from typing import NamedTuple, Self
 
 import numpy as np
 
@@ -21,6 +21,11 @@ class Event(NamedTuple):
     t_us: int
     kind: str
     chain: int
+
+
+def _copied(record: np.ndarray) -> np.ndarray:
+    """Of a one-element record, which numpy would copy field by field."""
+    return np.frombuffer(bytearray(record.tobytes()), record.dtype)
 
 
 class Plant:
@@ -62,10 +67,19 @@ class Plant:
             sense_f_per_count=sense_scale_f_per_count,
             sense_zero_f=sense_offset_f,
         )
-        self.state = state_at_rest(self.params, config, seed)
+        self._begin(self.params, state_at_rest(self.params, config, seed))
+
+    def _begin(self, params: np.ndarray, state: np.ndarray) -> None:
+        self.params, self.state = params, state
         self._time_us = self.state["t_us"]  # a view
         self._counts_in = np.zeros(3, np.int32)
         self._counts_out = np.zeros(3, np.int32)
+
+    def copy(self) -> Self:
+        """Another plant of the same device, as this one is now: from here on each goes its own way."""
+        other = object.__new__(type(self))
+        other._begin(_copied(self.params), _copied(self.state))
+        return other
 
     @property
     def t_us(self) -> int:

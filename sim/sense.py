@@ -13,7 +13,7 @@ import math
 
 import numpy as np
 
-from sim.motion.geometry import strokes
+from sim.motion.geometry import see_sliders
 from sim.motion.kernel import kernel
 from sim.motion.layout import KNOTS, SENSE_DRIFT_STREAM, SENSE_STREAM
 from sim.motion.noise import normal, total
@@ -137,16 +137,21 @@ def sample(params: np.ndarray, state: np.ndarray, counts: np.ndarray) -> None:
         if p["mode_count"] > 0:
             combs_seen(p, s, q, s["rates_m_per_s"])
         else:
-            strokes(p, s["motion"], q)
+            see_sliders(p, s, s["motion"])
+            for i in range(3):
+                q[i] = s["slider_m"][i]
         if p["parasitic_on"] != 0:
             for i in range(3):
                 q[i] += p["parasitic_comb"][i] * s["parasitic"][0]
-    step = p["adc_step"]
+    step, white = p["adc_step"], s["sense_white"]
+    per_count, per_step = 1.0 / p["count_f"], 1.0 / step
+    for i in range(3):  # by themselves: which way a draw goes nobody foresees, and what is under way then is lost
+        n = SENSE_STREAM + i
+        white[i] = normal(s["random"][n], s["spare"][n]) if p["sense_noise_f"] > 0.0 else 0.0
     for i in range(3):
         farad = p["sense_rest_f"] + p["sense_f_per_m"][i] * q[i] * (1.0 + 0.5 * p["sense_curvature_per_m"] * q[i])
         farad += p["sense_offset_f"][i] + s["sense_walk_f"][i] + p["feedthrough_f_per_v"] * s["voltage_v"][i]
-        if p["sense_noise_f"] > 0.0:
-            farad += p["sense_noise_f"] * normal(s["random"][SENSE_STREAM + i], s["spare"][SENSE_STREAM + i])
+        farad += p["sense_noise_f"] * white[i]
         if p["sense_chain_noise_f"] > 0.0:
             farad += p["sense_chain_noise_f"] * s["sense_chain_noise"][i]
         if p["crosstalk_on"] != 0:
@@ -155,5 +160,5 @@ def sample(params: np.ndarray, state: np.ndarray, counts: np.ndarray) -> None:
             farad += p["sense_flicker_f"] * total(s["sense_flicker"][i])
         if p["tone_count"] > 0:
             farad += hum(p, s, i)
-        fine = max(-40000.0, min(40000.0, (farad - p["count_zero_f"]) / p["count_f"]))  # before floor: it makes an int
-        counts[i] = min(32767, max(-32768, math.floor(fine / step + 0.5) * step))
+        fine = max(-40000.0, min(40000.0, (farad - p["count_zero_f"]) * per_count))  # before floor: it makes an int
+        counts[i] = min(32767, max(-32768, math.floor(fine * per_step + 0.5) * step))

@@ -3,7 +3,7 @@
 import numpy as np
 
 from pkxyz_ctrl.compiled.kernel import kernel
-from sim.motion.geometry import strokes
+from sim.motion.geometry import see_sliders
 from sim.structure.pose import combs_seen, stand
 
 
@@ -20,11 +20,11 @@ def observe(plant: np.void, state: np.void, out: np.void) -> None:
         for i in range(3):
             out["comb_voltage_v"][i] = state["voltage_v"][i]
         return
-    strokes(plant, state["motion"], out["stroke_m"])
-    sway = state["parasitic"][0]
+    see_sliders(plant, state, state["motion"])
+    stroke_m, sway = state["slider_m"], state["parasitic"][0]
     for i in range(3):
         out["position_m"][i] = state["motion"][i] + plant["parasitic_table"][i] * sway
-        out["stroke_m"][i] += plant["parasitic_comb"][i] * sway
+        out["stroke_m"][i] = stroke_m[i] + plant["parasitic_comb"][i] * sway
         out["comb_voltage_v"][i] = state["voltage_v"][i]
 
 

@@ -10,7 +10,7 @@ import math
 
 import numpy as np
 
-from sim.motion.geometry import strokes
+from sim.motion.geometry import see_sliders, strokes
 from sim.motion.kernel import kernel
 
 
@@ -38,13 +38,13 @@ def plan(p: np.void, s: np.void, remaining_s: float) -> float:
         if p["current_a"] > 0.0:
             comb_f = 2.0 * p["force_gain_n_per_v2"][i] * (p["overlap_rest_m"] + s["strokes_m"][i])
             limit = min(limit, p["current_a"] / (comb_f + p["stray_f"]))
-        ramp_s = (abs(gap) - limit * tau) / limit
+        beyond = abs(gap) - limit * tau
         if s["held"][i] != 0:  # shorted by snapped fingers
             s["base_v"][i], s["slope_v_per_s"][i], s["error_v"][i] = 0.0, 0.0, 0.0
-        elif ramp_s > 1e-12:
+        elif beyond > 1e-12 * limit:
             s["base_v"][i], s["error_v"][i] = s["voltage_v"][i], 0.0
             s["slope_v_per_s"][i] = math.copysign(limit, gap)
-            duration = min(duration, ramp_s)
+            duration = min(duration, beyond / limit)
         else:
             s["base_v"][i], s["slope_v_per_s"][i] = s["target_v"][i], 0.0
             s["error_v"][i] = -gap if tau > 0.0 and abs(gap) > 1e-12 else 0.0
@@ -73,11 +73,13 @@ def charge(p: np.void, s: np.void, dt_s: float) -> None:
 @kernel
 def snapped(p: np.void, s: np.void) -> int:
     """Look for lateral pull-in; snapped fingers short their comb and hold the slider. Returns the chain or -1."""
-    strokes(p, s["motion"], s["strokes_m"])
+    see_sliders(p, s, s["motion"])
+    stroke_m = s["slider_m"]
     for i in range(3):
         if s["held"][i] == 0:
             volt = s["voltage_v"][i] - s["charge_v"][i]
-            if (p["overlap_rest_m"] + s["strokes_m"][i]) * volt * volt > p["lateral_limit_v2m"][i]:
+            if (p["overlap_rest_m"] + stroke_m[i]) * volt * volt > p["lateral_limit_v2m"][i]:
+                s["strokes_m"][i] = stroke_m[i]
                 snap(s, i)
                 return i
     return -1

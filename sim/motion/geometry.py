@@ -50,6 +50,22 @@ def chain(i: int, crank_m: float, x_m: float, y_m: float, drawn_m: float) -> tup
     return E_X[i] * x_m + E_Y[i] * y_m + drawn_m + (crank_m - c), w, 1.0 / c
 
 
+@inlined
+def near_chain(
+    i: int, crank_m: float, per_crank: float, x_m: float, y_m: float, drawn_m: float
+) -> tuple[float, float, float]:
+    """The same, and w / L1 in place of w, where that is 0.1 at most: 1 / c by the series of (1 - a)^(-1/2), which waits
+    for neither root nor division."""
+    w = N_X[i] * x_m + N_Y[i] * y_m
+    lean = w * per_crank
+    a = lean * lean
+    a2 = a * a
+    low, high = 1.0 + 0.5 * a + a2 * (0.375 + 0.3125 * a), 35 / 128 + 63 / 256 * a + a2 * (231 / 1024 + 429 / 2048 * a)
+    inverse_c = per_crank * (low + a2 * a2 * high)
+    short_m = crank_m - (crank_m * crank_m - w * w) * inverse_c
+    return E_X[i] * x_m + E_Y[i] * y_m + drawn_m + short_m, lean, inverse_c
+
+
 @kernel
 def strokes(p: np.void, motion: np.ndarray, out_m: np.ndarray) -> None:
     """Strokes (3,) of the sliders from rest, positive inward, for the pose in motion[:3]."""
@@ -58,6 +74,23 @@ def strokes(p: np.void, motion: np.ndarray, out_m: np.ndarray) -> None:
         u = E_X[i] * motion[0] + E_Y[i] * motion[1]
         w = N_X[i] * motion[0] + N_Y[i] * motion[1]
         out_m[i] = u + drawn_m + p["crank_m"] - leg(p["crank_m"], w)
+
+
+@kernel
+def see_sliders(p: np.void, s: np.void, pose_m: np.ndarray) -> None:
+    """At a pose (3 or more,) the strokes to s["slider_m"], the tangents of the cranks' angles to s["slider_tangent"]
+    and that of the links' to s["slider_steep"]: worked out once, for all who ask of the same pose."""
+    at, crank_m, x, y, z = s["slider_at_m"], p["crank_m"], pose_m[0], pose_m[1], pose_m[2]
+    if x == at[0] and y == at[1] and z == at[2]:
+        return
+    height_m, projection_m, drawn_m = lift(p, z)
+    for i in range(3):
+        u, w = E_X[i] * x + E_Y[i] * y, N_X[i] * x + N_Y[i] * y
+        c = leg(crank_m, w)
+        s["slider_m"][i] = u + drawn_m + crank_m - c
+        s["slider_tangent"][i] = w / c
+    s["slider_steep"] = height_m / projection_m
+    at[0], at[1], at[2] = x, y, z
 
 
 @kernel

@@ -92,8 +92,7 @@ def transient(p: np.void, s: np.void) -> None:
     for i in range(3):
         s["volt2"][i] = 2.0 * (s["base_v"][i] - s["charge_v"][i]) * error[i]
         s["error_volt2"][i] = error[i] * error[i]
-    x, y, z = s["motion"][0], s["motion"][1], s["motion"][2]
-    ax, ay, az, bx, by, bz = comb_accelerations(p, s["volt2"], s["error_volt2"], x, y, z)
+    ax, ay, az, bx, by, bz = comb_accelerations(p, s, s["volt2"], s["error_volt2"], s["motion"])
     one[0], one[1], one[2] = times(p["response_1_s2"], ax, ay, az)
     one_push[0], one_push[1], one_push[2] = times(p["response_1"], ax, ay, az)
     two[0], two[1], two[2] = times(p["response_2_s2"], bx, by, bz)
@@ -178,6 +177,7 @@ def step(p: np.void, s: np.void, h: float) -> None:
     s["error_v"][0], s["error_v"][1], s["error_v"][2] = error0, error1, error2
     for i in range(3):
         s["touched"][i] = 0
-    n = math.ceil(h / CONTACT_S)
+    whole = s["tabulated_h_s"]  # h, read here so that no step without a stop works out what follows
+    n = math.ceil(whole / CONTACT_S)
     for _ in range(n):
-        _step(p, s, h / n)
+        _step(p, s, whole / n)

@@ -114,7 +114,9 @@ STATE = np.dtype(
         ("modes", "f8", (2, MODES)),  # coordinates (m) and rates (m/s) of the flexible modes
         ("tone_phase", "f8", (TONES, 3, 2)),  # cosine and sine, by axis or channel
         ("amplifier_flicker", "f8", (3, FLICKERS)), ("sense_flicker", "f8", (3, FLICKERS)),  # in deviations
-        ("sense_chain_noise", "f8", 3),  # in deviations
+        ("sense_chain_noise", "f8", 3), ("sense_white", "f8", 3),  # in deviations
+        # the mechanism's strokes, how its cranks and links lie, and the pose that these belong to
+        ("slider_m", "f8", 3), ("slider_tangent", "f8", 3), ("slider_steep", "f8"), ("slider_at_m", "f8", 3),
         ("filtered_v", "f8", 3),
         ("aside_m", "f8", 3), ("comb_rise", "f8", 3),  # what fingers bend aside, and what that does to their force
         ("rise_line", "f8", (3, 3)),  # ... tangent by chain: constant, per V^2, per m of stroke

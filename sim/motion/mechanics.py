@@ -13,7 +13,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from sim.motion.geometry import E_X, E_Y, N_X, N_Y, chain, leg, lift
+from sim.motion.geometry import E_X, E_Y, N_X, N_Y, chain, leg, lift, near_chain, see_sliders
 from sim.motion.kernel import inlined, kernel
 
 NEAR = 0.1
@@ -30,8 +30,9 @@ def arcsine(y: float) -> float:
 def near_arcsine(y: float) -> float:
     """asin(y) of at most ``NEAR``, by its series."""
     s = y * y
-    tail = 105.0 / 3456.0 + s * (945.0 / 42240.0 + s * (10395.0 / 599040.0))
-    return y * (1.0 + s * (1.0 / 6.0 + s * (3.0 / 40.0 + s * (15.0 / 336.0 + s * tail))))
+    fourth = s * s
+    tail = 15.0 / 336.0 + s * (105.0 / 3456.0) + fourth * (945.0 / 42240.0 + s * (10395.0 / 599040.0))
+    return y * (1.0 + s * (1.0 / 6.0 + s * (3.0 / 40.0) + fourth * tail))
 
 
 @kernel
@@ -164,33 +165,31 @@ def _near_pull(
     m: Constants, i: int, volt2: float, x: float, y: float, drawn_m: float
 ) -> tuple[float, float, float, float, float]:
     """Chain i's part: its force in the plane, N, its pull, N, the comb's in that, and whether it is near."""
-    q, w, inverse_c = chain(i, m.crank_m, x, y, drawn_m)
+    q, lean, inverse_c = near_chain(i, m.crank_m, m.per_crank, x, y, drawn_m)
     comb = m.comb[i] * (1.0 + m.fringe_per_m * q) * volt2
-    pull, lean = comb - m.leaf[i] * q, w * m.per_crank
-    turn = pull * (w * inverse_c) - m.crank_hinge[i] * near_arcsine(lean) * inverse_c
+    pull = comb - m.leaf[i] * q
+    turn = (pull * (lean * m.crank_m) - m.crank_hinge[i] * near_arcsine(lean)) * inverse_c
     near = 1.0 if (q >= m.stop_low_m) & (q <= m.stop_high_m) & (abs(lean) <= NEAR) else 0.0
     return pull * E_X[i] + turn * N_X[i], pull * E_Y[i] + turn * N_Y[i], pull, comb, near
 
 
 @kernel
 def comb_accelerations(
-    p: np.void, one: np.ndarray, two: np.ndarray, x: float, y: float, z: float
+    p: np.void, s: np.void, one: np.ndarray, two: np.ndarray, pose_m: np.ndarray
 ) -> tuple[float, float, float, float, float, float]:
     """The combs' own part of ``undamped_acceleration``, which is linear in squared voltages (3,): for two sets of them
-    at one pose, one after the other."""
-    height_m, projection_m, drawn_m = lift(p, z)
+    at one pose (3 or more,), one after the other."""
+    see_sliders(p, s, pose_m)
     fx, fy, combs, gx, gy, others = 0.0, 0.0, 0.0, 0.0, 0.0, 0.0
     for i in range(3):
-        w = N_X[i] * x + N_Y[i] * y
-        c = leg(p["crank_m"], w)
-        q = E_X[i] * x + E_Y[i] * y + drawn_m + (p["crank_m"] - c)
-        gain = p["force_gain_n_per_v2"][i] * (1.0 + p["fringe_per_m"] * q)
-        along_x, along_y = E_X[i] + N_X[i] * w / c, E_Y[i] + N_Y[i] * w / c
+        tangent = s["slider_tangent"][i]
+        gain = p["force_gain_n_per_v2"][i] * (1.0 + p["fringe_per_m"] * s["slider_m"][i])
+        along_x, along_y = E_X[i] + N_X[i] * tangent, E_Y[i] + N_Y[i] * tangent
         comb, other = gain * one[i], gain * two[i]
         fx, gx = fx + comb * along_x, gx + other * along_x
         fy, gy = fy + comb * along_y, gy + other * along_y
         combs, others = combs + comb, others + other
-    per_kg, steep = p["per_kg"], height_m / projection_m + p["levitation"]
+    per_kg, steep = p["per_kg"], s["slider_steep"] + p["levitation"]
     return fx * per_kg, fy * per_kg, combs * steep * per_kg, gx * per_kg, gy * per_kg, others * steep * per_kg
 
 

@@ -118,7 +118,7 @@ def _transient(p: np.void, s: np.void, n: int) -> None:
         pose[j] = s["motion"][j]
         for k in range(n - 3):
             pose[j] -= p["mode_table"][k, j] * s["modes"][0, k]
-    ax, ay, az, bx, by, bz = comb_accelerations(p, s["volt2"], s["error_volt2"], pose[0], pose[1], pose[2])
+    ax, ay, az, bx, by, bz = comb_accelerations(p, s, s["volt2"], s["error_volt2"], pose)
     _comb_forces(p, s["volt2"], pose[0], pose[1], pose[2], s["comb_n"])
     _generalise(p, s["comb_n"], ax, ay, az, n - 3, pull)
     _answer(p["general_response_1_s2"], pull, n, s["general_one"])

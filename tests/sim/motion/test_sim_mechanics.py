@@ -113,7 +113,7 @@ def test_combs_act_through_the_transposed_jacobian(x, volt2):
     s["force_n"] = 0.0
     expected = jacobian(par, x).T @ (par["force_gain_n_per_v2"] * volt2) / par["mass_kg"]
     np.testing.assert_allclose(
-        comb_accelerations(par, volt2, 0.5 * volt2, *x), [*expected, *(0.5 * expected)], rtol=1e-9, atol=1e-9
+        comb_accelerations(par, s, volt2, 0.5 * volt2, x), [*expected, *(0.5 * expected)], rtol=1e-9, atol=1e-9
     )
     both = np.array(acceleration(par, s, volt2, *x, 0.0, 0.0, 0.0))
     alone = np.array(acceleration(par, s, np.zeros(3), *x, 0.0, 0.0, 0.0))
