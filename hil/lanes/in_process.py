@@ -83,7 +83,7 @@ def run(
     else:
         raise ValueError(f"the {lane} lane waits for a clock: hil.lanes.wall")
     factor = setup.ticks * setup.bus.period_s / (time.perf_counter() - begin_s)
-    adaptation = memory["tick"]["adaptation"].copy()
+    adaptation = memory["tick"]["adaptation"]
     return LaneResult(setup.ticks, missed, load, tuple(faults), factor, learner, lost, adaptation)
 
 

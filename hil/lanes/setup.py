@@ -110,6 +110,11 @@ class Setup:
 
     def new_plant(self) -> Plant:
         """A plant at rest, at its time 0."""
+        return self._plant_at_rest.copy()
+
+    @cached_property
+    def _plant_at_rest(self) -> Plant:
+        """Nobody moves it: built once, as the law is designed once."""
         return Plant(
             self.plant,
             self.device,
