@@ -38,8 +38,12 @@ _OPTIONS = (  # of LLVM, for all that this process compiles; one that it should 
     "-slp-max-reg-size=128",
     "-slp-threshold=2",
 )
-_ROLLED_OUT = 60
-"""Up to so many instructions loops are rolled out."""
+_SHAPE = {  # what else LLVM is told here: up to so many instructions ...
+    "unroll-threshold": 60,  # loops are rolled out,
+    "tail-dup-size": 4,  # the end of a branch is written twice, in place of a jump,
+    "two-entry-phi-node-folding-threshold": 2,  # both branches are worked out, in place of one
+}
+_SHAPE_ELSEWHERE = {"tail-dup-size": 2, "two-entry-phi-node-folding-threshold": 4}  # as LLVM has it
 
 
 def optimise_whole_programs() -> None:
@@ -49,7 +53,7 @@ def optimise_whole_programs() -> None:
         config.SLP_VECTORIZE = 1  # the pass that makes pairs; off with numba
         for option in _OPTIONS:
             set_option("numba", option)
-        _roll_out(_ROLLED_OUT)
+        _tell(_SHAPE)
         FunctionIdentity._unique_ids = iter(_drawn, None)  # without an end; a fork draws others
         if platform.machine() in ("x86_64", "AMD64"):
             JITCPUCodegen._customize_tm_options = _choose_near
@@ -58,16 +62,17 @@ def optimise_whole_programs() -> None:
 
 @contextmanager
 def rolled_out(instructions: int) -> Iterator[None]:
-    """Roll loops out up to so many meanwhile, whatever this process compiles else."""
-    _roll_out(instructions)
+    """For others than this machine: roll loops out up to so many, whatever this process compiles else."""
+    _tell({"unroll-threshold": instructions, **_SHAPE_ELSEWHERE})
     try:
         yield
     finally:
-        _roll_out(_ROLLED_OUT)
+        _tell(_SHAPE)
 
 
-def _roll_out(instructions: int) -> None:
-    set_option("numba", f"-unroll-threshold={instructions}")
+def _tell(options: dict[str, int]) -> None:
+    for name, value in options.items():
+        set_option("numba", f"-{name}={value}")
 
 
 def _choose_near(codegen: Any, options: dict[str, Any]) -> None:

@@ -343,10 +343,10 @@ def foresee(
         newest[i, FRINGE] = newest[i, LIFT] = 0.0
         lost_n = damping[i, 0] * row[3] + damping[i, 1] * row[4] + damping[i, 2] * row[5]
         newest[i, DAMPING] = spread[DAMPING] * lost_n
-    newest[2, LINK] = spread[LINK] * bent["link_n_m"] / bent["projection_m"]
+    newest[2, LINK] = spread[LINK] * bent["link_n_m"] * bent["per_projection_m"]
     for i in range(3):
         pull = inverse[0, i] * feedforward_n[0] + inverse[1, i] * feedforward_n[1] + inverse[2, i] * feedforward_n[2]
-        _note_chain(adaptation["fringe_m"], spread, geometry, i, bent, pulls[i], pull, newest)
+        _note_chain(1.0 / adaptation["fringe_m"], spread, geometry, i, bent, pulls[i], pull, newest)
 
 
 @kernel
@@ -362,15 +362,15 @@ def note(state: np.void, start: Array) -> None:
 
 @kernel
 def _note_chain(
-    fringe_m: float, spread: Array, geometry: np.void, i: int, bent: np.void, along: Array, pull_n: float, out: Array
+    per_m: float, spread: Array, geometry: np.void, i: int, bent: np.void, along: Array, pull_n: float, out: Array
 ) -> None:
     """What errors of chain i make the feed-forward lack, per ``spread``: its comb's pull, springs, and its share of the
     rest. ``along`` (3,) is where the comb pulls.
     """
     n = geometry["n"]
-    across = spread[CRANK + i] * bent["crank_n_m"][i] / bent["along_m"][i]
+    across = spread[CRANK + i] * bent["crank_n_m"][i] * bent["per_along_m"][i]
     spring = spread[SLIDER + i] * bent["slider_n"][i]
-    pulled, grown = spread[COMB + i] * pull_n, spread[FRINGE] * pull_n * bent["stroke_m"][i] / fringe_m
+    pulled, grown = spread[COMB + i] * pull_n, spread[FRINGE] * pull_n * bent["stroke_m"][i] * per_m
     for k in range(3):
         out[k, COMB + i] = -pulled * along[k]
         out[k, SLIDER + i] = spring * (along[k] if k < 2 else along[k] - geometry["lift"])

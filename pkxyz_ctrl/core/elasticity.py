@@ -30,11 +30,11 @@ ELASTICITY = np.dtype(
 
 BENT = np.dtype(
     [
-        ("along_m", "f8", (3,)),  # of each chain: c, as ``kinematics.crank`` says it
+        ("per_along_m", "f8", (3,)),  # of each chain: 1 / c, as ``kinematics.crank`` says it
         ("stroke_m", "f8", (3,)),
         ("slider_n", "f8", (3,)),  # that the slider's springs need
         ("crank_n_m", "f8", (3,)),  # that the parallelogram needs
-        ("projection_m", "f8"),  # of the links
+        ("per_projection_m", "f8"),  # 1 / delta of the links
         ("link_n_m", "f8"),  # that their hinges need
     ],
     align=True,
@@ -134,13 +134,13 @@ def gradient_and_pulls(
     how the stage bends there: a record of ``BENT``.
     """
     e, n = geometry["e"], geometry["n"]
-    along_m, stroke_m, slider_n, crank_n_m = bent["along_m"], bent["stroke_m"], bent["slider_n"], bent["crank_n_m"]
+    along, stroke_m, slider_n, crank_n_m = bent["per_along_m"], bent["stroke_m"], bent["slider_n"], bent["crank_n_m"]
     x, y = position_m[0], position_m[1]
-    z, delta, per_delta, drop = link(geometry, position_m[2])
+    z, _, per_delta, drop = link(geometry, position_m[2])
     slope, per_crank = z * per_delta, 1.0 / geometry["crank_m"]
     fx = fy = pull = 0.0
     for i in range(3):
-        s, c, per_c, short = crank(geometry, i, x, y)
+        s, _, per_c, short = crank(geometry, i, x, y)
         tangent = s * per_c
         pulls_out[i, 0] = e[i, 0] + n[i, 0] * tangent
         pulls_out[i, 1] = e[i, 1] + n[i, 1] * tangent
@@ -150,8 +150,8 @@ def gradient_and_pulls(
         fx += force * e[i, 0] + across * n[i, 0]
         fy += force * e[i, 1] + across * n[i, 1]
         pull += force
-        along_m[i], stroke_m[i], slider_n[i], crank_n_m[i] = c, q, force, torque
-    bent["projection_m"], bent["link_n_m"] = delta, _link_torque(geometry, elasticity, position_m[2], drop)
+        along[i], stroke_m[i], slider_n[i], crank_n_m[i] = per_c, q, force, torque
+    bent["per_projection_m"], bent["link_n_m"] = per_delta, _link_torque(geometry, elasticity, position_m[2], drop)
     out[0], out[1], out[2] = fx, fy, (pull * z + bent["link_n_m"]) * per_delta
 
 

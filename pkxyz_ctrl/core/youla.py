@@ -77,7 +77,7 @@ def _add_filtered(tap: Array, taps: int, state: np.void, share: float, out: Arra
     innovation, at = state["innovation_m"], state["newest"]
     x, y, z, odd_x, odd_y, odd_z = 0.0, 0.0, 0.0, 0.0, 0.0, 0.0
     for j in range(0, taps, 2):
-        n = at + j
+        n = np.uint32(at + j)  # never below 0, which a signed one would be asked for
         x += tap[j, 0] * innovation[n, 0]
         y += tap[j, 1] * innovation[n, 1]
         z += tap[j, 2] * innovation[n, 2]

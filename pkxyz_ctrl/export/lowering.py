@@ -26,7 +26,7 @@ _APART = re.compile(
 _SELDOM = re.compile(
     r"10adaptation(5learn|7foresee|5begin|8set_base|8_compare|5clear)B|9estimator11predict_farB|9feed_hold6sampleB"
 )
-_ROLLED_OUT = 80  # instructions: a board counts each, and its memory is small
+_ROLLED_OUT = 70  # instructions: a board counts each, and its memory is small
 _ROUNDS = 2  # of the passes: what a callee turned out to return is known to its caller in the second
 
 

@@ -220,5 +220,5 @@ def test_instants_are_vectors():
     fresh = njit(error_model="numpy", _nrt=False)(collocation.second_round.py_func)
     fresh(p.params[0], p.state[0])
     (machine_code,) = fresh.inspect_asm().values()
-    assert "sqrtpd" in machine_code and "sqrtsd" not in machine_code
-    assert machine_code.count("sqrtsd") == 0
+    assert "sqrtpd" in machine_code
+    assert "sqrtsd" not in machine_code
