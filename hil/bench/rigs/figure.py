@@ -78,11 +78,20 @@ def once(run: Callable[[], object]) -> float:
 
 
 def repeated(runs: Mapping[str, Callable[[], object]], repeats: int) -> dict[str, Times]:
-    """Processor times of several things, taken in turn, so that all of them see the same machine."""
+    """Processor times of several things, taken in turn, so that all of them see the same machine.
+
+    What was there before is no garbage and is not looked through between them: that would empty the processor's caches,
+    which no study does between two runs.
+    """
     seconds: dict[str, list[float]] = {name: [] for name in runs}
-    for _ in range(repeats):
-        for name, run in runs.items():
-            seconds[name].append(once(run))
+    gc.collect()
+    gc.freeze()
+    try:
+        for _ in range(repeats):
+            for name, run in runs.items():
+                seconds[name].append(once(run))
+    finally:
+        gc.unfreeze()
     return {name: times_of(taken) for name, taken in seconds.items()}
 
 
