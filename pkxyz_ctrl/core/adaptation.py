@@ -87,23 +87,24 @@ ADAPTATION_STATE = np.dtype(
         ("covariance", "f8", (PARAMETERS, ROOM)),  # transposed: symmetric but for rounding
         ("sensitivity", "f8", (3, 3, ROOM)),  # U: axis, then x, v, d of the prediction
         ("shown", "f8", (3, ROOM)),  # d nu
+        ("base", "f8", (ROOM,)),
+        ("work", "f8", (ROOM,)),
+        ("lanes", "f8", (4,)),  # sums that make a product
         ("motion", "f8", (AGES, 9)),  # row of the reference at their beginnings
         ("added_n", "f8", (3,)),  # what the feed-forward of this tick has more
         ("told_n", "f8", (3,)),  # what the filter was told of the last interval that it went through
-        ("base", "f8", (ROOM,)),
         ("answer", "f8", (CAUSES,)),  # to each cause: mean square of what it shows, over that of the noise, ...
         ("clue", "f8", (CAUSES,)),  # ... and its product with what the base leaves
         ("left_by_base", "f8"),  # mean square innovation with the base, and ...
         ("left", "f8"),  # ... with what is learnt, over that of the noise
         ("change", "f8"),  # relative, of the cause that is warned of
-        ("work", "f8", (ROOM,)),
-        ("lanes", "f8", (4,)),  # sums that make a product
         ("updates", "i8"),
         ("begun", "i4"),  # 0: nothing is known yet, not even how little
         ("based", "i4"),  # 1: there is a base
         ("axis", "i4"),  # whose turn it is
         ("cause", "i4"),  # 0: no warning; else 1 + a cause
         ("calm", "i4"),  # ticks since something was not as it should be for learning
+        ("spare", "f8", (6,)),  # so that the rows that follow begin with a line of a processor's cache, as those before
         ("force_n", "f8", (AGES, 3, ROOM)),  # phi of the last intervals, newest first
     ],
     align=True,

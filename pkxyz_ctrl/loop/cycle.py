@@ -101,6 +101,8 @@ MEMORY = np.dtype(
     align=True,
 )
 
+_LINE_BYTES = 64  # of a cache: a vector that lies in two lines takes as long as two
+_ROWS_AT = MEMORY.fields["tick"][1] + tick.MEMORY.fields["adaptation"][1]  # the longest rows that every tick goes through
 _UNUSABLE = int(UNUSABLE)
 _IMPLAUSIBLE = int(SenseStatus.IMPLAUSIBLE)
 _NONE, _HOME, _HOMED, _ENABLE, _TRACK, _TRIP, _CLEAR = (
@@ -116,7 +118,9 @@ _LANDS_ONCE = int(Trip.OVERRUN)  # a computer that is late on the way down, too,
 
 def new_memory(mode: Mode = Mode.BOOT) -> NDArray[np.void]:
     """Memory of a controller that has just been switched on, in a mode: nothing known, 0 V, no reference."""
-    memory = np.frombuffer(bytearray(MEMORY.itemsize), MEMORY)  # as zeros(), which goes through the fields one by one
+    room = np.zeros(MEMORY.itemsize + _LINE_BYTES, np.uint8)
+    begin = -(room.ctypes.data + _ROWS_AT) % _LINE_BYTES
+    memory: NDArray[np.void] = room[begin : begin + MEMORY.itemsize].view(MEMORY)
     memory["mode"] = mode
     return memory
 
