@@ -6,7 +6,9 @@ and a kernel that takes memory does not compile.
 
 from numba import njit
 
-from pkxyz_ctrl.compiled.whole_program import optimise_whole_programs
+from pkxyz_ctrl.compiled.whole_program import optimise_whole_programs, rare
+
+__all__ = ["kernel", "rare"]
 
 optimise_whole_programs()
 

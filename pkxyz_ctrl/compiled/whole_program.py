@@ -22,7 +22,7 @@ one compilation, whoever loads it; its environment, its wrappers and what a cach
 
 import os
 import platform
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from typing import Any
 
@@ -43,6 +43,7 @@ _SHAPE = {  # what else LLVM is told here: up to so many instructions ...
     "tail-dup-size": 4,  # the end of a branch is written twice, in place of a jump,
     "two-entry-phi-node-folding-threshold": 2,  # both branches are worked out, in place of one
 }
+_RARELY = "_rarely"
 _SHAPE_ELSEWHERE = {"tail-dup-size": 2, "two-entry-phi-node-folding-threshold": 4}  # as LLVM has it
 
 
@@ -70,6 +71,14 @@ def rolled_out(instructions: int) -> Iterator[None]:
         _tell(_SHAPE)
 
 
+def rare(function: Callable[..., Any]) -> Callable[..., Any]:
+    """Of a kernel that hardly any tick calls: it is laid out of the way, and its caller keeps its numbers in registers
+    as if there were no call. Told by the name: where a whole program is optimised, a function has nothing else left.
+    """
+    function.__qualname__ += _RARELY
+    return function
+
+
 def _tell(options: dict[str, int]) -> None:
     for name, value in options.items():
         set_option("numba", f"-{name}={value}")
@@ -95,4 +104,6 @@ def _optimise_whole(library: Any) -> None:
     for function in module.functions:
         if not function.is_declaration and function.linkage == Linkage.linkonce_odr:
             function.linkage = Linkage.private
+        if _RARELY in function.name:
+            function.add_function_attribute("cold")
     _optimise(library)

@@ -109,7 +109,7 @@ ADAPTATION_STATE = np.dtype(
     ],
     align=True,
 )
-"""Last the ages of ``force_n``: a board need not hold those beyond the delay, at which no kernel looks."""
+"""Last the ages of ``force_n``: a board need not hold those beyond the delay, which no kernel looks at."""
 
 
 @kernel
@@ -230,8 +230,7 @@ def _update(adaptation: np.void, state: np.void, axis: int, innovation_m: float)
             p[k + 4, i] -= weight * g4
     bound, outside = adaptation["bound"], np.int32(0)  # seldom is one, and whether is told without a branch for each
     for i in range(_ROOM):
-        better = learnt[i] - gain[i] * scale * missing
-        learnt[i] = better
+        learnt[i] = better = learnt[i] - gain[i] * scale * missing
         outside |= np.int32(0) if abs(better) <= bound[i] else np.int32(1)
     for i in range(_PARAMETERS):
         p[i, i] = min(p[i, i] + adaptation["drift"], 1.0)

@@ -14,7 +14,7 @@ import numpy as np
 from numba import njit
 from numpy.typing import NDArray
 
-from pkxyz_ctrl.compiled.kernel import kernel
+from pkxyz_ctrl.compiled.kernel import kernel, rare
 from pkxyz_ctrl.core.kinematics import crank, crank_bend, jacobian, link, link_bend, stroke
 
 Array = NDArray[np.float64]
@@ -53,15 +53,25 @@ def arcsine(y: float) -> float:
     Near 0, where the workspace lies, by its series; from farther away the angle is halved until it is there.
     """
     doubled = 1.0
-    for _ in range(_HALVINGS):
-        if not abs(y) >= _SMALL:
-            break
-        y /= math.sqrt(2.0 + 2.0 * math.sqrt((1.0 - y) * (1.0 + y)))
-        doubled *= 2.0
+    if not abs(y) < _SMALL:
+        y, doubled = _halved(y)
     s = y * y
     s2 = s * s  # in pairs, which need not wait for one another
     tail = 5 / 112 + s * (35 / 1152) + s2 * (63 / 2816 + s * (231 / 13312))
     return doubled * (y + y * s * (1 / 6 + s * (3 / 40) + s2 * tail))
+
+
+@kernel
+@rare
+def _halved(y: float) -> tuple[float, float]:
+    """The sine of an angle that is small enough, and how many of it the one with the sine ``y`` is."""
+    times = 1.0
+    for _ in range(_HALVINGS):
+        if not abs(y) >= _SMALL:
+            break
+        y /= math.sqrt(2.0 + 2.0 * math.sqrt((1.0 - y) * (1.0 + y)))
+        times *= 2.0
+    return y, times
 
 
 @kernel

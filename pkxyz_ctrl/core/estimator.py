@@ -14,7 +14,7 @@ not in extra states. A sample shows x - tau v, tau being the sense chain's delay
 import numpy as np
 from numpy.typing import NDArray
 
-from pkxyz_ctrl.compiled.kernel import kernel
+from pkxyz_ctrl.compiled.kernel import kernel, rare
 from pkxyz_ctrl.core.elasticity import gradient_and_forces
 
 Array = NDArray[np.float64]
@@ -151,6 +151,7 @@ def goes_far(estimator: np.void, s: Array, after: Array) -> bool:
 
 
 @kernel
+@rare
 def predict_far(
     geometry: np.void,
     elasticity: np.void,

@@ -8,7 +8,7 @@ counts, mode and record in ``memory["row"]``.
 import numpy as np
 from numpy.typing import NDArray
 
-from pkxyz_ctrl.compiled.kernel import kernel
+from pkxyz_ctrl.compiled.kernel import kernel, rare
 from pkxyz_ctrl.core import demand, feed_hold, tick, youla
 from pkxyz_ctrl.loop import landing, set_points
 from pkxyz_ctrl.loop.row import ROW
@@ -102,7 +102,6 @@ MEMORY = np.dtype(
 )
 
 _LINE_BYTES = 64  # of a cache: a vector that lies in two lines takes as long as two
-_ROWS_AT = MEMORY.fields["tick"][1] + tick.MEMORY.fields["adaptation"][1]  # the longest rows that every tick goes through
 _UNUSABLE = int(UNUSABLE)
 _IMPLAUSIBLE = int(SenseStatus.IMPLAUSIBLE)
 _NONE, _HOME, _HOMED, _ENABLE, _TRACK, _TRIP, _CLEAR = (
@@ -118,9 +117,9 @@ _LANDS_ONCE = int(Trip.OVERRUN)  # a computer that is late on the way down, too,
 
 def new_memory(mode: Mode = Mode.BOOT) -> NDArray[np.void]:
     """Memory of a controller that has just been switched on, in a mode: nothing known, 0 V, no reference."""
-    room = np.zeros(MEMORY.itemsize + _LINE_BYTES, np.uint8)
-    begin = -(room.ctypes.data + _ROWS_AT) % _LINE_BYTES
-    memory: NDArray[np.void] = room[begin : begin + MEMORY.itemsize].view(MEMORY)
+    room = bytearray(MEMORY.itemsize + _LINE_BYTES)  # as zeros() of records goes through their fields one by one
+    begin = -np.frombuffer(room, MEMORY, 1)["tick"]["adaptation"].ctypes.data % _LINE_BYTES  # what all ticks go through
+    memory = np.frombuffer(room, MEMORY, 1, begin)
     memory["mode"] = mode
     return memory
 
@@ -217,13 +216,19 @@ def _asked(law: np.void, memory: np.void) -> int:
 
 @kernel
 def _handle(law: np.void, memory: np.void, event: int) -> None:
-    """Let an event act on the mode, and prepare what the mode that is entered needs."""
+    """Let an event act on the mode."""
     mode = memory["mode"]
     memory["row"]["event"] = event
     target = next_mode(mode, event)
     memory["homed"] = 1 if next_homed(memory["homed"] != 0, mode, event) else 0
-    if target == mode:
-        return
+    if target != mode:
+        _enter(law, memory, mode, target)
+
+
+@kernel
+@rare
+def _enter(law: np.void, memory: np.void, mode: int, target: int) -> None:
+    """Leave a mode, and prepare what the one that is entered needs."""
     memory["mode"] = target
     if mode == _LANDING:
         set_points.end_landing(memory)

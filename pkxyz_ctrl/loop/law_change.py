@@ -82,6 +82,6 @@ def _forget(state: np.void) -> None:
     state["base"][:] = 0.0
     state["answer"][:] = 0.0
     state["clue"][:] = 0.0
-    state["work"][:] = state["lanes"][:] = 0.0
+    state["work"][:] = state["lanes"][:] = state["spare"][:] = 0.0
     state["left_by_base"] = state["left"] = state["change"] = 0.0
     state["updates"] = state["begun"] = state["based"] = state["axis"] = state["cause"] = state["calm"] = 0

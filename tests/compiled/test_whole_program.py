@@ -2,15 +2,17 @@
 
 import math
 import os
+import re
 import subprocess
 import sys
+import types
 from pathlib import Path
 
 import numpy as np
 import pytest
 from numba import float64, njit
 
-from pkxyz_ctrl.compiled.whole_program import optimise_whole_programs
+from pkxyz_ctrl.compiled.whole_program import optimise_whole_programs, rare
 
 optimise_whole_programs()
 
@@ -72,6 +74,14 @@ def neighbours(a: np.ndarray, b: np.ndarray, out: np.ndarray) -> None:
     out[0], out[1] = x, y
 
 
+seldom = fresh(rare(types.FunctionType(winding.py_func.__code__, globals())))
+
+
+@fresh
+def seldom_or_often(a: np.ndarray, b: np.ndarray) -> float:
+    return winding(a) + winding(b) if a[0] < b[0] else seldom(a) + seldom(b)
+
+
 def library(compiled):
     return compiled.overloads[compiled.signatures[0]].library
 
@@ -111,6 +121,18 @@ def test_like_operations_on_neighbours_are_one():
     whole = library(neighbours).get_llvm_str()
     assert "fmul <2 x double>" in whole
     assert "<4 x double>" not in whole
+
+
+def test_llvm_knows_what_is_rare():
+    seldom_or_often.compile((float64[::1], float64[::1]))
+    whole = library(seldom_or_often).get_llvm_str()
+    groups = dict(re.findall(r"define private .*?(winding(?:_rarely)?)B.* #(\d+) ", whole))
+    told = {
+        name: re.search(rf"^attributes #{group} = {{ (\w+) ", whole, re.MULTILINE)[1] for name, group in groups.items()
+    }
+    assert told.pop("winding_rarely") == "cold"
+    assert told.keys() == {"winding"}
+    assert "cold" not in told.values()
 
 
 def test_its_bits_are_those_of_python():
