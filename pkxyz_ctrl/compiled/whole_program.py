@@ -43,8 +43,8 @@ _SHAPE = {  # what else LLVM is told here: up to so many instructions ...
     "tail-dup-size": 4,  # the end of a branch is written twice, in place of a jump,
     "two-entry-phi-node-folding-threshold": 2,  # both branches are worked out, in place of one
 }
-_RARELY = "_rarely"
 _SHAPE_ELSEWHERE = {"tail-dup-size": 2, "two-entry-phi-node-folding-threshold": 4}  # as LLVM has it
+_RARELY = "_rarely"
 
 
 def optimise_whole_programs() -> None:

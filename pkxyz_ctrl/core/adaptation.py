@@ -109,7 +109,7 @@ ADAPTATION_STATE = np.dtype(
     ],
     align=True,
 )
-"""Last the ages of ``force_n``: a board need not hold those beyond the delay, which no kernel looks at."""
+"""Last the ages of ``force_n``: a board need not hold those beyond the delay, at which no kernel looks."""
 
 
 @kernel

@@ -116,9 +116,13 @@ _LANDS_ONCE = int(Trip.OVERRUN)  # a computer that is late on the way down, too,
 
 
 def new_memory(mode: Mode = Mode.BOOT) -> NDArray[np.void]:
-    """Memory of a controller that has just been switched on, in a mode: nothing known, 0 V, no reference."""
-    room = bytearray(MEMORY.itemsize + _LINE_BYTES)  # as zeros() of records goes through their fields one by one
-    begin = -np.frombuffer(room, MEMORY, 1)["tick"]["adaptation"].ctypes.data % _LINE_BYTES  # what all ticks go through
+    """Memory of a controller that has just been switched on, in a mode: nothing known, 0 V, no reference.
+
+    The rows of what is learnt, through which every tick goes, begin with a line of the cache. zeros() would go through
+    the fields of the record one by one.
+    """
+    room = bytearray(MEMORY.itemsize + _LINE_BYTES)
+    begin = -np.frombuffer(room, MEMORY, 1)["tick"]["adaptation"].ctypes.data % _LINE_BYTES
     memory = np.frombuffer(room, MEMORY, 1, begin)
     memory["mode"] = mode
     return memory

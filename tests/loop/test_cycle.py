@@ -8,6 +8,8 @@ from cycle_rig import AT_REST, HOMING_TICKS, enabled, homed, in_the_middle, nois
 from loop_rig import MIDDLE, Cycle, bus, counts_at, law, rows_of, setup, stage
 
 from hil.runs.metrics import Metrics
+from pkxyz_ctrl.core.adaptation import ROOM
+from pkxyz_ctrl.loop.cycle import new_memory
 from pkxyz_ctrl.safety.modes import Event, Mode
 from pkxyz_ctrl.safety.monitors import NodeEvent, SenseStatus
 from pkxyz_ctrl.safety.trips import Trip
@@ -26,6 +28,18 @@ def test_the_automatic_start_tick_by_tick():
     assert [int(r["reference_tick"]) for r in rows] == [-1] * (n + 1) + list(range(9))
     assert not any(r["trips"] for r in rows)
     assert not any(r["drive_count"].any() for r in rows[: n - 1])  # 0 V while homing
+
+
+def test_rows_that_every_tick_goes_through_begin_with_a_line_of_the_cache():
+    """Wherever the memory lies: a vector in two lines takes as long as two."""
+    kept = [new_memory(Mode.IDLE) for _ in range(50)]
+    for memory in kept:
+        learnt = memory["tick"]["adaptation"]
+        rows = [learnt[name] for name in learnt.dtype.names if learnt[name].shape[-1] == ROOM]
+        assert len(rows) == 8
+        assert [row.ctypes.data % 64 for row in rows] == [0] * 8
+        assert memory["mode"] == Mode.IDLE
+        assert not memory["tick"].tobytes().strip(b"\0")
 
 
 def test_homing_finds_the_offsets_and_takes_them_away():
